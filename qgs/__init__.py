@@ -1,0 +1,65 @@
+"""Query-based feed-forward 3D Gaussian splatting from composable, checked components.
+
+model = qgs.compose("recipes/tiny/locus.yaml", overrides=["model.queries.count=128"])
+prediction = model(views)
+rendering = model.render(prediction.gaussians, cameras)
+qgs.save(model, path); model = qgs.load(path)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from qgs.analysis.trace import trace
+    from qgs.composer import compose
+    from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
+    from qgs.io.checkpoint import load, save
+    from qgs.model import QueryGaussianModel
+    from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "CONTRACT_VERSION": "qgs.contracts.plugin",
+    "Cameras": "qgs.types",
+    "Gaussians": "qgs.types",
+    "Plugin": "qgs.contracts.plugin",
+    "Prediction": "qgs.types",
+    "QueryGaussianModel": "qgs.model",
+    "QueryState": "qgs.types",
+    "Rendering": "qgs.types",
+    "Views": "qgs.types",
+    "compose": "qgs.composer",
+    "load": "qgs.io.checkpoint",
+    "save": "qgs.io.checkpoint",
+    "trace": "qgs.analysis.trace",
+}
+
+__all__ = [
+    "CONTRACT_VERSION",
+    "Cameras",
+    "Gaussians",
+    "Plugin",
+    "Prediction",
+    "QueryGaussianModel",
+    "QueryState",
+    "Rendering",
+    "Views",
+    "compose",
+    "load",
+    "save",
+    "trace",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names on first use, so that `import qgs` stays cheap."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'qgs' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PUBLIC])

@@ -1,0 +1,62 @@
+"""The contracts: one abstract class per slot, and what all components share."""
+
+from qgs.contracts.attention import AttentionWeights
+from qgs.contracts.centers import Centers
+from qgs.contracts.component import (
+    Component,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    ModelComponent,
+    ModelDims,
+    Problem,
+    RecipeContext,
+)
+from qgs.contracts.cross_attention import CrossAttention
+from qgs.contracts.data import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
+from qgs.contracts.feed_forward import FeedForward
+from qgs.contracts.head import Head
+from qgs.contracts.loss import Loss
+from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
+from qgs.contracts.queries import Queries
+from qgs.contracts.refinement import Refinement
+from qgs.contracts.renderer import Renderer, RendererConfig
+from qgs.contracts.self_attention import SelfAttention
+from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
+from qgs.contracts.supervision import Supervision
+
+__all__ = [
+    "CONTRACT_VERSION",
+    "ENTRY_POINT_GROUP",
+    "MEMORY_FIELDS",
+    "AttentionWeights",
+    "Centers",
+    "Component",
+    "ComponentConfig",
+    "CrossAttention",
+    "Encoder",
+    "EvaluationConfig",
+    "FeedForward",
+    "FieldSpec",
+    "Fields",
+    "Head",
+    "Loss",
+    "ModelComponent",
+    "ModelDims",
+    "Plugin",
+    "Problem",
+    "Queries",
+    "RecipeContext",
+    "Refinement",
+    "Renderer",
+    "RendererConfig",
+    "Scene",
+    "SceneSource",
+    "SceneSourceConfig",
+    "SelfAttention",
+    "Split",
+    "Supervision",
+    "TrainingConfig",
+    "ViewsConfig",
+]

@@ -1,0 +1,116 @@
+"""What every component shares: a name, a Config, and what it reads and writes."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, TypeAlias
+
+import torch
+from pydantic import BaseModel, ConfigDict
+
+
+class ComponentConfig(BaseModel):
+    """Options of a component: frozen, strict about types, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """A named tensor that one component leaves for later ones.
+
+    shape: trailing shape after the leading (batch, item) dimensions; a str is a symbolic size such
+        as "D". dtype: what the tensor is stored in. frame: the coordinate frame of its numbers.
+    """
+
+    shape: tuple[int | str, ...]
+    dtype: torch.dtype = torch.float32
+    frame: Literal["none", "world", "camera"] = "none"
+
+    def __str__(self) -> str:
+        shape = "x".join(map(str, self.shape)) or "scalar"
+        frame = "" if self.frame == "none" else f", {self.frame} frame"
+        return f"{shape} {str(self.dtype).removeprefix('torch.')}{frame}"
+
+
+Fields: TypeAlias = Mapping[str, FieldSpec]
+
+
+@dataclass(frozen=True)
+class ModelDims:
+    """Sizes that all parts of one model share: width D, heads h, decoder depth L."""
+
+    width: int
+    heads: int
+    depth: int
+
+
+@dataclass(frozen=True)
+class RecipeContext:
+    """What a component may know of the rest of its recipe when its options are checked.
+
+    image_size: (H, W) the data delivers; None when the recipe has no data.
+    """
+
+    dims: ModelDims
+    image_size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Problem:
+    """An option that does not fit the rest of the recipe.
+
+    option: dotted path below the component, "" for the component itself.
+    """
+
+    option: str
+    reason: str
+    fix: str
+
+
+class Component(ABC):
+    """Base of everything that a recipe can name.
+
+    A slot's contract sets `slot`; a final class sets `name` and nests its `Config`. A recipe
+    selects it as `type: PLUGIN/NAME`. Classmethods are called with a decoded config before
+    anything is built.
+    """
+
+    slot: ClassVar[str]
+    name: ClassVar[str]
+
+    class Config(ComponentConfig):
+        """No options."""
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        """Fields that must exist before this component runs, as a function of its options."""
+        return {}
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        """Fields that exist once this component has run, as a function of its options."""
+        return {}
+
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        """What is wrong with `config` beside the rest of the recipe; empty when it fits."""
+        return ()
+
+
+class ModelComponent(Component, torch.nn.Module):
+    """A component with parameters, built with the sizes that the whole model shares."""
+
+    def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
+        torch.nn.Module.__init__(self)
+        self.config = config
+        self.dims = dims
+
+    def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
+        """Whether weight decay applies to `parameter`, called `name` inside this component.
+
+        By default to all but 1-d parameters (biases, norms, LayerScale), as in the LocusGS release.
+        """
+        return parameter.ndim != 1

@@ -1,0 +1,67 @@
+"""Slot `data`: where scenes come from."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts.component import Component, ComponentConfig
+from qgs.types import Cameras
+
+Split = Literal["train", "test"]
+
+
+class Scene(ABC):
+    """Frames of one scene, decoded only when asked for."""
+
+    name: str
+
+    held_out: Sequence[int] = ()
+    """Frames that training never sees, so that evaluation can target them."""
+
+    @property
+    @abstractmethod
+    def cameras(self) -> Cameras:
+        """Cameras (F,) of all frames at the delivered image size, in the scene's own frame."""
+
+    @abstractmethod
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """Images (len(frames), 3, H, W) float32 in [0, 1]."""
+
+    def depths(self, frames: Sequence[int]) -> Tensor | None:
+        """Camera-frame z (len(frames), 1, H, W), world units; None where it is not known."""
+        return None
+
+    def __len__(self) -> int:
+        """F, the number of frames."""
+        return self.cameras.shape[0]
+
+
+class SceneSourceConfig(ComponentConfig):
+    """image_size: (H, W) of every delivered image, in pixels."""
+
+    image_size: tuple[int, int] = Field((64, 64))
+
+
+class SceneSource(Component):
+    """A collection of scenes with a training and a test split.
+
+    Opening a source reads what it needs to list its scenes and raises FileNotFoundError or
+    ValueError with the path and the remedy; images are decoded by `Scene.images`.
+    """
+
+    slot: ClassVar[str] = "data"
+
+    class Config(SceneSourceConfig):
+        """The common settings."""
+
+    def __init__(self, config: SceneSourceConfig) -> None:
+        self.config = config
+
+    @abstractmethod
+    def scenes(self, split: Split) -> Sequence[Scene]:
+        """The scenes of a split; indexing is cheap and deterministic."""

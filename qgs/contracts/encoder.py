@@ -1,0 +1,34 @@
+"""Slot `encoder`: posed photos to image memory."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+from qgs.contracts.component import ComponentConfig, Fields, FieldSpec, ModelComponent
+from qgs.types import ImageMemory, Views
+
+MEMORY_FIELDS: Fields = {
+    "memory.keys": FieldSpec(("D/h",)),
+    "memory.values": FieldSpec(("D/h",)),
+    "memory.features": FieldSpec(("D",)),
+    "memory.patch_rays": FieldSpec((6,), frame="world"),
+}
+
+
+class Encoder(ModelComponent):
+    """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
+
+    Runs once per forward pass. Raises ValueError for images it cannot divide into patches.
+    """
+
+    slot: ClassVar[str] = "encoder"
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        """Every encoder fills the whole ImageMemory."""
+        return MEMORY_FIELDS
+
+    @abstractmethod
+    def forward(self, views: Views) -> ImageMemory:
+        """Encode all views of each scene together."""

@@ -1,0 +1,28 @@
+"""What a distribution offers to recipes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from qgs.contracts.component import Component
+
+CONTRACT_VERSION = 1
+"""Raised when a contract changes so that components written for the old one no longer fit."""
+
+ENTRY_POINT_GROUP = "qgs.plugins"
+"""A distribution lists its `Plugin` object here, under the plugin's name."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """Components under one name. Making or importing one has no side effect.
+
+    name: the part of `type: NAME/component` before the slash.
+    contract_version: the CONTRACT_VERSION that the components were written for.
+    components: final component classes; their `name` is unique within their slot.
+    """
+
+    name: str
+    contract_version: int
+    components: Sequence[type[Component]]

@@ -1,0 +1,68 @@
+"""Slot `renderer`: Gaussians to images."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
+from qgs.types import Cameras, Gaussians, Rendering
+
+
+class RendererConfig(ComponentConfig):
+    """Splatting settings that every renderer obeys (defaults: both releases, gsplat 1.5.3).
+
+    near, far: camera-frame z outside which a Gaussian is dropped. dilation: pixel^2 added to the
+    diagonal of the projected covariance. alpha_min: contributions below it are skipped. alpha_cap:
+    upper bound of one contribution. transmittance_min: a pixel stops before its transmittance would
+    fall to this. background: RGB behind everything.
+    """
+
+    near: float = Field(0.025, gt=0)
+    far: float = Field(125.0, gt=0)
+    dilation: float = Field(0.3, ge=0)
+    alpha_min: float = Field(1 / 255, gt=0, lt=1)
+    alpha_cap: float = Field(0.999, gt=0, lt=1)
+    transmittance_min: float = Field(1e-4, ge=0, lt=1)
+    background: tuple[float, float, float] = (0.5, 0.5, 0.5)
+
+
+class Renderer(Component, torch.nn.Module):
+    """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
+
+    Differentiable in every Gaussian parameter and in the cameras' c2w and intrinsics. Zero
+    Gaussians, and Gaussians behind the camera, off screen or huge, give finite images and finite
+    gradients.
+    """
+
+    slot: ClassVar[str] = "renderer"
+
+    class Config(RendererConfig):
+        """The common settings."""
+
+    def __init__(self, config: RendererConfig) -> None:
+        torch.nn.Module.__init__(self)
+        self.config = config
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        """RGB, alpha and expected depth."""
+        return {
+            "rendering.rgb": FieldSpec((3, "H", "W")),
+            "rendering.alpha": FieldSpec((1, "H", "W")),
+            "rendering.depth": FieldSpec((1, "H", "W"), frame="camera"),
+        }
+
+    @abstractmethod
+    def forward(
+        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    ) -> Rendering:
+        """Render every scene from each of its cameras.
+
+        background: RGB (3,); None takes the configured one.
+        Raises ValueError when Gaussians and cameras disagree in batch size or device.
+        """

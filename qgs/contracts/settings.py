@@ -1,0 +1,75 @@
+"""The settings of a recipe that are no components: views, training, evaluation."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from qgs.contracts.component import ComponentConfig
+
+
+class ViewsConfig(ComponentConfig):
+    """How views are drawn from a scene and brought into the model's frame (TokenGS release).
+
+    inputs, targets: views per sample. gap: [min, max] frames between the first and the last input
+    frame, both ends included; it shrinks to what a scene has. The other inputs lie between, targets
+    are drawn from the same span. frame: the camera that becomes the identity. scale: "constant"
+    multiplies translations by `scale_factor`; "distance" divides them by the largest distance from
+    the first input camera to another one, then multiplies by `scale_factor`. mirror: probability of
+    mirroring a training sample in x.
+    """
+
+    inputs: int = Field(4, ge=1)
+    targets: int = Field(4, ge=1)
+    gap: tuple[int, int] = (10, 40)
+    frame: Literal["first_cam", "mean_cam"] = "first_cam"
+    scale: Literal["constant", "distance"] = "constant"
+    scale_factor: float = Field(0.15, gt=0)
+    mirror: float = Field(0.5, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _gap_is_ordered(self) -> ViewsConfig:
+        low, high = self.gap
+        if not 1 <= low <= high:
+            raise ValueError(f"gap must be [min, max] with 1 <= min <= max, got [{low}, {high}]")
+        return self
+
+
+class TrainingConfig(ComponentConfig):
+    """The optimisation (LocusGS release, base stage).
+
+    steps: optimiser steps. seconds: a time budget; when set, training ends at whichever of the two
+    comes first and the schedule follows the larger of the two fractions. batch_size: scenes per
+    step and process. accumulate: batches per optimiser step. learning_rate: peak of the one-cycle
+    cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
+    final_divisor: first rate over last rate (torch's OneCycleLR). clip: gradient norm. precision:
+    autocast dtype. save_every, evaluate_every: steps between checkpoints and between evaluations,
+    0 for never but at the end. collapse_window: steps of background-only output after which
+    training stops.
+    """
+
+    steps: int = Field(150_000, ge=1)
+    seconds: float | None = Field(None, gt=0)
+    batch_size: int = Field(16, ge=1)
+    accumulate: int = Field(1, ge=1)
+    learning_rate: float = Field(4e-4, gt=0)
+    warmup: int = Field(2000, ge=0)
+    initial_divisor: float = Field(25.0, ge=1)
+    final_divisor: float = Field(1000.0, ge=1)
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = Field(0.05, ge=0)
+    clip: float = Field(1.0, gt=0)
+    precision: Literal["float32", "bf16"] = "bf16"
+    workers: int = Field(0, ge=0)
+    save_every: int = Field(1000, ge=0)
+    evaluate_every: int = Field(0, ge=0)
+    collapse_window: int = Field(50, ge=10, le=100)
+
+
+class EvaluationConfig(ComponentConfig):
+    """What `qgs eval` runs: at most `scenes` test scenes, `samples` view samples from each."""
+
+    scenes: int = Field(32, ge=1)
+    samples: int = Field(1, ge=1)
+    seed: int = Field(0, ge=0)

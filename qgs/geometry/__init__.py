@@ -1,0 +1,1 @@
+"""Cameras, rays and rotations. Everything here computes in float32 or better."""

@@ -1,0 +1,60 @@
+"""Bringing the poses of a scene into the frame and scale a model expects (TokenGS release)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+
+
+@full_precision
+def first_camera(c2w: Tensor) -> Tensor:
+    """Reference frame of "first_cam": the first camera itself. c2w (..., V, 4, 4) -> (..., 4,
+    4).""" return c2w[..., 0, :, :]
+
+
+@full_precision
+def mean_camera(c2w: Tensor) -> Tensor:
+    """Reference frame of "mean_cam": mean position, Gram-Schmidt on the mean forward and down axes.
+
+    c2w (..., V, 4, 4) -> (..., 4, 4).
+    """
+    mean = c2w.mean(dim=-3)
+    forward = F.normalize(mean[..., :3, 2], dim=-1)
+    down = mean[..., :3, 1]
+    down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
+    right = torch.linalg.cross(down, forward, dim=-1)
+    rotation = torch.stack([right, down, forward], -1)
+    top = torch.cat([rotation, mean[..., :3, 3:]], -1)
+    return torch.cat([top, c2w[..., 0, 3:, :]], -2)
+
+
+@full_precision
+def relative_to(reference: Tensor, c2w: Tensor) -> Tensor:
+    """Poses c2w (..., V, 4, 4) seen from the frame `reference` (..., 4, 4)."""
+    return torch.linalg.inv(reference)[..., None, :, :] @ c2w
+
+
+@full_precision
+def scaled(c2w: Tensor, scale: Tensor | float) -> Tensor:
+    """Poses with translations multiplied by `scale` (a number or one per pose)."""
+    factor = torch.as_tensor(scale, dtype=c2w.dtype, device=c2w.device)
+    translation = c2w[..., :3, 3] * factor[..., None]
+    top = torch.cat([c2w[..., :3, :3], translation[..., None]], -1)
+    return torch.cat([top, c2w[..., 3:, :]], -2)
+
+
+@full_precision
+def largest_distance(c2w: Tensor) -> Tensor:
+    """Largest distance from the first camera to another one. c2w (..., V, 4, 4) -> (...)."""
+    centres = c2w[..., :3, 3]
+    return (centres - centres[..., :1, :]).norm(dim=-1).amax(-1)
+
+
+@full_precision
+def mirrored(c2w: Tensor) -> Tensor:
+    """Poses of the scene mirrored in x: R' = F R F, t' = F t with F = diag(-1, 1, 1)."""
+    flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=c2w.dtype, device=c2w.device))
+    return flip @ c2w @ flip

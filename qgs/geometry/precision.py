@@ -1,0 +1,33 @@
+"""Geometry keeps its precision whatever the autocast setting of the caller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def full_precision(function: F) -> F:
+    """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
+
+    float64 arguments stay float64, so that gradient checks work.
+    """
+
+    def raised(value: Any) -> Any:
+        if isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16):
+            return value.float()
+        return value
+
+    @wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        tensors = [v for v in (*args, *kwargs.values()) if isinstance(v, Tensor)]
+        device = tensors[0].device.type if tensors else "cpu"
+        with torch.autocast(device_type=device, enabled=False):
+            return function(*map(raised, args), **{k: raised(v) for k, v in kwargs.items()})
+
+    return cast(F, wrapper)

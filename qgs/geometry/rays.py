@@ -1,0 +1,67 @@
+"""Pixel rays and Plücker coordinates."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras
+
+
+@full_precision
+def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """Camera-frame directions with z = 1 through the pixel centres.
+
+    intrinsics (..., 4) -> (..., H, W, 3). Pixel centres lie at +0.5.
+    """
+    height, width = size
+    options = {"dtype": intrinsics.dtype, "device": intrinsics.device}
+    v, u = torch.meshgrid(
+        torch.arange(height, **options) + 0.5, torch.arange(width, **options) + 0.5, indexing="ij"
+    )
+    fx, fy, cx, cy = (intrinsics[..., i, None, None] for i in range(4))
+    x, y = (u - cx) / fx, (v - cy) / fy
+    return torch.stack([x, y, torch.ones_like(x)], -1)
+
+
+def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """World-frame origins and unit directions through the pixel centres, both (..., H, W, 3)."""
+    directions = F.normalize(pixel_directions(cameras.intrinsics, cameras.size), dim=-1)
+    return _to_world(cameras.c2w, directions)
+
+
+@full_precision
+def _to_world(c2w: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    world = torch.einsum("...ij,...hwj->...hwi", c2w[..., :3, :3], directions)
+    return c2w[..., None, None, :3, 3].expand_as(world), world
+
+
+def plucker_rays(cameras: Cameras) -> Tensor:
+    """Plücker map (..., 6, H, W): moment o x d, then the unit direction d (TokenGS release)."""
+    origins, directions = camera_rays(cameras)
+    moments = torch.linalg.cross(origins, directions, dim=-1)
+    return torch.cat([moments, directions], -1).movedim(-1, -3)
+
+
+@full_precision
+def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
+    """Mean Plücker ray of each patch, not renormalised.
+
+    plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered view, row, column.
+    """
+    batch = plucker.shape[0]
+    pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
+    return pooled.flatten(2).transpose(1, 2).reshape(batch, -1, 6)
+
+
+@full_precision
+def normalised_rays(rays: Tensor, eps: float = 1e-6) -> tuple[Tensor, Tensor]:
+    """Unit-direction Plücker rays (m', d') = (m, d) / |d|, |d| floored at `eps`.
+
+    rays (..., 6), moment first -> moments (..., 3), directions (..., 3).
+    """
+    moments, directions = rays.split(3, dim=-1)
+    length = directions.norm(dim=-1, keepdim=True).clamp_min(eps)
+    return moments / length, directions / length

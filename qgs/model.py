@@ -1,0 +1,162 @@
+"""The model: photos to image memory, queries through the decoder, queries to Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import torch
+from einops import rearrange
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    Centers,
+    CrossAttention,
+    Encoder,
+    FeedForward,
+    Head,
+    Queries,
+    Refinement,
+    Renderer,
+    SelfAttention,
+    Supervision,
+)
+from qgs.types import (
+    Cameras,
+    Gaussians,
+    ImageMemory,
+    LayerPrediction,
+    Prediction,
+    QueryState,
+    Rendering,
+    Views,
+)
+
+
+class LayerScale(nn.Module):
+    """Per-channel factor on a residual update, initialised at `init`."""
+
+    def __init__(self, width: int, init: float) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((width,), init))
+
+    def forward(self, update: Tensor) -> Tensor:
+        """(..., D) -> (..., D)."""
+        return update * self.gamma
+
+
+class DecoderLayer(nn.Module):
+    """Cross-attention, self-attention, MLP, each a LayerScale residual (TokenGS release)."""
+
+    def __init__(
+        self,
+        cross_attention: CrossAttention,
+        self_attention: SelfAttention,
+        feed_forward: FeedForward,
+        layer_scale: float,
+    ) -> None:
+        super().__init__()
+        width = cross_attention.dims.width
+        self.cross_attention = cross_attention
+        self.cross_scale = LayerScale(width, layer_scale)
+        self.self_attention = self_attention
+        self.self_scale = LayerScale(width, layer_scale)
+        self.feed_forward = feed_forward
+        self.feed_forward_scale = LayerScale(width, layer_scale)
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> QueryState:
+        """The state with updated features; fields pass through."""
+        x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
+        state = state.replace(x_BND)
+        x_BND = x_BND + self.self_scale(self.self_attention(state))
+        x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
+        return state.replace(x_BND)
+
+
+class QueryGaussianModel(nn.Module):
+    """Posed photos in, a fixed budget of Gaussians out.
+
+    refinements: one per decoder layer; layers may share a module.
+    recipe: the resolved recipe this model was composed from, None for one built by hand.
+    """
+
+    def __init__(
+        self,
+        *,
+        encoder: Encoder,
+        queries: Queries,
+        decoder: Sequence[DecoderLayer],
+        refinements: Sequence[Refinement],
+        head: Head,
+        centers: Centers,
+        supervision: Supervision,
+        renderer: Renderer,
+        recipe: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.queries = queries
+        self.decoder = nn.ModuleList(decoder)
+        self.refinements = nn.ModuleList(dict.fromkeys(refinements))
+        shared = {id(module): index for index, module in enumerate(self.refinements)}
+        self._refinement_of = [shared[id(module)] for module in refinements]
+        self.head = head
+        self.centers = centers
+        self.supervision = supervision
+        self.renderer = renderer
+        self.recipe = recipe
+
+    @property
+    def depth(self) -> int:
+        """Number of decoder layers."""
+        return len(self.decoder)
+
+    def forward(self, views: Views, layers: Collection[int] | None = None) -> Prediction:
+        """Reconstruct every scene of `views`.
+
+        layers: numbers of the decoder layers to decode besides the last (1 is the first); None
+            decodes the supervised ones while training and only the last otherwise.
+        Raises ValueError for a layer that does not exist.
+        """
+        wanted = self._decoded_layers(layers)
+        memory = self.encoder(views)
+        state = self.queries(views.images.shape[0])
+        decoded: dict[int, LayerPrediction] = {}
+        for number, layer in enumerate(self.decoder, start=1):
+            refine = self.refinements[self._refinement_of[number - 1]]
+            state = refine(layer(state, memory))
+            if number in wanted:
+                decoded[number] = LayerPrediction(self.decode(state), state)
+        return Prediction(decoded[self.depth].gaussians, state, decoded)
+
+    def decode(self, state: QueryState) -> Gaussians:
+        """The Gaussians that a state stands for, query by query."""
+        attributes = self.head(state)
+        means = self.centers(attributes.offsets, state)
+
+        def flat(x: Tensor) -> Tensor:
+            return rearrange(x, "b n k c -> b (n k) c")
+
+        return Gaussians(
+            means=flat(means),
+            scales=flat(attributes.scales),
+            quats=flat(attributes.quats),
+            opacities=rearrange(attributes.opacities, "b n k -> b (n k)"),
+            colors=flat(attributes.colors),
+        )
+
+    def render(
+        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    ) -> Rendering:
+        """Render (B, G) Gaussians from (B, V) cameras, see `qgs.contracts.Renderer`."""
+        return self.renderer(gaussians, cameras, background)
+
+    def _decoded_layers(self, layers: Collection[int] | None) -> set[int]:
+        if layers is None:
+            layers = self.supervision.weights().keys() if self.training else ()
+        unknown = sorted(n for n in layers if not 1 <= n <= self.depth)
+        if unknown:
+            raise ValueError(
+                f"layers {unknown} do not exist; this model has layers 1..{self.depth}"
+            )
+        return {*layers, self.depth}

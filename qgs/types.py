@@ -1,0 +1,243 @@
+"""The containers that travel between components.
+
+Shapes: B scenes, V views, H x W pixels, N queries, D width, h heads, M image tokens,
+K Gaussians per query, G = N*K Gaussians. Frames: "world" is the frame of the first input camera
+once poses are normalised; cameras are OpenCV (x right, y down, z forward).
+
+Every container is frozen. A component returns a new one and never writes into the old.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+
+class _TensorContainer:
+    """Moves every tensor of a frozen dataclass, one level of nesting included."""
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Return a copy with every tensor moved as by `Tensor.to`."""
+
+        def move(value: Any) -> Any:
+            if isinstance(value, Tensor | _TensorContainer):
+                return value.to(*args, **kwargs)
+            if isinstance(value, Mapping):
+                return {key: move(item) for key, item in value.items()}
+            return value
+
+        moved = {f.name: move(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-
+        type] return replace(self, **moved)  # type: ignore[type-var]
+
+
+def _expect(name: str, tensor: Tensor, trailing: tuple[int | None, ...]) -> None:
+    """Raise ValueError unless `tensor` ends with `trailing` (None matches any size)."""
+    tail = tuple(tensor.shape[-len(trailing) :])
+    matches = len(tail) == len(trailing) and all(
+        want is None or want == have for want, have in zip(trailing, tail, strict=True)
+    )
+    if not matches:
+        wanted = ", ".join("*" if size is None else str(size) for size in trailing)
+        raise ValueError(f"{name} must have shape (..., {wanted}), got {tuple(tensor.shape)}")
+
+
+@dataclass(frozen=True)
+class Cameras(_TensorContainer):
+    """Pinhole cameras of one image size.
+
+    c2w: (..., 4, 4) camera-to-world, OpenCV axes, rigid.
+    intrinsics: (..., 4) fx, fy, cx, cy in pixels; the centre of the first pixel is (0.5, 0.5).
+    size: (H, W) in pixels.
+    """
+
+    c2w: Tensor
+    intrinsics: Tensor
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        _expect("Cameras.c2w", self.c2w, (4, 4))
+        _expect("Cameras.intrinsics", self.intrinsics, (4,))
+        if self.c2w.shape[:-2] != self.intrinsics.shape[:-1]:
+            raise ValueError(
+                "Cameras.c2w and Cameras.intrinsics must share their batch shape, got "
+                f"{tuple(self.c2w.shape)} and {tuple(self.intrinsics.shape)}"
+            )
+
+    @property
+    def shape(self) -> torch.Size:
+        """Batch shape, usually (B, V)."""
+        return self.c2w.shape[:-2]
+
+    @property
+    def w2c(self) -> Tensor:
+        """(..., 4, 4) world-to-camera: the rigid inverse of `c2w`, differentiable."""
+        rotation = self.c2w[..., :3, :3].transpose(-1, -2)
+        translation = -rotation @ self.c2w[..., :3, 3:]
+        return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
+
+    def __getitem__(self, index: Any) -> Cameras:
+        return Cameras(self.c2w[index], self.intrinsics[index], self.size)
+
+
+@dataclass(frozen=True)
+class Views(_TensorContainer):
+    """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V)."""
+
+    images: Tensor
+    cameras: Cameras
+
+    def __post_init__(self) -> None:
+        if self.images.ndim != 5:
+            raise ValueError(
+                f"Views.images must have shape (B, V, 3, H, W), got {tuple(self.images.shape)}; "
+                "add a leading dimension for a single scene"
+            )
+        _expect("Views.images", self.images, (3, *self.cameras.size))
+        if self.images.shape[:2] != self.cameras.shape:
+            raise ValueError(
+                f"Views.images has {tuple(self.images.shape[:2])} scenes and views, "
+                f"Views.cameras {tuple(self.cameras.shape)}"
+            )
+
+    def select(self, index: Any) -> Views:
+        """The views at `index` of every scene (a slice or a list of ints)."""
+        return Views(self.images[:, index], self.cameras[:, index])
+
+
+@dataclass(frozen=True)
+class ImageMemory(_TensorContainer):
+    """What the encoder leaves for the decoder.
+
+    keys, values: (B, h, M, D/h), made once for all decoder layers.
+    features: (B, M, D), for components that project their own keys and values.
+    patch_rays: (B, M, 6) float32 world-frame Plücker rays (moment, direction), averaged over each
+        patch and not renormalised.
+    grid: (V, H/P, W/P), M is its product; tokens are ordered view, row, column.
+    """
+
+    keys: Tensor
+    values: Tensor
+    features: Tensor
+    patch_rays: Tensor
+    grid: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class QueryState(_TensorContainer):
+    """The state of every query: features (B, N, D) and named fields (B, N, ...)."""
+
+    features: Tensor
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self.fields[name]
+
+    def replace(
+        self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
+    ) -> QueryState:
+        """A new state with other features and with `fields` added or replaced."""
+        return QueryState(
+            self.features if features is None else features, {**self.fields, **(fields or {})}
+        )
+
+
+@dataclass(frozen=True)
+class GaussianAttributes(_TensorContainer):
+    """What a head reads off each query; everything of a Gaussian but its mean.
+
+    offsets: (B, N, K, 3) raw, before any activation: a `centers` component turns them into means.
+    scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
+    opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1].
+    """
+
+    offsets: Tensor
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians(_TensorContainer):
+    """G Gaussians per scene, ordered query by query.
+
+    means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
+    quats: (B, G, 4) unit, w x y z. opacities: (B, G). colors: (B, G, 3) RGB.
+    """
+
+    means: Tensor
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+    def __post_init__(self) -> None:
+        count = self.means.shape[:-1]
+        for name, trailing in (("means", 3), ("scales", 3), ("quats", 4), ("colors", 3)):
+            tensor = getattr(self, name)
+            if tensor.shape != (*count, trailing):
+                raise ValueError(
+                    f"Gaussians.{name} must have shape {(*count, trailing)}, "
+                    f"got {tuple(tensor.shape)}"
+                )
+        if self.opacities.shape != count:
+            raise ValueError(
+                f"Gaussians.opacities must have shape {tuple(count)}, "
+                f"got {tuple(self.opacities.shape)}"
+            )
+
+    @property
+    def count(self) -> int:
+        """Gaussians per scene."""
+        return self.means.shape[-2]
+
+    def __getitem__(self, index: Any) -> Gaussians:
+        return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Rendering(_TensorContainer):
+    """What cameras see: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
+
+    `rgb` is over the background, `alpha` in [0, 1], `depth` the expected camera-frame z of what
+    was hit, sum(w z) / sum(w), 0 where nothing was.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+@dataclass(frozen=True)
+class SpatialSupport(_TensorContainer):
+    """Where queries look, for pictures: an ellipsoid per query.
+
+    centers: (B, N, 3) world. axes: (B, N, 3, 3), its semi-axes as columns, world units.
+    """
+
+    centers: Tensor
+    axes: Tensor
+
+
+@dataclass(frozen=True)
+class LayerPrediction(_TensorContainer):
+    """What one decoder layer predicts: its Gaussians and the state they were decoded from."""
+
+    gaussians: Gaussians
+    state: QueryState
+
+
+@dataclass(frozen=True)
+class Prediction(_TensorContainer):
+    """A forward pass: the last layer's Gaussians and state, and those of every decoded layer.
+
+    layers: layer number (1 is the first) to LayerPrediction, ascending.
+    """
+
+    gaussians: Gaussians
+    state: QueryState
+    layers: Mapping[int, LayerPrediction]
