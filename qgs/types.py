@@ -30,8 +30,8 @@ class _TensorContainer:
                 return {key: move(item) for key, item in value.items()}
             return value
 
-        moved = {f.name: move(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-
-        type] return replace(self, **moved)  # type: ignore[type-var]
+        moved = {f.name: move(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **moved)  # type: ignore[type-var]
 
 
 def _expect(name: str, tensor: Tensor, trailing: tuple[int | None, ...]) -> None:

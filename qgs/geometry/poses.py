@@ -11,8 +11,8 @@ from qgs.geometry.precision import full_precision
 
 @full_precision
 def first_camera(c2w: Tensor) -> Tensor:
-    """Reference frame of "first_cam": the first camera itself. c2w (..., V, 4, 4) -> (..., 4,
-    4).""" return c2w[..., 0, :, :]
+    """Reference frame of "first_cam": the first camera. c2w (..., V, 4, 4) -> (..., 4, 4)."""
+    return c2w[..., 0, :, :]
 
 
 @full_precision
