@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-import torch
 from einops import rearrange
 from torch import Tensor, nn
 
+from qgs.components.blocks import LayerScale
 from qgs.contracts import (
     Centers,
     CrossAttention,
@@ -31,18 +31,6 @@ from qgs.types import (
     Rendering,
     Views,
 )
-
-
-class LayerScale(nn.Module):
-    """Per-channel factor on a residual update, initialised at `init`."""
-
-    def __init__(self, width: int, init: float) -> None:
-        super().__init__()
-        self.gamma = nn.Parameter(torch.full((width,), init))
-
-    def forward(self, update: Tensor) -> Tensor:
-        """(..., D) -> (..., D)."""
-        return update * self.gamma
 
 
 class DecoderLayer(nn.Module):

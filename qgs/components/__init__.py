@@ -1,1 +1,44 @@
-"""."""
+"""The default components: TokenGS, one file per slot."""
+
+from qgs.components.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
+from qgs.components.centers import FreeCenters
+from qgs.components.cross_attention import ContentCrossAttention
+from qgs.components.encoder import MultiViewViT
+from qgs.components.feed_forward import MlpFeedForward
+from qgs.components.head import GaussianHead
+from qgs.components.position import posact
+from qgs.components.queries import LatentQueries
+from qgs.components.refinement import NoRefinement
+from qgs.components.self_attention import ContentSelfAttention
+from qgs.components.supervision import LayerSupervision
+from qgs.contracts import Component
+
+COMPONENTS: tuple[type[Component], ...] = (
+    MultiViewViT,
+    LatentQueries,
+    ContentCrossAttention,
+    ContentSelfAttention,
+    MlpFeedForward,
+    NoRefinement,
+    GaussianHead,
+    FreeCenters,
+    LayerSupervision,
+)
+
+__all__ = [
+    "COMPONENTS",
+    "ContentCrossAttention",
+    "ContentSelfAttention",
+    "CrossAttentionCore",
+    "FreeCenters",
+    "GaussianHead",
+    "LatentQueries",
+    "LayerScale",
+    "LayerSupervision",
+    "Mlp",
+    "MlpFeedForward",
+    "MultiViewViT",
+    "NoRefinement",
+    "SelfAttentionCore",
+    "posact",
+]

@@ -22,17 +22,23 @@ class FieldSpec:
     """A named tensor that one component leaves for later ones.
 
     shape: trailing shape after the leading (batch, item) dimensions; a str is a symbolic size such
-        as "D". dtype: what the tensor is stored in. frame: the coordinate frame of its numbers.
+        as "D".
+    dtype: what the tensor is stored in.
+    frame: the coordinate frame of its numbers.
+    encoding: how raw numbers are to be read where more than one way exists; writer and reader must
+        agree.
     """
 
     shape: tuple[int | str, ...]
     dtype: torch.dtype = torch.float32
     frame: Literal["none", "world", "camera"] = "none"
+    encoding: str = ""
 
     def __str__(self) -> str:
         shape = "x".join(map(str, self.shape)) or "scalar"
         frame = "" if self.frame == "none" else f", {self.frame} frame"
-        return f"{shape} {str(self.dtype).removeprefix('torch.')}{frame}"
+        encoding = f", {self.encoding}" if self.encoding else ""
+        return f"{shape} {str(self.dtype).removeprefix('torch.')}{frame}{encoding}"
 
 
 Fields: TypeAlias = Mapping[str, FieldSpec]

@@ -28,5 +28,5 @@ class Queries(ModelComponent):
         """The initial state, expanded to `batch_size` scenes."""
 
     def support(self, state: QueryState) -> SpatialSupport | None:
-        """The region each query of `state` attends to; None for queries without a place."""
+        """Where each query of `state` looks; None for queries without a place in space."""
         return None

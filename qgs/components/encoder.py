@@ -1,0 +1,129 @@
+"""`qgs/multiview_vit`: one sequence of all views' patches through a small ViT (TokenGS release)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import ClassVar
+
+import torch
+from einops import rearrange
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components.blocks import LayerScale, Mlp, SelfAttentionCore, split_heads
+from qgs.contracts import ComponentConfig, Encoder, ModelDims, Problem, RecipeContext
+from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.types import ImageMemory, Views
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class PatchEmbedding(nn.Module):
+    """P x P convolution with stride P, then LayerNorm: (X, C, H, W) -> (X, H/P*W/P, D)."""
+
+    def __init__(self, channels: int, width: int, patch_size: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(channels, width, kernel_size=patch_size, stride=patch_size)
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(X, C, H, W) -> (X, H/P*W/P, D), row by row."""
+        return self.norm(rearrange(self.proj(images), "x d h w -> x (h w) d"))
+
+
+class EncoderBlock(nn.Module):
+    """Pre-norm ViT block with QK-LayerNorm and LayerScale."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: int, layer_scale: float) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width)
+        self.attention = SelfAttentionCore(width, heads)
+        self.scale1 = LayerScale(width, layer_scale)
+        self.norm2 = nn.LayerNorm(width)
+        self.mlp = Mlp(width, mlp_ratio * width, width)
+        self.scale2 = LayerScale(width, layer_scale)
+
+    def forward(self, x_BMD: Tensor) -> Tensor:
+        """(B, M, D) -> (B, M, D)."""
+        x_BMD = x_BMD + self.scale1(self.attention(self.norm1(x_BMD)))
+        return x_BMD + self.scale2(self.mlp(self.norm2(x_BMD)))
+
+
+class MultiViewViT(Encoder):
+    """Patch and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
+
+    name: ClassVar[str] = "multiview_vit"
+
+    class Config(ComponentConfig):
+        """patch_size: P in pixels. depth: blocks. layer_scale: its initial value."""
+
+        patch_size: int = Field(8, ge=1)
+        depth: int = Field(3, ge=0)
+        mlp_ratio: int = Field(4, ge=1)
+        layer_scale: float = 0.01
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.patch_size = config.patch_size
+        self.rgb_embedding = PatchEmbedding(3, dims.width, config.patch_size)
+        self.ray_embedding = PatchEmbedding(6, dims.width, config.patch_size)
+        self.blocks = nn.ModuleList(
+            EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale)
+            for _ in range(config.depth)
+        )
+        self.norm = nn.LayerNorm(dims.width)
+        self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
+        self.k_norm = nn.LayerNorm(dims.width // dims.heads)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """The patch must divide both sides of the image."""
+        size, patch = context.image_size, config.patch_size
+        if size and any(side % patch for side in size):
+            nearest = [max(round(side / patch), 1) * patch for side in size]
+            yield Problem(
+                "patch_size",
+                f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
+                f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
+            )
+
+    def forward(self, views: Views) -> ImageMemory:
+        """Encode; raises ValueError when the patch does not divide the images."""
+        view_count, _, height, width = views.images.shape[1:]
+        if height % self.patch_size or width % self.patch_size:
+            raise ValueError(
+                f"images of {height} x {width} cannot be cut into patches of {self.patch_size}; "
+                "resize the views, or compose the model with another patch_size"
+            )
+        plucker = plucker_rays(views.cameras)
+        x_BMD = self.norm(self._encode(self.embed(views.images, plucker)))
+        keys, values = self.kv_proj(x_BMD).chunk(2, -1)
+        heads = self.dims.heads
+        values = split_heads(values, heads)
+        return ImageMemory(
+            keys=self.k_norm(split_heads(keys, heads)).to(values.dtype),
+            values=values,
+            features=x_BMD,
+            patch_rays=patch_rays(plucker, self.patch_size),
+            grid=(view_count, height // self.patch_size, width // self.patch_size),
+        )
+
+    def embed(self, images: Tensor, plucker: Tensor) -> Tensor:
+        """Images (B, V, 3, H, W) in [0, 1] and Plücker maps (B, V, 6, H, W) -> (B, M, D)."""
+        batch = images.shape[0]
+        tokens = self.rgb_embedding(_imagenet_normalised(images).flatten(0, 1))
+        tokens = tokens + self.ray_embedding(plucker.flatten(0, 1))
+        return rearrange(tokens, "(b v) p d -> b (v p) d", b=batch)
+
+    def _encode(self, x_BMD: Tensor) -> Tensor:
+        for block in self.blocks:
+            x_BMD = block(x_BMD)
+        return x_BMD
+
+
+def _imagenet_normalised(images: Tensor) -> Tensor:
+    options = {"dtype": images.dtype, "device": images.device}
+    mean = torch.tensor(IMAGENET_MEAN, **options).view(3, 1, 1)
+    std = torch.tensor(IMAGENET_STD, **options).view(3, 1, 1)
+    return (images - mean) / std

@@ -1,0 +1,92 @@
+"""`qgs/gaussian_head`: one linear layer from a query to its Gaussians (TokenGS, LocusGS)."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import ComponentConfig, Head, ModelDims
+from qgs.geometry.precision import full_precision
+from qgs.types import GaussianAttributes, QueryState
+
+CHANNELS = (3, 3, 3, 4, 1)
+"""Per Gaussian: position, RGB, scale, rotation, opacity (both releases)."""
+
+
+class GaussianHead(Head):
+    """D -> K * 14 linear, then the published activations in float32."""
+
+    name: ClassVar[str] = "gaussian_head"
+
+    class Config(ComponentConfig):
+        """Defaults are the LocusGS release's; TokenGS: scale_input_limit null, quat_eps 1e-12.
+
+        gaussians_per_query: K. init_std, position_std: truncated normal of all weights, of those
+        that make positions (None: the same). norm: a LayerNorm before the linear layer (in neither
+        release; steadier when small). scale_cap: largest scale c, world units. scale_input_limit:
+        clamp before the exponential, None for none. opacity_bias: added to the opacity logit.
+        quat_eps: floor of the quaternion's length before division.
+        """
+
+        gaussians_per_query: int = Field(64, ge=1)
+        init_std: float = Field(0.002, gt=0)
+        position_std: float | None = Field(None, gt=0)
+        norm: bool = False
+        scale_cap: float = Field(0.075, gt=0)
+        scale_input_limit: float | None = Field(10.0, gt=0)
+        opacity_bias: float = -2.0
+        quat_eps: float = Field(1e-4, gt=0)
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width) if config.norm else nn.Identity()
+        self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
+        nn.init.zeros_(self.linear.bias)
+        nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
+        if config.position_std is not None:
+            rows = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
+            nn.init.trunc_normal_(rows, std=config.position_std)
+            with torch.no_grad():
+                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows
+
+    @property
+    def gaussians_per_query(self) -> int:
+        """K."""
+        return self.config.gaussians_per_query
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        """(B, N, D) -> attributes of (B, N, K) Gaussians."""
+        raw = self.linear(self.norm(state.features))
+        return self.activate(rearrange(raw, "b n (k c) -> b n k c", c=sum(CHANNELS)))
+
+    def activate(self, raw: Tensor) -> GaussianAttributes:
+        """Raw channels (B, N, K, 14) to attributes."""
+        offsets, rgb, scale, rotation, opacity = _split(raw)
+        return GaussianAttributes(
+            offsets=offsets,
+            scales=capped_exp(scale, self.config.scale_cap, self.config.scale_input_limit),
+            quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
+            opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
+            colors=(torch.tanh(rgb) + 1) / 2,
+        )
+
+
+@full_precision
+def _split(raw: Tensor) -> tuple[Tensor, ...]:
+    return raw.split(CHANNELS, -1)
+
+
+@full_precision
+def capped_exp(t: Tensor, cap: float, input_limit: float | None) -> Tensor:
+    """min(exp(t - (1 - ln c)), c): c/e at t = 0, never above c (TokenGS release)."""
+    if input_limit is not None:
+        t = t.clamp(-input_limit, input_limit)
+    return torch.exp(t - (1 - math.log(cap))).clamp_max(cap)

@@ -1,0 +1,37 @@
+"""`qgs/latent`: plain learned queries (TokenGS)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import nn
+
+from qgs.contracts import ComponentConfig, ModelDims, Queries
+from qgs.types import QueryState
+
+
+class LatentQueries(Queries):
+    """N learned vectors, shared by all scenes, without a place in space."""
+
+    name: ClassVar[str] = "latent"
+
+    class Config(ComponentConfig):
+        """count: N. std: of the normal distribution they start from."""
+
+        count: int = Field(4096, ge=1)
+        std: float = Field(0.01, ge=0)
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.features.shape[0]
+
+    def forward(self, batch_size: int) -> QueryState:
+        """Features (B, N, D), no fields."""
+        return QueryState(self.features.expand(batch_size, -1, -1))

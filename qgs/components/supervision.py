@@ -1,0 +1,47 @@
+"""`qgs/layers`: a set of supervised layers, later ones weighing more (LocusGS)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import ClassVar
+
+from pydantic import Field, field_validator
+
+from qgs.contracts import ComponentConfig, Problem, RecipeContext, Supervision
+
+
+class LayerSupervision(Supervision):
+    """The m-th of S supervised layers weighs m / (1 + ... + S)."""
+
+    name: ClassVar[str] = "layers"
+
+    class Config(ComponentConfig):
+        """layers: numbers of the supervised decoder layers, ascending; 1 is the first."""
+
+        layers: tuple[int, ...] = Field((12,), min_length=1)
+
+        @field_validator("layers")
+        @classmethod
+        def _ascending(cls, layers: tuple[int, ...]) -> tuple[int, ...]:
+            if list(layers) != sorted(set(layers)) or layers[0] < 1:
+                raise ValueError(f"layers must ascend from 1 without repeats, got {list(layers)}")
+            return layers
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Every supervised layer must exist."""
+        beyond = [number for number in config.layers if number > context.dims.depth]
+        if beyond:
+            yield Problem(
+                "layers",
+                f"layers {beyond} do not exist in a decoder of depth {context.dims.depth}",
+                f"choose layers from 1 to {context.dims.depth}, or raise model.decoder.depth",
+            )
+
+    def weights(self) -> Mapping[int, float]:
+        """Layer number to weight."""
+        count = len(self.config.layers)
+        total = count * (count + 1) / 2
+        return {number: rank / total for rank, number in enumerate(self.config.layers, start=1)}
