@@ -26,8 +26,8 @@ class FreeCenters(Centers):
         """
 
         z_offset: float = 1.0
-        input_limit: float | None = Field(100.0, gt=0)
-        output_limit: float | None = Field(1000.0, gt=0)
+        input_limit: float | None = Field(default=100.0, gt=0)
+        output_limit: float | None = Field(default=1000.0, gt=0)
 
     config: Config
 

@@ -58,9 +58,9 @@ class MultiViewViT(Encoder):
     class Config(ComponentConfig):
         """patch_size: P in pixels. depth: blocks. layer_scale: its initial value."""
 
-        patch_size: int = Field(8, ge=1)
-        depth: int = Field(3, ge=0)
-        mlp_ratio: int = Field(4, ge=1)
+        patch_size: int = Field(default=8, ge=1)
+        depth: int = Field(default=3, ge=0)
+        mlp_ratio: int = Field(default=4, ge=1)
         layer_scale: float = 0.01
 
     def __init__(self, config: Config, dims: ModelDims) -> None:

@@ -19,7 +19,7 @@ class MlpFeedForward(FeedForward):
     class Config(ComponentConfig):
         """ratio: hidden width over D."""
 
-        ratio: int = Field(4, ge=1)
+        ratio: int = Field(default=4, ge=1)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

@@ -34,14 +34,14 @@ class GaussianHead(Head):
         quat_eps: floor of the quaternion's length before division.
         """
 
-        gaussians_per_query: int = Field(64, ge=1)
-        init_std: float = Field(0.002, gt=0)
-        position_std: float | None = Field(None, gt=0)
+        gaussians_per_query: int = Field(default=64, ge=1)
+        init_std: float = Field(default=0.002, gt=0)
+        position_std: float | None = Field(default=None, gt=0)
         norm: bool = False
-        scale_cap: float = Field(0.075, gt=0)
-        scale_input_limit: float | None = Field(10.0, gt=0)
+        scale_cap: float = Field(default=0.075, gt=0)
+        scale_input_limit: float | None = Field(default=10.0, gt=0)
         opacity_bias: float = -2.0
-        quat_eps: float = Field(1e-4, gt=0)
+        quat_eps: float = Field(default=1e-4, gt=0)
 
     config: Config
 

@@ -20,8 +20,8 @@ class LatentQueries(Queries):
     class Config(ComponentConfig):
         """count: N. std: of the normal distribution they start from."""
 
-        count: int = Field(4096, ge=1)
-        std: float = Field(0.01, ge=0)
+        count: int = Field(default=4096, ge=1)
+        std: float = Field(default=0.01, ge=0)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

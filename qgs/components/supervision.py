@@ -18,7 +18,7 @@ class LayerSupervision(Supervision):
     class Config(ComponentConfig):
         """layers: numbers of the supervised decoder layers, ascending; 1 is the first."""
 
-        layers: tuple[int, ...] = Field((12,), min_length=1)
+        layers: tuple[int, ...] = Field(default=(12,), min_length=1)
 
         @field_validator("layers")
         @classmethod

@@ -44,7 +44,7 @@ class Scene(ABC):
 class SceneSourceConfig(ComponentConfig):
     """image_size: (H, W) of every delivered image, in pixels."""
 
-    image_size: tuple[int, int] = Field((64, 64))
+    image_size: tuple[int, int] = Field(default=(64, 64))
 
 
 class SceneSource(Component):

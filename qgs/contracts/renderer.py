@@ -22,12 +22,12 @@ class RendererConfig(ComponentConfig):
     fall to this. background: RGB behind everything.
     """
 
-    near: float = Field(0.025, gt=0)
-    far: float = Field(125.0, gt=0)
-    dilation: float = Field(0.3, ge=0)
-    alpha_min: float = Field(1 / 255, gt=0, lt=1)
-    alpha_cap: float = Field(0.999, gt=0, lt=1)
-    transmittance_min: float = Field(1e-4, ge=0, lt=1)
+    near: float = Field(default=0.025, gt=0)
+    far: float = Field(default=125.0, gt=0)
+    dilation: float = Field(default=0.3, ge=0)
+    alpha_min: float = Field(default=1 / 255, gt=0, lt=1)
+    alpha_cap: float = Field(default=0.999, gt=0, lt=1)
+    transmittance_min: float = Field(default=1e-4, ge=0, lt=1)
     background: tuple[float, float, float] = (0.5, 0.5, 0.5)
 
 

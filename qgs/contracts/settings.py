@@ -20,13 +20,13 @@ class ViewsConfig(ComponentConfig):
     mirroring a training sample in x.
     """
 
-    inputs: int = Field(4, ge=1)
-    targets: int = Field(4, ge=1)
+    inputs: int = Field(default=4, ge=1)
+    targets: int = Field(default=4, ge=1)
     gap: tuple[int, int] = (10, 40)
     frame: Literal["first_cam", "mean_cam"] = "first_cam"
     scale: Literal["constant", "distance"] = "constant"
-    scale_factor: float = Field(0.15, gt=0)
-    mirror: float = Field(0.5, ge=0, le=1)
+    scale_factor: float = Field(default=0.15, gt=0)
+    mirror: float = Field(default=0.5, ge=0, le=1)
 
     @model_validator(mode="after")
     def _gap_is_ordered(self) -> ViewsConfig:
@@ -49,27 +49,27 @@ class TrainingConfig(ComponentConfig):
     training stops.
     """
 
-    steps: int = Field(150_000, ge=1)
-    seconds: float | None = Field(None, gt=0)
-    batch_size: int = Field(16, ge=1)
-    accumulate: int = Field(1, ge=1)
-    learning_rate: float = Field(4e-4, gt=0)
-    warmup: int = Field(2000, ge=0)
-    initial_divisor: float = Field(25.0, ge=1)
-    final_divisor: float = Field(1000.0, ge=1)
+    steps: int = Field(default=150_000, ge=1)
+    seconds: float | None = Field(default=None, gt=0)
+    batch_size: int = Field(default=16, ge=1)
+    accumulate: int = Field(default=1, ge=1)
+    learning_rate: float = Field(default=4e-4, gt=0)
+    warmup: int = Field(default=2000, ge=0)
+    initial_divisor: float = Field(default=25.0, ge=1)
+    final_divisor: float = Field(default=1000.0, ge=1)
     betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = Field(0.05, ge=0)
-    clip: float = Field(1.0, gt=0)
+    weight_decay: float = Field(default=0.05, ge=0)
+    clip: float = Field(default=1.0, gt=0)
     precision: Literal["float32", "bf16"] = "bf16"
-    workers: int = Field(0, ge=0)
-    save_every: int = Field(1000, ge=0)
-    evaluate_every: int = Field(0, ge=0)
-    collapse_window: int = Field(50, ge=10, le=100)
+    workers: int = Field(default=0, ge=0)
+    save_every: int = Field(default=1000, ge=0)
+    evaluate_every: int = Field(default=0, ge=0)
+    collapse_window: int = Field(default=50, ge=10, le=100)
 
 
 class EvaluationConfig(ComponentConfig):
     """What `qgs eval` runs: at most `scenes` test scenes, `samples` view samples from each."""
 
-    scenes: int = Field(32, ge=1)
-    samples: int = Field(1, ge=1)
-    seed: int = Field(0, ge=0)
+    scenes: int = Field(default=32, ge=1)
+    samples: int = Field(default=1, ge=1)
+    seed: int = Field(default=0, ge=0)

@@ -12,6 +12,11 @@ from torch import Tensor
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+def at_least_float32(x: Tensor) -> Tensor:
+    """Half-precision tensors raised to float32, others as they are."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+
+
 def full_precision(function: F) -> F:
     """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
 
@@ -19,9 +24,7 @@ def full_precision(function: F) -> F:
     """
 
     def raised(value: Any) -> Any:
-        if isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16):
-            return value.float()
-        return value
+        return at_least_float32(value) if isinstance(value, Tensor) else value
 
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:

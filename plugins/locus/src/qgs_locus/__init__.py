@@ -1,0 +1,21 @@
+"""LocusGS for qgs: queries with a 3D anchor that steers attention and places Gaussians."""
+
+from qgs.contracts import Plugin
+from qgs_locus.anchors import AnchoredQueries
+from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
+from qgs_locus.refinement import AnchorRefinement
+from qgs_locus.self_attention import AnchorAwareSelfAttention
+
+plugin = Plugin(
+    name="locus",
+    contract_version=1,
+    components=(
+        AnchoredQueries,
+        RayBiasedCrossAttention,
+        AnchorAwareSelfAttention,
+        AnchorRefinement,
+        AnchorOffsetCenters,
+        RadiusScaledCenters,
+    ),
+)

@@ -1,0 +1,105 @@
+"""`locus/anchored`: every query carries a 3D anchor, centre and support radius."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import ComponentConfig, Fields, ModelDims, Queries
+from qgs.types import QueryState, SpatialSupport
+from qgs_locus.fields import (
+    CENTER,
+    CENTER_FIELD,
+    RAW_RADIUS,
+    RadiusOptions,
+    radius_field,
+    raw_radius_of,
+    support_radius,
+)
+
+
+class NormalCenters(ComponentConfig):
+    """Centres start normally distributed around `mean`, world units (release: N(0, 1), z + 1)."""
+
+    kind: Literal["normal"] = "normal"
+    mean: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    std: float = Field(default=1.0, ge=0)
+
+    def sample(self, count: int) -> Tensor:
+        """Centres (count, 3)."""
+        return torch.randn(count, 3) * self.std + torch.tensor(self.mean)
+
+
+class FrustumCenters(ComponentConfig):
+    """Centres start inside the first camera's frustum, uniform in log depth and in the image.
+
+    depth: [nearest, farthest] z, world units. slope: largest |x / z| and |y / z|.
+    """
+
+    kind: Literal["frustum"]
+    depth: tuple[float, float] = (0.3, 3.0)
+    slope: float = Field(default=0.6, gt=0)
+
+    def sample(self, count: int) -> Tensor:
+        """Centres (count, 3)."""
+        near, far = self.depth
+        z = near * (far / near) ** torch.rand(count, 1)
+        return torch.cat([(2 * torch.rand(count, 2) - 1) * self.slope * z, z], -1)
+
+
+class AnchoredQueries(Queries):
+    """N learned vectors, centres mu and raw radii rho, shared by all scenes (LocusGS)."""
+
+    name: ClassVar[str] = "anchored"
+
+    class Config(RadiusOptions):
+        """count: N. std: of the features. radius: False for centres alone.
+
+        init_radius: r that every anchor starts with, world units. center_init: where they start.
+        """
+
+        count: int = Field(default=4096, ge=1)
+        std: float = Field(default=0.01, ge=0)
+        radius: bool = True
+        init_radius: float = Field(default=1.0, gt=0)
+        center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
+            NormalCenters()
+        )
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
+        self.center = nn.Parameter(config.center_init.sample(config.count))
+        if config.radius:
+            raw = raw_radius_of(config.init_radius)
+            self.raw_radius = nn.Parameter(torch.full((config.count, 1), raw))
+
+    @classmethod
+    def provides(cls, config: Config) -> Fields:
+        """The centre, and the raw radius if there is one."""
+        return {**CENTER_FIELD, **(radius_field(config) if config.radius else {})}
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.features.shape[0]
+
+    def forward(self, batch_size: int) -> QueryState:
+        """Features (B, N, D), `anchor.center` (B, N, 3) and `anchor.raw_radius` (B, N, 1)."""
+        fields = {CENTER: self.center.expand(batch_size, -1, -1)}
+        if self.config.radius:
+            fields[RAW_RADIUS] = self.raw_radius.expand(batch_size, -1, -1)
+        return QueryState(self.features.expand(batch_size, -1, -1), fields)
+
+    def support(self, state: QueryState) -> SpatialSupport:
+        """Balls of the support radius; points (radius 0) for anchors without one."""
+        center = state[CENTER]
+        radius = torch.zeros_like(center[..., :1])
+        if self.config.radius:
+            radius = support_radius(state[RAW_RADIUS], self.config)
+        return SpatialSupport(center, radius[..., None] * torch.eye(3).to(center))

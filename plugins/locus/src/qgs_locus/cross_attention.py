@@ -1,0 +1,91 @@
+"""`locus/ray_biased`: queries look first at the rays that pass near their anchor."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components import CrossAttentionCore
+from qgs.contracts import MEMORY_FIELDS, AttentionWeights, CrossAttention, Fields, ModelDims
+from qgs.types import ImageMemory, QueryState
+from qgs_locus.fields import (
+    CENTER,
+    CENTER_FIELD,
+    RAW_RADIUS,
+    RadiusOptions,
+    radius_field,
+    support_radius,
+)
+from qgs_locus.ray_bias import ray_bias
+
+
+class RayBiasedCrossAttention(CrossAttention):
+    """softmax(q k / sqrt(d) + gamma b) v, b = -1/2 (D / sigma)^2 (LocusGS).
+
+    sigma = sigma0 r ("radius") or sigma0 ("fixed"); the bias is the same for all heads.
+    """
+
+    name: ClassVar[str] = "ray_biased"
+
+    class Config(RadiusOptions):
+        """bandwidth: sigma follows the radius or is fixed. sigma0: its factor, world units.
+
+        sigma_sq_min: floor of (sigma0 r)^2. bias_min: lower clamp of b. gamma_init: start of g, one
+        number per layer, gamma = softplus(g).
+        """
+
+        bandwidth: Literal["radius", "fixed"] = "radius"
+        sigma0: float = Field(default=0.1, gt=0)
+        sigma_sq_min: float = Field(default=1e-3, gt=0)
+        bias_min: float = Field(default=-20.0, lt=0)
+        gamma_init: float = -2.25
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.core = CrossAttentionCore(dims.width, dims.heads)
+        self.raw_gamma = nn.Parameter(torch.tensor(config.gamma_init))
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """Keys, values, patch rays, centres, and radii if the bandwidth follows them."""
+        memory = ("memory.keys", "memory.values", "memory.patch_rays")
+        radius = radius_field(config) if config.bandwidth == "radius" else {}
+        return {name: MEMORY_FIELDS[name] for name in memory} | dict(CENTER_FIELD) | dict(radius)
+
+    @property
+    def gamma(self) -> Tensor:
+        """Weight of the bias, 0-d, positive."""
+        return F.softplus(self.raw_gamma)
+
+    def sigma_sq(self, state: QueryState) -> Tensor | float:
+        """Squared bandwidth: (B, N, 1), or one number when fixed."""
+        if self.config.bandwidth == "fixed":
+            return self.config.sigma0**2
+        radius = support_radius(state[RAW_RADIUS], self.config)
+        return (self.config.sigma0 * radius).square().clamp_min(self.config.sigma_sq_min)
+
+    def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
+        """gamma b (B, N, M), float32, computed from the state that enters the layer."""
+        return ray_bias(
+            state[CENTER],
+            self.sigma_sq(state),
+            memory.patch_rays,
+            self.config.bias_min,
+            self.gamma,
+        )
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
+        """The update (B, N, D)."""
+        bias = self.bias(state, memory)
+        return self.core(state.features, memory.keys, memory.values, bias)
+
+    def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
+        """Attention over image tokens, with the bias apart."""
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias)

@@ -1,0 +1,77 @@
+"""`locus/anchor_offset`, `locus/radius_scaled`: Gaussians stand around their query's anchor."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+from torch import Tensor
+
+from qgs.components import posact
+from qgs.contracts import Centers, ComponentConfig, Fields
+from qgs.geometry.precision import at_least_float32
+from qgs.types import QueryState
+from qgs_locus.fields import (
+    CENTER,
+    CENTER_FIELD,
+    RAW_RADIUS,
+    RadiusOptions,
+    radius_field,
+    support_radius,
+)
+
+
+class OffsetOptions(ComponentConfig):
+    """offset: posact(t) (release) or t itself (paper). input_limit, output_limit: see posact."""
+
+    offset: Literal["posact", "linear"] = "posact"
+    input_limit: float | None = Field(default=100.0, gt=0)
+    output_limit: float | None = Field(default=1000.0, gt=0)
+
+    def displacement(self, raw: Tensor) -> Tensor:
+        """Displacements of raw offsets, float32 or better, any shape."""
+        if self.offset == "linear":
+            return at_least_float32(raw)
+        return posact(raw, self.input_limit, self.output_limit)
+
+
+class AnchorOffsetCenters(Centers):
+    """mean = mu + posact(offset)."""
+
+    name: ClassVar[str] = "anchor_offset"
+
+    class Config(OffsetOptions):
+        """See OffsetOptions."""
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """Centres."""
+        return CENTER_FIELD
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        return state[CENTER][:, :, None] + self.config.displacement(offsets)
+
+
+class RadiusScaledCenters(Centers):
+    """mean = mu + r posact(offset)."""
+
+    name: ClassVar[str] = "radius_scaled"
+
+    class Config(OffsetOptions, RadiusOptions):
+        """See OffsetOptions and RadiusOptions."""
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """Centres and radii."""
+        return {**CENTER_FIELD, **radius_field(config)}
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        radius = support_radius(state[RAW_RADIUS], self.config)
+        displacement = radius[:, :, None] * self.config.displacement(offsets)
+        return state[CENTER][:, :, None] + displacement

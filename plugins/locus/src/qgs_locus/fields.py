@@ -1,0 +1,53 @@
+"""The anchor of a query as state fields, and how its radius is read."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import ComponentConfig, Fields, FieldSpec
+from qgs.geometry.precision import full_precision
+
+CENTER = "anchor.center"
+RAW_RADIUS = "anchor.raw_radius"
+
+CENTER_FIELD: Fields = {CENTER: FieldSpec((3,), frame="world")}
+"""Unbounded anchor centre mu (B, N, 3)."""
+
+
+class RadiusOptions(ComponentConfig):
+    """How a support radius r is read from the raw radius rho; all components must agree.
+
+    radius_bound: "floor" is r = max(softplus(rho), radius_min) (release), "offset" is
+    r = softplus(rho) + radius_min (paper).
+    """
+
+    radius_bound: Literal["floor", "offset"] = "floor"
+    radius_min: float = Field(default=1e-3, ge=0)
+
+
+def radius_field(options: RadiusOptions) -> Fields:
+    """Raw radius rho (B, N, 1) with its reading, so that a mismatch is refused at compose."""
+    reading = {
+        "floor": f"radius = max(softplus(x), {options.radius_min:g})",
+        "offset": f"radius = softplus(x) + {options.radius_min:g}",
+    }
+    return {RAW_RADIUS: FieldSpec((1,), frame="world", encoding=reading[options.radius_bound])}
+
+
+@full_precision
+def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
+    """Support radius r > 0, world units, of a raw radius of any shape."""
+    radius = F.softplus(raw_radius)
+    if options.radius_bound == "floor":
+        return radius.clamp_min(options.radius_min)
+    return radius + options.radius_min
+
+
+def raw_radius_of(radius: float) -> float:
+    """softplus^-1: the rho whose softplus is `radius` > 0."""
+    return radius + float(torch.log(-torch.expm1(torch.tensor(-radius, dtype=torch.float64))))
