@@ -1,0 +1,120 @@
+"""`qgs/gsplat`: the CUDA kernels of gsplat 1.5.3."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import import_module
+from importlib.util import find_spec
+
+import torch
+from torch import Tensor
+
+from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
+from qgs.renderers.inputs import background_of, check_inputs
+from qgs.types import Cameras, Gaussians, Rendering
+
+_FIXED = ("alpha_min", "alpha_cap", "transmittance_min")
+
+
+class GsplatRenderer(Renderer):
+    """For tensors on CUDA, in float32.
+
+    Differentiable in the Gaussians and in c2w; gsplat has no gradient for intrinsics, so
+    intrinsics that require one are refused. Its kernels fix alpha_min, alpha_cap and
+    transmittance_min at the defaults.
+    """
+
+    name = "gsplat"
+
+    def __init__(self, config: RendererConfig) -> None:
+        super().__init__(config)
+        for problem in _unsupported(config):
+            raise ValueError(f"{problem.option}: {problem.reason}; {problem.fix}")
+
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        """The options that gsplat's kernels fix."""
+        return _unsupported(config)
+
+    def forward(
+        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    ) -> Rendering:
+        """See `Renderer`.
+
+        Raises ValueError for tensors that are not on CUDA and for intrinsics that require a
+        gradient, RuntimeError when gsplat is not installed.
+        """
+        check_inputs(gaussians, cameras)
+        _check_supported(gaussians, cameras)
+        rasterization = import_module("gsplat").rasterization
+
+        config = self.config
+        with torch.autocast("cuda", enabled=False):
+            gaussians, cameras = gaussians.to(torch.float32), cameras.to(torch.float32)
+            backdrop = background_of(background, config.background, gaussians.means)
+            height, width = cameras.size
+            # The packed path asserts with backgrounds and can mix gradients between scenes.
+            rgbd, alpha, _ = rasterization(
+                means=gaussians.means,
+                quats=gaussians.quats,
+                scales=gaussians.scales,
+                opacities=gaussians.opacities,
+                colors=gaussians.colors,
+                viewmats=cameras.w2c,
+                Ks=_calibration(cameras.intrinsics),
+                width=width,
+                height=height,
+                near_plane=config.near,
+                far_plane=config.far,
+                eps2d=config.dilation,
+                packed=False,
+                backgrounds=backdrop.expand(*cameras.shape, 3).contiguous(),
+                render_mode="RGB+ED",
+            )
+        rgb, depth = rgbd.movedim(-1, -3).split([3, 1], dim=-3)
+        return Rendering(rgb=rgb, alpha=alpha.movedim(-1, -3), depth=depth)
+
+
+def _unsupported(config: ComponentConfig) -> list[Problem]:
+    defaults = RendererConfig()
+    return [
+        Problem(
+            option,
+            f"gsplat's kernels fix it at {getattr(defaults, option):g}, "
+            f"got {getattr(config, option):g}",
+            "remove the option, or choose qgs/torch or qgs/cpu as renderer",
+        )
+        for option in _FIXED
+        if getattr(config, option) != getattr(defaults, option)
+    ]
+
+
+def _check_supported(gaussians: Gaussians, cameras: Cameras) -> None:
+    if not gaussians.means.is_cuda:
+        raise ValueError(
+            f"qgs/gsplat renders CUDA tensors, got Gaussians on {gaussians.means.device}; move "
+            "them with .to('cuda') or choose `renderer: {type: qgs/auto}`"
+        )
+    if gaussians.means.dtype == torch.float64:
+        raise ValueError(
+            "qgs/gsplat renders float32, got float64 Gaussians; convert them with "
+            ".to(torch.float32) or choose `renderer: {type: qgs/torch}`"
+        )
+    if cameras.intrinsics.requires_grad:
+        raise ValueError(
+            "gsplat has no gradient for intrinsics, but they require one; detach them or choose "
+            "`renderer: {type: qgs/torch}`"
+        )
+    if find_spec("gsplat") is None:
+        raise RuntimeError(
+            "the renderer qgs/gsplat needs gsplat, which is not installed: run "
+            "`pip install qgs[gsplat]`, or choose `renderer: {type: qgs/torch}`"
+        )
+
+
+def _calibration(intrinsics: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) of intrinsics (..., 4)."""
+    fx, fy, cx, cy = intrinsics.unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    rows = [fx, zero, cx, zero, fy, cy, zero, zero, one]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
