@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+import torch
+
+from qgs.analysis.pictures.anchors import support_picture
+from qgs.analysis.pictures.attention import attention_pictures, patch_maps
+from qgs.analysis.pictures.ellipses import project_support
+from qgs.analysis.pictures.figures import Curves, curves_figure, figure_picture, running_mean
+from qgs.analysis.pictures.images import (
+    depth_picture,
+    depth_range,
+    enlarged,
+    finer,
+    rgb_picture,
+    washed,
+)
+from qgs.analysis.pictures.palette import CATEGORICAL, NOTHING
+from qgs.analysis.pictures.tokens import notable_tokens, rendered_weights, token_picture
+from qgs.geometry.projection import to_camera, to_pixels
+from qgs.types import SpatialSupport
+
+
+def ellipsoids(count: int = 5) -> SpatialSupport:
+    generator = torch.Generator().manual_seed(3)
+    centers = torch.rand(1, count, 3, generator=generator) - 0.5
+    axes = torch.linalg.qr(torch.randn(1, count, 3, 3, generator=generator)).Q
+    lengths = 0.05 + 0.3 * torch.rand(1, count, 1, 3, generator=generator)
+    return SpatialSupport(centers + torch.tensor([0.0, 0.0, 1.5]), axes * lengths)
+
+
+def test_outlines_hold_every_projected_surface_point_and_touch_the_outermost(cameras):
+    support = ellipsoids()
+    camera = cameras[:, 1:]
+    ellipses = project_support(support, camera)
+    assert ellipses.whole.all()
+    sphere = torch.nn.functional.normalize(torch.randn(20000, 3), dim=-1)
+    for index in range(5):
+        surface = support.centers[0, index] + sphere @ support.axes[0, index].T
+        in_camera = to_camera(surface[None], camera)[0, 0]
+        pixels = to_pixels(in_camera, camera.intrinsics[0, 0])
+        local = torch.linalg.solve(ellipses.axes[index], (pixels - ellipses.centers[index]).T).norm(
+            dim=0
+        )
+        assert local.max() < 1 + 1e-3
+        assert local.max() > 0.99
+
+
+def test_supports_around_or_behind_the_camera_have_no_outline(cameras):
+    centers = torch.tensor([[[0.0, 0.0, 0.1], [0.0, 0.0, -2.0], [0.0, 0.0, 2.0]]])
+    axes = (torch.eye(3) * 0.5).expand(1, 3, 3, 3)
+    ellipses = project_support(SpatialSupport(centers, axes), cameras[:, :1])
+    assert ellipses.whole.tolist() == [False, False, True]
+    assert ellipses.axes.isfinite().all()
+
+
+def test_support_picture_draws_the_chosen_in_their_colour(cameras):
+    photo = np.full((128, 128, 3), 255, np.uint8)
+    center = torch.tensor([[[0.0, 0.0, 2.0]]])
+    support = SpatialSupport(center, torch.eye(3)[None, None] * 0.5)
+    plain = support_picture(photo, support, cameras[:, :1], {})
+    drawn = support_picture(photo, support, cameras[:, :1], {0: CATEGORICAL[0]})
+    changed = (np.abs(plain.astype(int) - drawn) > 40).any(-1)
+    rows, columns = np.nonzero(changed)
+    radius = 4 * 32 * 0.5 / np.sqrt(2**2 - 0.5**2)
+    assert abs((columns.max() - columns.min()) / 2 - radius) < 3
+    assert abs(rows.mean() - 64) < 2
+
+
+def test_rendered_weights_add_up_to_the_coverage(model, gaussians, cameras):
+    weights = rendered_weights(model, gaussians, cameras)
+    alpha = model.render(gaussians, cameras).alpha
+    assert weights.shape == (1, gaussians.count)
+    torch.testing.assert_close(weights.sum(), alpha.sum(), rtol=1e-4, atol=1e-3)
+
+
+def test_notable_tokens_are_distinct_and_start_with_the_heaviest(model, gaussians, cameras):
+    tokens = notable_tokens(model, gaussians, cameras, 4)
+    weights = rendered_weights(model, gaussians, cameras).view(model.queries.count, -1).sum(1)
+    assert len({token.query for token in tokens}) == 4
+    assert tokens[0].query == int(weights.argmax())
+    means = gaussians.means.view(model.queries.count, -1, 3)[tokens[1].query]
+    spread = (means - means.mean(0)).norm(dim=-1).mean()
+    assert tokens[1].spread == pytest.approx(float(spread))
+
+
+def test_a_token_picture_is_grey_but_for_its_tokens(model, gaussians, cameras):
+    camera = finer(cameras[:, :1], 64)
+    tokens = notable_tokens(model, gaussians, camera, 1)
+    picture = token_picture(model, gaussians, tokens, camera).astype(int)
+    colored = np.ptp(picture, axis=-1) > 60
+    assert picture.shape == (64, 64, 3)
+    assert 0 < colored.mean() < 0.6
+    none = token_picture(model, gaussians, [], camera)
+    assert np.ptp(none.astype(int), axis=-1).max() == 0
+
+
+def test_finer_cameras_see_the_same_points_at_the_same_place(cameras):
+    fine = finer(cameras, 128)
+    assert fine.size == (128, 128)
+    torch.testing.assert_close(fine.intrinsics, cameras.intrinsics * 4)
+
+
+def test_depth_pictures_share_a_scale_and_show_where_nothing_is():
+    depth = torch.tensor([[[0.0, 1.0], [2.0, 3.0]]])
+    assert depth_range(depth)[0] == pytest.approx(1.0, abs=0.1)
+    picture = depth_picture(depth, 1.0, 3.0)
+    assert tuple(picture[0, 0]) == NOTHING
+    brightness = picture.sum(-1)
+    assert brightness[0, 1] > brightness[1, 0] > brightness[1, 1]
+    assert depth_range(torch.zeros(1, 2, 2)) == (0.0, 1.0)
+
+
+def test_pictures_keep_their_pixels():
+    image = torch.rand(3, 4, 6)
+    picture = rgb_picture(image)
+    np.testing.assert_allclose(picture / 255, image.permute(1, 2, 0), atol=0.51 / 255)
+    assert enlarged(picture, 24).shape == (16, 24, 3)
+    np.testing.assert_array_equal(enlarged(picture, 24)[::4, ::4], picture)
+    assert washed(picture).mean() > picture.mean()
+
+
+def test_attention_maps_share_one_scale_over_the_views():
+    scores = torch.zeros(8)
+    scores[5] = 1.0
+    maps = patch_maps(scores, (2, 2, 2))
+    assert maps[1, 0, 1] == 1
+    white = [np.full((16, 16, 3), 255, np.uint8)] * 2
+    first, second = attention_pictures(white, maps)
+    assert np.ptp(first.reshape(-1, 3), axis=0).max() == 0
+    assert (second[:8, 8:].astype(int) > second[8:, :8]).all()
+
+
+def test_curves_are_drawn_for_each_model():
+    run = Curves([0.0, 1.0, 2.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0])
+    alone = figure_picture(curves_figure({"a": run}), dpi=60)
+    both = figure_picture(curves_figure({"a": run, "b": run}), dpi=60)
+    assert alone.shape == both.shape
+    assert (alone != both).any()
+
+
+def test_running_mean_keeps_a_line_straight():
+    line = np.linspace(3, 9, 200)
+    np.testing.assert_allclose(running_mean(line), line)
+    noisy = line + np.random.default_rng(0).normal(size=200)
+    assert np.abs(running_mean(noisy)[10:-10] - line[10:-10]).max() < 1.5
