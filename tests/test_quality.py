@@ -1,0 +1,66 @@
+"""House rules that a machine can check: layers, style, types, file length, no machine's paths."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = ("qgs", "plugins", "tests", "tools")
+TEXTS = (*SOURCES, "docs", "recipes", ".ci")
+MAX_LINES = 400
+MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
+
+
+def files(directories: tuple[str, ...], suffixes: set[str]) -> Iterator[Path]:
+    for directory in directories:
+        for path in sorted((ROOT / directory).rglob("*")):
+            if path.is_file() and path.suffix in suffixes and "__pycache__" not in path.parts:
+                yield path
+
+
+def check(*command: str) -> None:
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if result.returncode:
+        pytest.fail(result.stdout + result.stderr, pytrace=False)
+
+
+def test_imports_follow_the_layers() -> None:
+    check(str(Path(sys.executable).with_name("lint-imports")), "--no-cache")
+
+
+def test_lint() -> None:
+    check(sys.executable, "-m", "ruff", "check", *SOURCES)
+
+
+def test_format() -> None:
+    check(sys.executable, "-m", "ruff", "format", "--check", *SOURCES)
+
+
+def test_types() -> None:
+    check(sys.executable, "-m", "basedpyright", "--pythonpath", sys.executable)
+
+
+def test_files_are_short() -> None:
+    lengths = {
+        str(path.relative_to(ROOT)): len(path.read_text(encoding="utf-8").splitlines())
+        for path in files(SOURCES, {".py"})
+    }
+    assert lengths, "no sources found"
+    assert {name: lines for name, lines in lengths.items() if lines > MAX_LINES} == {}
+
+
+def test_no_path_of_one_machine() -> None:
+    suffixes = {"", ".py", ".md", ".yaml", ".yml", ".toml", ".sh"}
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
+        for path in files(TEXTS, suffixes)
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        if MACHINE_PATH.search(line)
+    ]
+    assert found == []

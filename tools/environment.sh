@@ -1,0 +1,73 @@
+# Sourced by tools/demo and tools/test: `use_environment EXTRAS` makes sure that a virtual
+# environment holds qgs, its EXTRAS and plugins/locus, and puts it first on PATH.
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+
+die() {
+    printf 'qgs: %s\n' "$@" >&2
+    exit 1
+}
+
+is_new_enough() {
+    "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
+}
+
+find_python() {
+    local candidate
+    for candidate in python3 python3.14 python3.13 python3.12 python3.11; do
+        if is_new_enough "$candidate"; then
+            echo "$candidate"
+            return
+        fi
+    done
+    die "Python 3.11 or newer is needed, found $(python3 --version 2>&1 || true)." \
+        "On Debian or Ubuntu: sudo apt install python3.11 python3.11-venv"
+}
+
+make_environment() {
+    local directory=$1 python
+    python=$(find_python)
+    "$python" -c 'import ensurepip, venv' 2>/dev/null ||
+        die "$python cannot make virtual environments: its venv module is missing." \
+            "On Debian or Ubuntu: sudo apt install python3-venv"
+    echo "qgs: making the virtual environment $directory" >&2
+    "$python" -m venv --clear "$directory" || die "$directory could not be made (see above)."
+}
+
+# What an installation depends on; any change of it installs again.
+fingerprint() {
+    {
+        echo "$root"
+        "$1/bin/python" --version
+        cat "$root"/{pyproject.toml,constraints.txt,plugins/locus/pyproject.toml}
+    } | sha256sum | cut -d' ' -f1
+}
+
+install() {
+    local environment=$1 extras=$2 started=$SECONDS
+    echo "qgs: installing qgs[$extras] and plugins/locus into $environment" >&2
+    # Modules are compiled when first imported: most of them never are.
+    "$environment/bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
+        --constraint "$root/constraints.txt" \
+        --editable "$root[$extras]" --editable "$root/plugins/locus" ||
+        die "the installation failed (see above); run the command again to retry."
+    echo "qgs: installed in $((SECONDS - started)) s" >&2
+}
+
+use_environment() {
+    local extras=$1 environment=${VIRTUAL_ENV:-$root/.venv} wanted stamp
+    if [[ -n ${VIRTUAL_ENV:-} ]]; then
+        is_new_enough "$environment/bin/python" ||
+            die "the active virtual environment $environment has no Python 3.11 or newer." \
+                "Deactivate it and run the command again."
+    elif [[ ! -x $environment/bin/pip ]]; then
+        make_environment "$environment"
+    fi
+    stamp="$environment/.qgs-$extras"
+    wanted=$(fingerprint "$environment")
+    if [[ ! -f $stamp || $(<"$stamp") != "$wanted" ]]; then
+        install "$environment" "$extras"
+        echo "$wanted" >"$stamp"
+    fi
+    export VIRTUAL_ENV=$environment PATH="$environment/bin:$PATH"
+}
