@@ -22,7 +22,12 @@ SPLAT_FIELDS = 8
 SUMS = 5
 GRADIENTS = 10  # of u, v, xx, xy, yy, depth, opacity, r, g, b
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+_OPTIONS = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",  # no branch on a division by zero
+    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+}
 _LANES = np.uint64(TILE)
 _STATE = np.uint64(8 * TILE)  # floats per row of a tile
 _CHECK_EVERY = 16  # splats between two looks at which rows are still open
