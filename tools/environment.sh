@@ -45,6 +45,9 @@ fingerprint() {
 
 install() {
     local environment=$1 extras=$2 started=$SECONDS
+    "$environment/bin/python" -m pip --version >/dev/null 2>&1 ||
+        die "the virtual environment $environment has no pip." \
+            "Add it with: $environment/bin/python -m ensurepip"
     echo "qgs: installing qgs[$extras] and plugins/locus into $environment" >&2
     # Modules are compiled when first imported: most of them never are.
     "$environment/bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
@@ -54,20 +57,28 @@ install() {
     echo "qgs: installed in $((SECONDS - started)) s" >&2
 }
 
+is_installed() {
+    local environment=$1 wanted=$2 extra
+    for extra in ${3//,/ }; do
+        [[ -f $environment/.qgs-$extra && $(<"$environment/.qgs-$extra") == "$wanted" ]] || return 1
+    done
+}
+
 use_environment() {
-    local extras=$1 environment=${VIRTUAL_ENV:-$root/.venv} wanted stamp
+    local extras=$1 environment=${VIRTUAL_ENV:-$root/.venv} wanted extra
     if [[ -n ${VIRTUAL_ENV:-} ]]; then
         is_new_enough "$environment/bin/python" ||
             die "the active virtual environment $environment has no Python 3.11 or newer." \
                 "Deactivate it and run the command again."
-    elif [[ ! -x $environment/bin/pip ]]; then
+    elif ! is_new_enough "$environment/bin/python" || [[ ! -x $environment/bin/pip ]]; then
         make_environment "$environment"
     fi
-    stamp="$environment/.qgs-$extras"
     wanted=$(fingerprint "$environment")
-    if [[ ! -f $stamp || $(<"$stamp") != "$wanted" ]]; then
+    if ! is_installed "$environment" "$wanted" "$extras"; then
         install "$environment" "$extras"
-        echo "$wanted" >"$stamp"
+        for extra in ${extras//,/ }; do
+            echo "$wanted" >"$environment/.qgs-$extra"
+        done
     fi
     export VIRTUAL_ENV=$environment PATH="$environment/bin:$PATH"
 }
