@@ -48,7 +48,7 @@ def ray_bias(
     """
     scaled = center_features(center) * (-0.5 * gamma / sigma_sq)
     bias = scaled @ ray_features(patch_rays)
-    return torch.minimum(torch.maximum(bias, bias_min * gamma), torch.zeros_like(gamma))
+    return bias.clamp_(bias_min * gamma, torch.zeros_like(gamma))
 
 
 @full_precision

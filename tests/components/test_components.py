@@ -1,0 +1,133 @@
+"""The TokenGS components, each on its own."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from qgs import Cameras, QueryState, Views
+from qgs.components import (
+    FreeCenters,
+    GaussianHead,
+    LatentQueries,
+    LayerSupervision,
+    MultiViewViT,
+    posact,
+)
+from qgs.contracts import ModelDims, RecipeContext
+
+DIMS = ModelDims(width=16, heads=2, depth=2)
+
+
+def _views(batch: int = 1, views: int = 2, size: tuple[int, int] = (16, 24)) -> Views:
+    height, width = size
+    c2w = torch.eye(4).repeat(batch, views, 1, 1)
+    c2w[..., 0, 3] = torch.arange(views) * 0.2
+    intrinsics = torch.tensor([width, width, width / 2, height / 2]).float()
+    cameras = Cameras(c2w, intrinsics.expand(batch, views, 4), size)
+    return Views(torch.rand(batch, views, 3, *size), cameras)
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+def test_posact_and_its_slope_at_zero() -> None:
+    t = torch.tensor([-3.0, -1e-4, 0.0, 1e-4, 3.0], requires_grad=True)
+    y = posact(t)
+    torch.testing.assert_close(y, t.sign() * (t.abs().exp() - 1), rtol=1e-3, atol=1e-7)
+    y.sum().backward()
+    torch.testing.assert_close(t.grad, t.abs().exp())
+
+
+def test_posact_limits_keep_saturated_inputs_finite() -> None:
+    t = torch.tensor([-1e4, 1e4], requires_grad=True)
+    y = posact(t, 100.0, 1000.0)
+    y.sum().backward()
+    assert y.tolist() == [-1000.0, 1000.0]
+    assert torch.isfinite(t.grad).all()
+
+
+def test_memory_has_the_documented_shapes() -> None:
+    encoder = MultiViewViT(MultiViewViT.Config(depth=1), DIMS)
+    memory = encoder(_views(batch=2, views=3))
+    assert memory.grid == (3, 2, 3)
+    assert memory.keys.shape == memory.values.shape == (2, 2, 18, 8)
+    assert memory.features.shape == (2, 18, 16)
+    assert memory.patch_rays.shape == (2, 18, 6)
+
+
+def test_patch_rays_are_float32_under_autocast() -> None:
+    encoder = MultiViewViT(MultiViewViT.Config(depth=1), DIMS)
+    views = _views()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        memory = encoder(views)
+    assert memory.patch_rays.dtype == torch.float32
+    assert memory.values.dtype == torch.bfloat16
+
+
+def test_an_image_that_patches_do_not_divide() -> None:
+    encoder = MultiViewViT(MultiViewViT.Config(), DIMS)
+    with pytest.raises(ValueError, match="20 x 24 cannot be cut into patches of 8"):
+        encoder(_views(size=(20, 24)))
+    problems = MultiViewViT.problems(MultiViewViT.Config(), RecipeContext(DIMS, (20, 24)))
+    assert [problem.option for problem in problems] == ["patch_size"]
+
+
+def test_scenes_of_a_batch_do_not_see_each_other() -> None:
+    encoder = MultiViewViT(MultiViewViT.Config(depth=1, layer_scale=0.5), DIMS)
+    views = _views(batch=2)
+    images = views.images.clone().requires_grad_()
+    encoder(Views(images, views.cameras)).values[0].sum().backward()
+    assert images.grad[0].abs().sum() > 0
+    assert images.grad[1].abs().sum() == 0
+
+
+def test_head_activations() -> None:
+    config = GaussianHead.Config(gaussians_per_query=2)
+    head = GaussianHead(config, DIMS)
+    zero = head.activate(torch.zeros(1, 1, 2, 14))
+    torch.testing.assert_close(zero.scales, torch.full((1, 1, 2, 3), 0.075 / math.e))
+    torch.testing.assert_close(zero.opacities, torch.full((1, 1, 2), 1 / (1 + math.exp(2))))
+    torch.testing.assert_close(zero.colors, torch.full((1, 1, 2, 3), 0.5))
+    wild = head.activate(torch.randn(4, 3, 2, 14) * 1e4)
+    assert wild.scales.max() <= 0.075
+    torch.testing.assert_close(wild.quats.norm(dim=-1), torch.ones(4, 3, 2))
+
+
+def test_head_starts_with_the_spread_it_is_told() -> None:
+    dims = ModelDims(width=256, heads=4, depth=1)
+    config = GaussianHead.Config(gaussians_per_query=32, init_std=0.02, position_std=0.2)
+    weight = GaussianHead(config, dims).linear.weight.detach().unflatten(0, (32, 14))
+    assert weight[:, :3].std() == pytest.approx(0.2, rel=0.05)
+    assert weight[:, 3:].std() == pytest.approx(0.02, rel=0.05)
+
+
+def test_free_centers_ignore_the_state() -> None:
+    centers = FreeCenters(FreeCenters.Config(z_offset=1.0), DIMS)
+    offsets = torch.randn(1, 2, 3, 3)
+    means = centers(offsets, QueryState(torch.zeros(1, 2, 16)))
+    torch.testing.assert_close(means, posact(offsets) + torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_queries_are_shared_by_all_scenes() -> None:
+    queries = LatentQueries(LatentQueries.Config(count=7), DIMS)
+    features = queries(3).features
+    assert features.shape == (3, 7, 16)
+    assert torch.equal(features[0], features[2])
+
+
+@pytest.mark.parametrize(
+    ("layers", "expected"),
+    [
+        ((12,), {12: 1.0}),
+        ((6, 12), {6: 1 / 3, 12: 2 / 3}),
+        ((1, 2, 4), {1: 1 / 6, 2: 2 / 6, 4: 0.5}),
+    ],
+)
+def test_supervision_weights(layers: tuple[int, ...], expected: dict[int, float]) -> None:
+    weights = LayerSupervision(LayerSupervision.Config(layers=layers)).weights()
+    assert weights == pytest.approx(expected)
