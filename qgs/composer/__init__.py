@@ -1,1 +1,43 @@
-"""."""
+"""The composer: from a recipe to a checked, reproducible model.
+
+`compose` makes the model, `resolve` says everything about a recipe before anything is allocated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from qgs.composer.errors import RecipeError, RecipeProblem
+from qgs.composer.recipe import Recipe, resolve
+from qgs.composer.registry import PluginError, plugin_versions
+from qgs.model import QueryGaussianModel
+
+__all__ = [
+    "PluginError",
+    "Recipe",
+    "RecipeError",
+    "RecipeProblem",
+    "compose",
+    "plugin_versions",
+    "resolve",
+]
+
+
+def compose(
+    recipe: str | Path | Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    *,
+    device: torch.device | str | None = None,
+) -> QueryGaussianModel:
+    """The model that a recipe describes, with its initial parameters.
+
+    recipe: path of a YAML file, or a mapping of the same form. overrides: such as
+        "model.queries.count=128". device: where to put it; "meta" allocates nothing.
+    The same recipe gives the same parameters, and the global random state stays as it was.
+    Raises RecipeError, a ValueError, with every problem of the recipe.
+    """
+    return resolve(recipe, overrides).build_model(device)

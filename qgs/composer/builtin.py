@@ -1,0 +1,20 @@
+"""The plugin `qgs`: the components that ship with the framework."""
+
+from __future__ import annotations
+
+import qgs.components
+import qgs.data
+import qgs.losses
+import qgs.renderers
+from qgs.contracts import CONTRACT_VERSION, Plugin
+
+BUILTIN = Plugin(
+    name="qgs",
+    contract_version=CONTRACT_VERSION,
+    components=(
+        *qgs.components.COMPONENTS,
+        *getattr(qgs.renderers, "COMPONENTS", ()),
+        *getattr(qgs.losses, "COMPONENTS", ()),
+        *getattr(qgs.data, "COMPONENTS", ()),
+    ),
+)

@@ -1,0 +1,66 @@
+"""What is wrong with a recipe: every problem with its place, its reason and a fix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from qgs.composer.nodes import Origin
+
+
+@dataclass(frozen=True, order=True)
+class RecipeProblem:
+    """One mistake.
+
+    file: as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python mapping.
+    line: 1-based, 0 where there is none. path: dotted path in the recipe, "" for the whole of it.
+    """
+
+    file: str
+    line: int
+    path: str
+    reason: str
+    fix: str
+
+    def __str__(self) -> str:
+        return "\n".join(
+            (f"{Origin(self.file, self.line)}: {self.path or 'recipe'}",)
+            + tuple(f"  {label} {text}" for label, text in (("why:", self.reason), ("fix:", self.fix)))
+        )
+
+
+class RecipeError(ValueError):
+    """A recipe that cannot work. `problems` holds all that were found, by file and line."""
+
+    def __init__(self, problems: Iterable[RecipeProblem]) -> None:
+        self.problems = tuple(sorted(set(problems)))
+        count = len(self.problems)
+        title = "1 problem" if count == 1 else f"{count} problems"
+        super().__init__("\n".join([f"{title} in the recipe", *map(str, self.problems)]))
+
+
+class Problems:
+    """Collects problems while a recipe is read, so that all come at once."""
+
+    def __init__(self) -> None:
+        self._found: list[RecipeProblem] = []
+        self._stopped = False
+
+    def stop(self, origin: Origin, path: str, reason: str, fix: str) -> None:
+        """Note a mistake that hides part of the recipe: reading on would only mislead."""
+        self.add(origin, path, reason, fix)
+        self._stopped = True
+
+    def add(self, origin: Origin, path: str, reason: str, fix: str) -> None:
+        """Note a mistake and go on."""
+        self._found.append(RecipeProblem(origin.file, origin.line, path, reason, fix))
+
+    def raise_if_stopped(self) -> None:
+        """Raise RecipeError if part of the recipe could not be read."""
+        if self._stopped:
+            self.raise_any()
+
+    def raise_any(self) -> None:
+        """Raise RecipeError if anything was found."""
+        if self._found:
+            raise RecipeError(self._found)

@@ -1,0 +1,107 @@
+"""requires and provides, followed in the order in which a forward pass runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from qgs.composer.decode import Chosen
+from qgs.composer.errors import Problems
+from qgs.composer.nodes import Path
+from qgs.composer.providers import fix_mismatch, fix_unmet
+from qgs.composer.registry import Registry
+from qgs.composer.slots import LAYER_SLOTS
+from qgs.contracts import FieldSpec, Supervision
+
+
+@dataclass(frozen=True)
+class Step:
+    """One component's turn. layer: None in the decoder's own course, else the decoded layer."""
+
+    chosen: Chosen | None
+    layer: int | None = None
+
+
+def decoded_layers(chosen: Chosen | None, depth: int) -> set[int]:
+    """Numbers of the layers that are decoded: the supervised ones and the last."""
+    if chosen is None:
+        return {depth}
+    supervision = chosen.component(chosen.config)  # type: ignore[call-arg]
+    assert isinstance(supervision, Supervision)
+    return {*supervision.weights(), depth}
+
+
+def execution_order(
+    parts: Mapping[Path, Chosen | None], depth: int, decoded: set[int]
+) -> Iterator[Step]:
+    """Every component's turn in a training step."""
+    yield Step(parts["model", "encoder"])
+    yield Step(parts["model", "queries"])
+    for index in range(depth):
+        for name in LAYER_SLOTS:
+            yield Step(parts["model", "decoder", "layers", str(index), name])
+        if index + 1 in decoded:
+            for name in ("head", "centers", "renderer"):
+                yield Step(parts["model", name], index + 1)
+            for path, loss in parts.items():
+                if path[0] == "losses":
+                    yield Step(loss, index + 1)
+
+
+def check_flow(steps: Sequence[Step], registry: Registry, problems: Problems) -> None:
+    """Report fields that are read before they are written, or not as they are written.
+
+    After a component that could not be decoded nothing is reported as missing: it might have
+    provided it.
+    """
+    written: dict[str, tuple[FieldSpec, Chosen]] = {}
+    branch, layer, uncertain = dict(written), None, False
+    for position, step in enumerate(steps):
+        if step.layer is None:
+            fields = written
+        else:
+            if step.layer != layer:
+                branch, layer = dict(written), step.layer
+            fields = branch
+        if step.chosen is None:
+            uncertain = True
+            continue
+        _check_step(steps, position, fields, uncertain, registry, problems)
+        provided = step.chosen.component.provides(step.chosen.config)
+        fields.update({name: (spec, step.chosen) for name, spec in provided.items()})
+
+
+def _check_step(
+    steps: Sequence[Step],
+    position: int,
+    fields: Mapping[str, tuple[FieldSpec, Chosen]],
+    uncertain: bool,
+    registry: Registry,
+    problems: Problems,
+) -> None:
+    chosen = steps[position].chosen
+    assert chosen is not None
+    for name, spec in chosen.component.requires(chosen.config).items():
+        if name not in fields:
+            if not uncertain:
+                before = [step.chosen for step in steps[:position] if step.chosen]
+                after = [step.chosen for step in steps[position + 1 :] if step.chosen]
+                reason = f"`{chosen.type}` needs {name} ({spec}), which nothing before it provides"
+                later = next((c for c in after if _provides(c, name)), None)
+                if later:
+                    reason += f"; `{later.type}` at {later.written_at} provides it too late"
+                fix = fix_unmet(name, chosen, before, registry)
+                problems.add(chosen.place.origin, chosen.written_at, reason, fix)
+        elif fields[name][0] != spec:
+            found, writer = fields[name]
+            reason = (
+                f"`{chosen.type}` reads {name} as {spec}, "
+                f"`{writer.type}` at {writer.written_at} writes it as {found}"
+            )
+            problems.add(
+                chosen.place.origin, chosen.written_at, reason, fix_mismatch(chosen, writer)
+            )
+
+
+def _provides(chosen: Chosen, name: str) -> bool:
+    return name in chosen.component.provides(chosen.config)

@@ -1,0 +1,80 @@
+"""Which change of a recipe would meet a requirement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, get_args, get_origin
+
+from pydantic import ValidationError
+
+from qgs.composer.decode import Chosen
+from qgs.composer.registry import Registry
+from qgs.composer.slots import SLOTS
+from qgs.composer.yaml12 import dump
+from qgs.contracts import Component, ComponentConfig
+
+
+def fix_unmet(name: str, chosen: Chosen, before: Sequence[Chosen], registry: Registry) -> str:
+    """What to do when `chosen` needs a field `name` that nothing `before` it provides."""
+    fixes = dict.fromkeys(
+        f"set `{earlier.written_at}.{option}: {value}` on `{earlier.type}`"
+        for earlier in before
+        for option, value, config in _variants(earlier.config)
+        if name in earlier.component.provides(config)
+    )
+    if not fixes:
+        fixes = dict.fromkeys(_installed_providers(name, registry))
+    for option, value, config in _variants(chosen.config):
+        if name not in chosen.component.requires(config):
+            fixes[f"set `{chosen.written_at}.{option}: {value}`, which needs no {name}"] = None
+    return ", or ".join(fixes) or f"install a plugin with a component that provides {name}"
+
+
+def fix_mismatch(reader: Chosen, writer: Chosen) -> str:
+    """What to do when two components disagree about a field."""
+    ours, theirs = reader.config, writer.config
+    differing = [
+        option
+        for option in type(ours).model_fields
+        if option in type(theirs).model_fields and getattr(ours, option) != getattr(theirs, option)
+    ]
+    if not differing:
+        return f"choose another component than `{reader.type}` or `{writer.type}`"
+    words = [f"{option}: {_word(getattr(theirs, option))}" for option in differing]
+    return f"set `{', '.join(words)}` on `{reader.type}`, as on `{writer.type}`"
+
+
+def _installed_providers(name: str, registry: Registry) -> Iterator[str]:
+    for slot in SLOTS:
+        for kind, component in registry.components(slot).items():
+            for note, config in _default_configs(component):
+                if name in component.provides(config):
+                    yield f"use `{kind}`{note} in the slot `{slot}`"
+                    break
+
+
+def _default_configs(component: type[Component]) -> Iterator[tuple[str, ComponentConfig]]:
+    try:
+        config = component.Config()
+    except ValidationError:
+        return
+    yield "", config
+    for option, value, variant in _variants(config):
+        yield f" with `{option}: {value}`", variant
+
+
+def _variants(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
+    """`config` with one choice made otherwise: option, new value in YAML, new config."""
+    for option, field in type(config).model_fields.items():
+        choices: tuple[object, ...] = ()
+        if field.annotation is bool:
+            choices = (True, False)
+        elif get_origin(field.annotation) is Literal:
+            choices = get_args(field.annotation)
+        for choice in choices:
+            if choice != getattr(config, option):
+                yield option, _word(choice), config.model_copy(update={option: choice})
+
+
+def _word(value: object) -> str:
+    return dump(value).removesuffix("\n").removesuffix("\n...")

@@ -1,0 +1,173 @@
+"""The parts of a recipe that are no components: which keys there are, and their values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from qgs.composer.decode import decode_config
+from qgs.composer.errors import Problems
+from qgs.composer.nodes import ListNode, MapNode, Path, ScalarNode, is_null, kind_of
+from qgs.composer.registry import PluginError, Registry, builtin, load_plugin
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS
+from qgs.composer.suggest import did_you_mean
+from qgs.contracts import ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
+
+
+class ModelSettings(ComponentConfig):
+    """width: D. heads: h, a divisor of D (both papers)."""
+
+    width: int = Field(default=1024, ge=1)
+    heads: int = Field(default=16, ge=1)
+
+
+class DecoderSettings(ComponentConfig):
+    """depth: L. layer_scale: initial LayerScale of every sublayer (TokenGS release)."""
+
+    depth: int = Field(default=12, ge=1)
+    layer_scale: float = 5e-5
+
+
+class RecipeSettings(ComponentConfig):
+    """recipe: version of the recipe format. seed: of the model's initial parameters."""
+
+    recipe: Literal[1]
+    seed: int = Field(default=0, ge=0, lt=2**63)
+
+
+SETTINGS: dict[Path, type[ComponentConfig]] = {
+    (): RecipeSettings,
+    ("model",): ModelSettings,
+    ("model", "decoder"): DecoderSettings,
+    ("views",): ViewsConfig,
+    ("training",): TrainingConfig,
+    ("evaluation",): EvaluationConfig,
+}
+"""Where which settings stand."""
+
+TOP_SECTIONS = ("plugins", "swap", "model", "losses", "data", "views", "training", "evaluation")
+
+_CHILDREN: dict[Path, tuple[str, ...]] = {
+    (): TOP_SECTIONS,
+    ("model",): (*MODEL_SLOTS, "decoder"),
+    ("model", "decoder"): (*LAYER_SLOTS, "layers"),
+}
+"""Keys of a section that are no settings of its own."""
+
+_MAPPINGS: tuple[Path, ...] = (
+    ("model",),
+    ("model", "decoder"),
+    ("model", "decoder", "layers"),
+    ("losses",),
+    ("swap",),
+    ("views",),
+    ("training",),
+    ("evaluation",),
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Decoded settings; None for a section that has problems."""
+
+    recipe: RecipeSettings | None
+    model: ModelSettings | None
+    decoder: DecoderSettings | None
+    views: ViewsConfig | None
+    training: TrainingConfig | None
+    evaluation: EvaluationConfig | None
+
+
+def check_tree(tree: MapNode, problems: Problems) -> MapNode:
+    """Report unknown keys and sections that are no mappings; the tree without them."""
+    for path in _MAPPINGS:
+        tree = _without_misfit(tree, path, (), problems)
+    _report_unknown(tree, problems)
+    return tree
+
+
+def _without_misfit(tree: MapNode, path: Path, above: Path, problems: Problems) -> MapNode:
+    name, rest = path[0], path[1:]
+    node = tree.items.get(name)
+    if node is None or is_null(node):
+        return tree.without(name)
+    if not isinstance(node, MapNode):
+        where = ".".join((*above, name))
+        reason = f"`{name}` is a mapping, this is {kind_of(node)}"
+        problems.add(tree.keys[name], where, reason, f"write `key: value` lines below `{name}:`")
+        return tree.without(name)
+    if rest:
+        child = _without_misfit(node, rest, (*above, name), problems)
+        return tree.with_item(name, child, tree.keys[name])
+    return tree
+
+
+def _report_unknown(tree: MapNode, problems: Problems) -> None:
+    for path, children in _CHILDREN.items():
+        node = tree
+        for step in path:
+            node = node.child_map(step)
+        known = {*children, *SETTINGS[path].model_fields}
+        for key in sorted(set(node.items) - known):
+            problems.add(
+                node.keys[key],
+                ".".join((*path, key)),
+                f"there is no key `{key}` here",
+                _fix_key(key, path, known),
+            )
+
+
+def _fix_key(key: str, path: Path, known: set[str]) -> str:
+    for home, children in _CHILDREN.items():
+        if home != path and key in {*children, *SETTINGS[home].model_fields}:
+            return f"did you mean `{'.'.join((*home, key))}`?"
+    return did_you_mean(key, known, "keys")
+
+
+def decode_settings(tree: MapNode, problems: Problems) -> Settings:
+    """All settings of a checked tree; defaults where nothing is written."""
+    decoded = []
+    for path, config in SETTINGS.items():
+        node = tree
+        for step in path:
+            node = node.child_map(step)
+        unknown = set(node.items) - set(config.model_fields)
+        known = node.without(*unknown) if path in _CHILDREN else node
+        decoded.append(decode_config(config, known, path, problems))
+    settings = Settings(*decoded)
+    _check_heads(tree.child_map("model"), settings.model, problems)
+    return settings
+
+
+def _check_heads(node: MapNode, model: ModelSettings | None, problems: Problems) -> None:
+    if model is not None and model.width % model.heads:
+        fitting = [n for n in range(1, model.width + 1) if model.width % n == 0]
+        near = min(fitting, key=lambda n: abs(n - model.heads))
+        problems.add(
+            node.keys.get("heads", node.keys.get("width", node.origin)),
+            "model.heads",
+            f"{model.heads} heads do not divide the width {model.width}",
+            f"set model.heads to {near}, or make model.width a multiple of {model.heads}",
+        )
+
+
+def load_plugins(tree: MapNode, problems: Problems) -> Registry:
+    """The components of the recipe's `plugins`; a problem for each that cannot be used."""
+    plugins = {"qgs": builtin()}
+    written = tree.items.get("plugins")
+    if written is not None and not isinstance(written, ListNode) and not is_null(written):
+        reason = f"`plugins` is a list, this is {kind_of(written)}"
+        problems.add(tree.keys["plugins"], "plugins", reason, "write `plugins: [NAME]`")
+    for index, item in enumerate(written.items if isinstance(written, ListNode) else ()):
+        path = f"plugins.{index}"
+        if not (isinstance(item, ScalarNode) and isinstance(item.value, str)):
+            reason = f"a plugin is a name, this is {kind_of(item)}"
+            problems.add(item.origin, path, reason, "write `plugins: [NAME]`")
+            continue
+        try:
+            plugins[item.value] = load_plugin(item.value)
+        except PluginError as error:
+            problems.add(item.origin, path, error.reason, error.fix)
+    return Registry(plugins)

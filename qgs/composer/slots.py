@@ -1,0 +1,86 @@
+"""The places of a recipe that hold components, and what stands there by default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from qgs.composer.nodes import MapNode, Node, Path, ScalarNode
+from qgs.contracts import (
+    Centers,
+    Component,
+    CrossAttention,
+    Encoder,
+    FeedForward,
+    Head,
+    Loss,
+    Queries,
+    Refinement,
+    Renderer,
+    SceneSource,
+    SelfAttention,
+    Supervision,
+)
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One kind of place. default: the `type` of a place that names none; None if it must."""
+
+    contract: type[Component]
+    default: str | None
+
+    @property
+    def name(self) -> str:
+        """The slot's name, as components know it."""
+        return self.contract.slot
+
+
+SLOTS = {
+    slot.name: slot
+    for slot in (
+        Slot(Encoder, "qgs/multiview_vit"),
+        Slot(Queries, "qgs/latent"),
+        Slot(CrossAttention, "qgs/content"),
+        Slot(SelfAttention, "qgs/content"),
+        Slot(FeedForward, "qgs/mlp"),
+        Slot(Refinement, "qgs/none"),
+        Slot(Head, "qgs/gaussian_head"),
+        Slot(Centers, "qgs/free"),
+        Slot(Supervision, "qgs/layers"),
+        Slot(Renderer, "qgs/auto"),
+        Slot(Loss, None),
+        Slot(SceneSource, "qgs/rooms"),
+    )
+}
+
+MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
+LAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward", "refinement")
+
+DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
+"""What a recipe without `losses` is trained with."""
+
+
+def slot_at(path: Path) -> Slot | None:
+    """The slot at a place of a recipe; None where no component belongs."""
+    match path:
+        case ("model", name) if name in MODEL_SLOTS:
+            return SLOTS[name]
+        case ("model", "decoder", name) if name in LAYER_SLOTS:
+            return SLOTS[name]
+        case ("model", "decoder", "layers", _, name) if name in LAYER_SLOTS:
+            return SLOTS[name]
+        case ("losses", _):
+            return SLOTS["losses"]
+        case ("data",):
+            return SLOTS["data"]
+    return None
+
+
+def type_at(node: Node | None, path: Path) -> Any:
+    """The `type` of the component written as `node` at `path`: its own, or the slot's default."""
+    if isinstance(node, MapNode) and "type" in node.items:
+        written = node.items["type"]
+        return written.value if isinstance(written, ScalarNode) else written
+    slot = slot_at(path)
+    return slot.default if slot else None
