@@ -1,0 +1,165 @@
+"""A model as one safetensors file that carries its recipe; no pickle is ever read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+import qgs
+from qgs.composer import Recipe, resolve
+from qgs.contracts import CONTRACT_VERSION
+from qgs.io.atomic import replacing
+from qgs.model import QueryGaussianModel
+
+FORMAT_VERSION = 1
+"""Raised when the layout of the file changes."""
+
+_RECIPE, _PLUGINS, _CONTRACT = "qgs.recipe", "qgs.plugins", "qgs.contract_version"
+_FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
+
+_PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
+
+
+class CheckpointError(ValueError):
+    """A file that is no usable checkpoint; the message says why and what to do."""
+
+
+def save(
+    model: QueryGaussianModel,
+    path: str | os.PathLike[str],
+    *,
+    extra: Mapping[str, str] | None = None,
+    weights: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Write the weights of `model` and its resolved recipe to `path`, whole or not at all.
+
+    extra: more metadata, such as the training step. weights: take these, named as by
+    `unique_tensors`, instead of the model's present ones.
+    Raises ValueError for a model that was not composed from a recipe.
+    """
+    if model.recipe is None:
+        raise ValueError(
+            "this model was built by hand and has no recipe to save; build it with qgs.compose"
+        )
+    metadata = {
+        _RECIPE: json.dumps(model.recipe),
+        _PLUGINS: json.dumps(dict(resolve(model.recipe).plugin_versions)),
+        _CONTRACT: str(CONTRACT_VERSION),
+        _FORMAT: str(FORMAT_VERSION),
+        _VERSION: qgs.__version__,
+        **{_EXTRA + key: value for key, value in (extra or {}).items()},
+    }
+    tensors = {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for name, tensor in (weights or unique_tensors(model)).items()
+    }
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata)
+
+
+def load(
+    path: str | os.PathLike[str], device: str | torch.device | None = None
+) -> QueryGaussianModel:
+    """Rebuild the model that `save` wrote, on `device` (default: CPU), in evaluation mode.
+
+    Raises FileNotFoundError, CheckpointError, or the composer's error when a plugin is missing.
+    """
+    metadata = _read_metadata(path)
+    model = resolve(json.loads(metadata[_RECIPE])).build_model()
+    with safe_open(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    load_weights(model, tensors, str(path))
+    return (model if device is None else model.to(device)).eval()
+
+
+def load_recipe(path: str | os.PathLike[str]) -> Recipe:
+    """The recipe that a checkpoint carries. Raises as `load` does."""
+    return resolve(json.loads(_read_metadata(path)[_RECIPE]))
+
+
+def load_extra(path: str | os.PathLike[str]) -> dict[str, str]:
+    """The `extra` metadata that `save` was given. Raises as `load` does."""
+    metadata = _read_metadata(path)
+    return {k.removeprefix(_EXTRA): v for k, v in metadata.items() if k.startswith(_EXTRA)}
+
+
+def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
+    """Parameters and persistent buffers, a shared one only under its first name."""
+    first_names: dict[int, str] = {}
+    state = model.state_dict(keep_vars=True)
+    for name, tensor in state.items():
+        first_names.setdefault(id(tensor), name)
+    return {name: state[name] for name in first_names.values()}
+
+
+def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
+    """Copy `tensors` into `model`; names and shapes must match exactly.
+
+    Raises CheckpointError that lists all differences; `origin` names the source in it.
+    """
+    own = unique_tensors(model)
+    differences = [f"missing: {name}" for name in own if name not in tensors]
+    differences += [f"unexpected: {name}" for name in tensors if name not in own]
+    differences += [
+        f"shape of {name}: {tuple(tensors[name].shape)} in the file, {tuple(own[name].shape)} here"
+        for name in own
+        if name in tensors and tensors[name].shape != own[name].shape
+    ]
+    if differences:
+        raise CheckpointError(
+            f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
+            + "\n  ".join(differences)
+            + "\nInstall the versions of qgs and of its plugins that wrote the file."
+        )
+    with torch.no_grad():
+        for name, tensor in own.items():
+            tensor.copy_(tensors[name])
+
+
+def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no checkpoint at {path}")
+    _refuse_pickle(path)
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+    except SafetensorError as error:
+        raise CheckpointError(
+            f"{path} is not a whole safetensors file ({error}); it may be cut off: copy it again"
+        ) from error
+    if _RECIPE not in metadata:
+        raise CheckpointError(
+            f"{path} is a safetensors file without a qgs recipe; only files written by qgs.save "
+            "or `qgs train` can be loaded"
+        )
+    _refuse_newer(path, metadata)
+    return metadata
+
+
+def _refuse_pickle(path: str | os.PathLike[str]) -> None:
+    with open(path, "rb") as file:
+        start = file.read(4)
+        json_follows = file.seek(8) and file.read(1) == b"{"
+    for magic, kind in _PICKLES.items():
+        if start.startswith(magic) and not json_follows:
+            raise CheckpointError(
+                f"{path} is {kind}, whatever its name says; such files can run code when they are "
+                "read, so qgs never opens them: use the safetensors file of the run"
+            )
+
+
+def _refuse_newer(path: str | os.PathLike[str], metadata: Mapping[str, str]) -> None:
+    for key, known in ((_CONTRACT, CONTRACT_VERSION), (_FORMAT, FORMAT_VERSION)):
+        written = int(metadata.get(key, 0))
+        if written > known:
+            raise CheckpointError(
+                f"{path} was written by qgs {metadata.get(_VERSION, '?')} with {key} {written}; "
+                f"this is qgs {qgs.__version__}, which knows {known}: install the newer qgs"
+            )

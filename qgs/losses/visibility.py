@@ -1,0 +1,103 @@
+"""`qgs/visibility`: points that no supervised view sees are drawn towards one (TokenGS)."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import ComponentConfig, Loss
+from qgs.geometry.precision import full_precision
+from qgs.geometry.projection import to_camera
+from qgs.types import Cameras, LayerPrediction, Rendering, Views
+
+BehindCamera = Literal["published", "invisible"]
+
+_TINY_Z = 1e-8
+"""Below this |z| counts as 0, so that gradients of x / z stay finite."""
+
+_INFINITE_PIXEL = 1e6
+"""Stands for x / 0 with x != 0 (TokenGS release)."""
+
+
+class VisibilityOptions(ComponentConfig):
+    """Options of a visibility loss.
+
+    weight: factor of the term. clamp: upper bound per point, half images (release: 1). near: in a
+    view, points with z <= near are behind the camera. behind_camera: "published" ignores the sign
+    of z as both releases do, so that such a point is seen mirrored and may count as visible;
+    "invisible" gives it the full `clamp` in that view. Like every clamped point it gets no gradient
+    from there, and still moves under views that it stands in front of.
+    """
+
+    weight: float = Field(default=1.0, ge=0)
+    clamp: float = Field(default=1.0, gt=0)
+    near: float = Field(default=0.025, gt=0)
+    behind_camera: BehindCamera = "published"
+
+
+class Visibility(Loss):
+    """Mean over Gaussians of `view_visibility` of their means."""
+
+    name: ClassVar[str] = "visibility"
+
+    class Config(VisibilityOptions):
+        """See `VisibilityOptions`."""
+
+    config: Config
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        """One term, `visibility`."""
+        per_point = view_visibility(
+            prediction.gaussians.means,
+            target.cameras,
+            clamp=self.config.clamp,
+            behind=self.config.near if self.config.behind_camera == "invisible" else None,
+        )
+        return {"visibility": self.config.weight * per_point.mean()}
+
+
+def view_visibility(
+    points: Tensor,
+    cameras: Cameras,
+    *,
+    clamp: float | None = 1.0,
+    behind: float | None = None,
+    z_guard: float | None = None,
+) -> Tensor:
+    """How far each point is from the nearest view that would see it, 0 if one does (B, P).
+
+    points: (B, P, 3) world. cameras: (B, V). Per view, with u and v scaled to [-1, 1] over the
+    image: relu(|u| - 1) + relu(|v| - 1); then the minimum over views, at most `clamp` (TokenGS,
+    LocusGS releases). behind: z at or below which a point is infinitely far from a view's image;
+    None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard (LocusGS anchors);
+    None leaves z alone, where x / 0 is far outside and 0 / 0 visible (TokenGS).
+
+    Values and gradients are finite everywhere, as long as `clamp` is set whenever `behind` is.
+    """
+    camera_points = to_camera(points, cameras)
+    excess = _image_excess(camera_points, cameras, z_guard)
+    if behind is not None:
+        excess = torch.where(camera_points[..., 2] <= behind, torch.inf, excess)
+    nearest = excess.amin(dim=1)
+    return nearest if clamp is None else nearest.clamp_max(clamp)
+
+
+@full_precision
+def _image_excess(camera_points: Tensor, cameras: Cameras, z_guard: float | None) -> Tensor:
+    """relu(|u| - 1) + relu(|v| - 1) of camera-frame points (B, V, P, 3) -> (B, V, P)."""
+    xy, z = camera_points[..., :2], camera_points[..., 2:]
+    if z_guard is not None:
+        z = torch.where(z.abs() < z_guard, z_guard, z)
+    at_zero = z.abs() < _TINY_Z
+    focal, principal = cameras.intrinsics[..., None, :2], cameras.intrinsics[..., None, 2:]
+    pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
+    limit = torch.where(xy == 0, 0.0, _INFINITE_PIXEL * xy.sign())
+    pixels = torch.where(at_zero, limit, pixels)
+    height, width = cameras.size
+    normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1
+    return (normalised.abs() - 1).relu().sum(-1)
