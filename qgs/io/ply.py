@@ -1,0 +1,109 @@
+"""Gaussians as PLY files that splat viewers open (property names and order: 3DGS release)."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from qgs.io.atomic import replacing
+from qgs.types import Gaussians
+
+SH_C0 = 0.28209479177387814
+"""The spherical harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
+
+OPACITY_EPS = 1e-6
+"""Opacities are kept this far from 0 and 1, where the logit is infinite."""
+
+SCALE_MIN = 1e-12
+"""Smallest scale stored, world units: the logarithm of 0 is infinite."""
+
+PROPERTIES = (
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
+
+
+def write_ply(gaussians: Gaussians, path: str | Path) -> None:
+    """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
+
+    Colours become f_dc, opacities logits, scales logarithms; quaternions stay w x y z; normals are
+    zero. The file appears whole or not at all. Raises ValueError for several scenes or for numbers
+    that are not finite.
+    """
+    table = _table(_single_scene(gaussians))
+    vertices = np.empty(len(table), dtype=[(name, "<f4") for name in PROPERTIES])
+    for column, name in enumerate(PROPERTIES):
+        vertices[name] = table[:, column]
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<")
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        ply.write(file)
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """Read the (1, G, ...) Gaussians of a 3DGS file, whoever wrote it.
+
+    Raises ValueError for a file without the 3DGS properties, and for view-dependent colour
+    (f_rest not zero), which `Gaussians` cannot hold.
+    """
+    vertices = _read_vertices(Path(path))
+    names = vertices.dtype.names or ()
+    missing = [name for name in PROPERTIES if name not in names and name not in ("nx", "ny", "nz")]
+    if missing:
+        raise ValueError(f"{path} is no 3DGS file: properties {', '.join(missing)} are missing")
+    if any(np.any(vertices[name]) for name in names if name.startswith("f_rest_")):
+        raise ValueError(
+            f"{path} holds view-dependent colour (f_rest), but Gaussians have one RGB each; "
+            "export it with spherical harmonics of degree 0"
+        )
+
+    def columns(*wanted: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([vertices[name] for name in wanted], -1, dtype=np.float32))
+
+    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    return Gaussians(
+        means=columns("x", "y", "z"),
+        scales=columns("scale_0", "scale_1", "scale_2").exp(),
+        quats=torch.nn.functional.normalize(quats, dim=-1),
+        opacities=columns("opacity")[:, 0].sigmoid(),
+        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * SH_C0 + 0.5,
+    )[None]
+
+
+def _single_scene(gaussians: Gaussians) -> Gaussians:
+    batch = gaussians.means.shape[:-2]
+    if batch == ():
+        return gaussians
+    if batch != (1,):
+        raise ValueError(
+            f"a PLY file holds one scene, got Gaussians of batch shape {tuple(batch)}; "
+            "write them one by one, as gaussians[i]"
+        )
+    return gaussians[0]
+
+
+def _table(gaussians: Gaussians) -> np.ndarray:
+    """(G, 17) in the order of PROPERTIES."""
+    parts = [
+        gaussians.means,
+        torch.zeros_like(gaussians.means),
+        (gaussians.colors - 0.5) / SH_C0,
+        gaussians.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
+        gaussians.scales.clamp_min(SCALE_MIN).log(),
+        gaussians.quats,
+    ]
+    table = torch.cat([part.detach().float().cpu() for part in parts], -1)
+    broken = int((~table.isfinite()).any(-1).sum())
+    if broken:
+        raise ValueError(f"{broken} of {len(table)} Gaussians have numbers that are not finite")
+    return table.numpy()
+
+
+def _read_vertices(path: Path) -> np.ndarray:
+    try:
+        return PlyData.read(BytesIO(path.read_bytes()))["vertex"].data
+    except (PlyParseError, KeyError) as error:
+        raise ValueError(f"{path} is not a readable PLY file of vertices: {error}") from error
