@@ -1,0 +1,36 @@
+"""What the README shows is what the repository holds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import yaml
+
+from qgs.composer.slots import DEFAULT_LOSSES, SLOTS
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def section(title: str) -> str:
+    return README.split(f"\n## {title}\n")[1].split("\n## ")[0]
+
+
+def test_overlay_is_the_recipe() -> None:
+    shown = re.findall(r"```yaml\n(.*?)```", README, re.DOTALL)
+    recipe = (ROOT / "recipes/locus/overlay.yaml").read_text(encoding="utf-8")
+    assert [yaml.safe_load(text) for text in shown] == [yaml.safe_load(recipe)]
+
+
+def test_slots_and_their_defaults() -> None:
+    rows = re.findall(r"^\| `([\w.]+)` \| [^|]* \| ([^|]*) \|", section("Slots"), re.MULTILINE)
+    shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
+    defaults = {name: [slot.default] for name, slot in SLOTS.items()}
+    assert shown == {**defaults, "losses": list(DEFAULT_LOSSES.values())}
+
+
+def test_paths_exist() -> None:
+    paths = re.findall(r"`(?:\./)?((?:recipes|tools|docs|plugins|tests)/[\w./-]+)`", README)
+    assert paths
+    assert [path for path in paths if not (ROOT / path).exists()] == []
