@@ -1,0 +1,168 @@
+"""Furnishing a room around a camera path, so that no camera ever stands in furniture."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from qgs.data.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
+from qgs.data.rooms.materials import Materials
+from qgs.data.rooms.shapes import Room, Shape, box, cylinder
+
+CLEARANCE = 0.5  # metres between a camera and the nearest shape
+_GAP = 0.05  # metres between pieces
+
+
+class Furnisher:
+    """Places pieces one by one where they hit neither each other nor the cameras."""
+
+    def __init__(self, size: tuple[float, float, float], eyes: np.ndarray) -> None:
+        self.size, self.eyes = size, eyes
+        self.shapes: list[Shape] = []
+        self._taken: list[tuple[float, float, float, float]] = []
+
+    def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
+        """Put `piece` at (x, y), turned; False, and nothing is placed, where it does not fit."""
+        shapes = [shape.moved(x, y, turn) for shape in piece]
+        low, high = bounds(shapes)
+        inside = abs(low[0]) <= self.size[0] / 2 and abs(high[0]) <= self.size[0] / 2
+        inside = inside and abs(low[1]) <= self.size[1] / 2 and abs(high[1]) <= self.size[1] / 2
+        if not inside or self._blocked(low, high) or not clear_of(low, high, self.eyes):
+            return False
+        self._taken.append((low[0], low[1], high[0], high[1]))
+        self.shapes += shapes
+        return True
+
+    def _blocked(self, low: np.ndarray, high: np.ndarray) -> bool:
+        return any(
+            low[0] < x1 + _GAP
+            and high[0] > x0 - _GAP
+            and low[1] < y1 + _GAP
+            and high[1] > y0 - _GAP
+            for x0, y0, x1, y1 in self._taken
+        )
+
+
+def bounds(shapes: list[Shape]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner of the box around `shapes`."""
+    rows = np.array([shape.row() for shape in shapes])
+    cos, sin = np.abs(rows[:, 7]), np.abs(rows[:, 8])
+    reach = rows[:, 4:7].copy()
+    reach[:, 0] = cos * rows[:, 4] + sin * rows[:, 5]
+    reach[:, 1] = sin * rows[:, 4] + cos * rows[:, 5]
+    return (rows[:, 1:4] - reach).min(0), (rows[:, 1:4] + reach).max(0)
+
+
+def clear_of(low: np.ndarray, high: np.ndarray, eyes: np.ndarray) -> bool:
+    """Whether every eye keeps its clearance from the box between `low` and `high`."""
+    outside = np.maximum(np.maximum(low - eyes, eyes - high), 0)
+    return bool(((outside**2).sum(-1) > CLEARANCE**2).all())
+
+
+def furnish(rng: np.random.Generator, size: tuple[float, float, float], eyes: np.ndarray) -> Room:
+    """A room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
+    m = Materials(rng)
+    wall = m.wall()
+    walls = [wall] + [m.wall() if rng.random() < 0.3 else wall for _ in range(3)]
+    surfaces = [*walls, m.floor(), m.pale()]
+    furnisher = Furnisher(size, eyes)
+    _centre(rng, m, furnisher)
+    for side in range(4):
+        _against_wall(rng, m, furnisher, side)
+    for _ in range(3):
+        maker = LOOSE[rng.integers(len(LOOSE))]
+        x, y = (float(rng.uniform(-0.4, 0.4)) * extent for extent in size[:2])
+        furnisher.place(maker(rng, m), x, y, float(rng.uniform(0, 2 * math.pi)))
+    window_side = int(rng.integers(4))
+    shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
+    head = [m.rows[i] for i in surfaces]
+    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes])
+    return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
+
+
+def _centre(rng: np.random.Generator, m: Materials, furnisher: Furnisher) -> None:
+    maker = CENTRAL[rng.integers(len(CENTRAL))]
+    turn = float(rng.integers(4)) * math.pi / 2 + float(rng.normal(0, 0.12))
+    piece = maker(rng, m)
+    for _ in range(4):
+        x, y = (float(rng.uniform(-0.18, 0.18)) * extent for extent in furnisher.size[:2])
+        if furnisher.place(piece, x, y, turn):
+            return
+
+
+def _against_wall(rng: np.random.Generator, m: Materials, furnisher: Furnisher, side: int) -> None:
+    """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
+    across, along = furnisher.size[side % 2], furnisher.size[1 - side % 2]
+    turn = math.pi / 2 + side * math.pi / 2
+    position = -along / 2 + float(rng.uniform(0.1, 0.6))
+    while position < along / 2 - 0.4:
+        piece = AGAINST_WALLS[rng.integers(len(AGAINST_WALLS))](rng, m)
+        low, high = bounds(piece)
+        away = across / 2 - float(high[1]) - 0.02
+        middle = position - float(low[0])
+        if furnisher.place(piece, *_from_wall(side, away, middle), turn):
+            position += float(high[0] - low[0])
+        position += float(rng.uniform(0.1, 0.5))
+
+
+def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
+    """The point `away` from the centre towards wall `side`, `along` it."""
+    angle = math.pi + side * math.pi / 2
+    cos, sin = math.cos(angle), math.sin(angle)
+    return cos * away + sin * along, sin * away - cos * along
+
+
+def _on_walls(
+    rng: np.random.Generator, m: Materials, size: tuple[float, float, float], window_side: int
+) -> list[Shape]:
+    """A window on one wall, pictures on the others."""
+    shapes: list[Shape] = []
+    for side in range(4):
+        across, along = size[side % 2], size[1 - side % 2]
+        turn = math.pi / 2 + side * math.pi / 2
+        if side == window_side:
+            hung = _framed(m.pale(), m.window(), float(rng.uniform(1.2, 2.0)), 1.25, 0.95, 0.07)
+            places = [float(rng.uniform(-0.15, 0.15)) * along]
+        else:
+            places = [along * (float(rng.uniform(-0.06, 0.06)) + k) for k in (-0.27, 0.0, 0.27)]
+            places = [place for place in places if rng.random() < 0.65]
+            hung = []
+        for place in places:
+            item = hung or _framed(
+                m.timber(), m.picture(), *map(float, rng.uniform(0.4, 0.75, 2)), 1.45, 0.05
+            )
+            x, y = _from_wall(side, across / 2, place)
+            shapes += [shape.moved(x, y, turn) for shape in item]
+    return shapes
+
+
+def _framed(
+    frame: int, inner: int, width: float, height: float, bottom: float, border: float
+) -> list[Shape]:
+    return [
+        box(0, 0, bottom, (width, 0.06, height), frame),
+        box(0, 0, bottom + border, (width - 2 * border, 0.08, height - 2 * border), inner),
+    ]
+
+
+def _fixed(rng: np.random.Generator, m: Materials, size: tuple[float, float, float]) -> list[Shape]:
+    """The rug, the skirting boards and the ceiling lamp."""
+    board = m.pale()
+    w, d, h = size
+    shapes = [box(0, side * d / 2, 0, (w, 0.04, 0.09), board) for side in (-1, 1)] + [
+        box(side * w / 2, 0, 0, (0.04, d, 0.09), board) for side in (-1, 1)
+    ]
+    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, m.glow()))
+    if rng.random() < 0.75:
+        rug = box(0, 0, 0, (*map(float, rng.uniform(0.35, 0.6, 2) * size[:2]), 0.012), m.rug())
+        shapes.append(rug.moved(*map(float, rng.uniform(-0.3, 0.3, 2)), float(rng.normal(0, 0.1))))
+    return shapes
+
+
+def _lights(
+    rng: np.random.Generator, size: tuple[float, float, float], window_side: int
+) -> np.ndarray:
+    x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
+    lamp = (0.0, 0.0, size[2] - 0.2, float(rng.uniform(0.35, 0.55)))
+    return np.array([lamp, (x, y, 1.6, float(rng.uniform(0.4, 0.8)))])

@@ -1,0 +1,66 @@
+"""Cameras that move through a room: a smooth sway while looking across it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+EYE = (1.25, 1.65)  # metres above the floor
+WALL = 0.45  # least distance from a camera to a wall
+TRAVEL = (0.7, 1.3)  # metres from the first to the last camera
+
+
+def camera_path(
+    rng: np.random.Generator, size: tuple[float, float, float], count: int
+) -> np.ndarray:
+    """OpenCV c2w (count, 4, 4) of cameras that look from one side of the room to the other."""
+    side = int(rng.integers(4))
+    across = size[0] if side % 2 == 0 else size[1]
+    along = size[1] if side % 2 == 0 else size[0]
+    travel = float(rng.uniform(*TRAVEL))
+    back = float(rng.uniform(WALL + 0.1, 0.25 * across)) - across / 2
+    middle = float(rng.uniform(-1, 1)) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
+    s = np.linspace(-0.5, 0.5, count) if count > 1 else np.zeros(1)
+    sway, lift = rng.uniform(-0.12, 0.12, 2)
+    phase = rng.uniform(0, math.pi)
+    eyes = np.stack(
+        [
+            back + sway * np.cos(3 * s + phase) + abs(sway),
+            middle + travel * s,
+            rng.uniform(*EYE) + lift * np.sin(3 * s + phase),
+        ],
+        -1,
+    )
+    drift = float(rng.uniform(-0.3, 0.5)) * travel
+    target = np.stack(
+        [
+            np.full(count, 0.25 * across),
+            float(rng.uniform(-0.25, 0.25)) * along - 0.35 * middle + drift * s,
+            rng.uniform(0.7, 1.15) + 0.1 * np.sin(2 * s + phase),
+        ],
+        -1,
+    )
+    if rng.random() < 0.5:
+        eyes, target = eyes[::-1], target[::-1]
+    turn = _turn(side * math.pi / 2)
+    return _look_at(eyes @ turn.T, target @ turn.T)
+
+
+def _turn(angle: float) -> np.ndarray:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _look_at(eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    forward = targets - eyes
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    c2w = np.zeros((len(eyes), 4, 4))
+    c2w[:, :3, 0] = right
+    c2w[:, :3, 1] = np.cross(forward, right)
+    c2w[:, :3, 2] = forward
+    c2w[:, :3, 3] = eyes
+    c2w[:, 3, 3] = 1.0
+    return c2w

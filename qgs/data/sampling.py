@@ -1,0 +1,175 @@
+"""From a scene to what a model sees: which frames, in which frame and scale, mirrored or not.
+
+Sources: TokenGS release (gap, targets from the span of the inputs, pose normalisation, mirroring).
+Everything here is a pure function of its arguments and of the random generator it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from qgs.contracts import Scene, ViewsConfig
+from qgs.geometry.poses import (
+    first_camera,
+    largest_distance,
+    mean_camera,
+    mirrored,
+    relative_to,
+    scaled,
+)
+from qgs.types import Cameras, Views
+
+Frames: TypeAlias = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Input and target views of one scene, both Views (1, V), in the frame of the inputs."""
+
+    scene: str
+    inputs: Views
+    targets: Views
+    input_frames: Frames
+    target_frames: Frames
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B samples: inputs (B, V_in) and targets (B, V_out), float32 and contiguous."""
+
+    inputs: Views
+    targets: Views
+    scenes: tuple[str, ...]
+
+
+def training_frames(scene: Scene) -> list[int]:
+    """The frames that training may see: all but the held-out ones."""
+    held_out = set(scene.held_out)
+    return [frame for frame in range(len(scene)) if frame not in held_out]
+
+
+def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
+    """Smallest and largest gap that `count` frames of `scene` allow.
+
+    Raises ValueError when the inputs do not fit into the gap, or the scene has too few frames.
+    """
+    low, high = views.gap
+    if views.inputs - 1 > high:
+        raise ValueError(
+            f"views.inputs is {views.inputs}, but views.gap [{low}, {high}] spans only {high + 1} "
+            f"frames: raise the upper gap to {views.inputs - 1} or more, or ask for fewer inputs"
+        )
+    needed = max(views.inputs, 2)
+    if count < needed:
+        raise ValueError(
+            f"scene {scene!r} has {count} frames for inputs, but views.inputs is {views.inputs} "
+            f"and at least {needed} are needed: use fewer inputs, hold out fewer frames, or drop "
+            "the scene"
+        )
+    high = min(high, count - 1)
+    return max(min(low, high), views.inputs - 1), high
+
+
+def draw_frames(
+    scene: Scene, views: ViewsConfig, rng: np.random.Generator
+) -> tuple[Frames, Frames]:
+    """Input frames, ascending, and target frames of a training sample.
+
+    The gap counts steps between frames that training may see. Targets are frames of the span that
+    are no inputs; where those are too few, input frames join them, and where even these are too
+    few, frames come again.
+    """
+    usable = training_frames(scene)
+    low, high = gap_range(len(usable), views, scene.name)
+    gap = int(rng.integers(low, high + 1))
+    first = int(rng.integers(0, len(usable) - gap))
+    span = usable[first : first + gap + 1]
+    inputs = _inputs_of(span, views.inputs, rng)
+    return inputs, _targets_of(span, inputs, views.targets, rng)
+
+
+def _inputs_of(span: Sequence[int], count: int, rng: np.random.Generator) -> Frames:
+    """The two ends of `span` and `count - 2` frames between; one alone is drawn from the span."""
+    if count == 1:
+        return (int(rng.choice(span)),)
+    between = rng.choice(span[1:-1], count - 2, replace=False) if count > 2 else ()
+    return (span[0], *sorted(map(int, between)), span[-1])
+
+
+def _targets_of(
+    span: Sequence[int], inputs: Frames, count: int, rng: np.random.Generator
+) -> Frames:
+    novel = rng.permutation([frame for frame in span if frame not in inputs]).astype(int)
+    chosen = [*novel, *rng.permutation(inputs)][:count]
+    chosen += list(rng.choice(span, count - len(chosen)))
+    return tuple(map(int, chosen))
+
+
+def make_sample(
+    scene: Scene, input_frames: Frames, target_frames: Frames, views: ViewsConfig, mirror: bool
+) -> Sample:
+    """Decode the frames, normalise their poses by the inputs, and mirror them if asked to."""
+    frames = (*input_frames, *target_frames)
+    wanted = sorted(set(frames))
+    place = {frame: i for i, frame in enumerate(wanted)}
+    images = scene.images(wanted)[[place[frame] for frame in frames]]
+    cameras = scene.cameras[list(frames)]
+    c2w = normalised(cameras.c2w, len(input_frames), views, scene.name)
+    both = Views(images[None], Cameras(c2w[None], cameras.intrinsics[None], cameras.size))
+    if mirror:
+        both = mirrored_views(both)
+    inputs = both.select(slice(0, len(input_frames)))
+    targets = both.select(slice(len(input_frames), None))
+    return Sample(scene.name, inputs, targets, input_frames, target_frames)
+
+
+def normalised(c2w: Tensor, inputs: int, views: ViewsConfig, scene: str = "") -> Tensor:
+    """Poses (V, 4, 4) in the frame and scale of their first `inputs` ones.
+
+    Raises ValueError for `scale: distance` when the input cameras stand on one point.
+    """
+    reference = first_camera if views.frame == "first_cam" else mean_camera
+    relative = relative_to(reference(c2w[:inputs]), c2w)
+    factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
+    if views.scale == "distance":
+        distance = largest_distance(relative[:inputs])
+        if not distance > 0:
+            raise ValueError(
+                f"views.scale is 'distance', but the input cameras of scene {scene!r} stand on one "
+                "point: use at least two inputs that moved, or `scale: constant`"
+            )
+        factor = factor / distance
+    return scaled(relative, factor)
+
+
+def mirrored_views(views: Views) -> Views:
+    """The same scene seen in a mirror that flips x: images, poses and principal point."""
+    cameras = views.cameras
+    fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
+    intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
+    flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
+    return Views(views.images.flip(-1), flipped)
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
+    """Stack samples of equal view counts and image size."""
+    return Batch(
+        _stack([sample.inputs for sample in samples]),
+        _stack([sample.targets for sample in samples]),
+        tuple(sample.scene for sample in samples),
+    )
+
+
+def _stack(views: Sequence[Views]) -> Views:
+    cameras = Cameras(
+        torch.cat([v.cameras.c2w for v in views]),
+        torch.cat([v.cameras.intrinsics for v in views]),
+        views[0].cameras.size,
+    )
+    return Views(torch.cat([v.images for v in views]), cameras)
