@@ -1,1 +1,15 @@
-"""."""
+"""How good a reconstruction is, and what needs no model to reach."""
+
+from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.dispersion import Spread, spread, token_dispersion
+from qgs.metrics.images import psnr, ssim
+
+__all__ = [
+    "Spread",
+    "mean_colour",
+    "nearest_input",
+    "psnr",
+    "spread",
+    "ssim",
+    "token_dispersion",
+]

@@ -1,0 +1,131 @@
+"""Noticing a run that died: nothing drawn, no gradient, or numbers that are not finite."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from qgs.io.checkpoint import unique_tensors
+
+EMPTY_ALPHA = 2e-3
+"""Mean alpha below which a rendering shows the background alone."""
+
+FLAT = 1 / 255
+"""Largest deviation from the background of a rendering that shows nothing else."""
+
+NO_GRADIENT = 1e-8
+"""Gradient norm of a model that learns nothing any more."""
+
+REMEDIES = (
+    "a learning rate too high for this model (lower training.learning_rate, lengthen "
+    "training.warmup)",
+    "a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
+    "behind_camera: invisible)",
+    "an initialisation that hides every Gaussian (raise model.head.opacity_bias, check "
+    "views.scale_factor against the anchors' and the scenes' depth)",
+)
+
+
+class CollapseError(RuntimeError):
+    """Training stopped because the model died; the last good weights are kept."""
+
+
+@dataclass(frozen=True)
+class Vitals:
+    """Signs of life of one step: numbers, so that reading them synchronises once."""
+
+    alpha: float
+    deviation: float
+    gradient: float
+
+
+def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean alpha, and largest |rgb - background| of renderings (B, V, C, H, W); both 0-d."""
+    return alpha.mean(), (rgb - background[:, None, None]).abs().amax()
+
+
+class CollapseDetector:
+    """Counts consecutive steps without signs of life.
+
+    A step is dead when nothing is drawn (mean alpha under EMPTY_ALPHA, which is also what a model
+    shows whose Gaussians are all invisible), when no gradient is left, or when the images have gone
+    back to the plain background after showing more.
+    """
+
+    def __init__(self, window: int) -> None:
+        self.window = window
+        self.dead_steps = 0
+        self.symptom = ""
+        self._has_drawn = False
+
+    def observe(self, vitals: Vitals) -> None:
+        """Take note of one step."""
+        self.symptom = self._symptom_of(vitals)
+        self.dead_steps = self.dead_steps + 1 if self.symptom else 0
+        self._has_drawn |= vitals.deviation > 8 * FLAT
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether the window is full of dead steps."""
+        return self.dead_steps >= self.window
+
+    def _symptom_of(self, vitals: Vitals) -> str:
+        if vitals.alpha < EMPTY_ALPHA:
+            return f"the renderings are empty (mean alpha {vitals.alpha:.1e})"
+        if vitals.gradient < NO_GRADIENT:
+            return f"the gradient has vanished (norm {vitals.gradient:.1e})"
+        if self._has_drawn and vitals.deviation < FLAT:
+            return "the renderings equal the background"
+        return ""
+
+
+class GoodWeights:
+    """Host copies of the weights from healthy times, the older of the last two.
+
+    A collapse is noticed late, and the newest healthy copy may already be on its way down; the
+    older one is at least a window away.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        self._model = model
+        self._copies = [(0, self._copy())]
+
+    def refresh(self, step: int) -> None:
+        """Copy the present weights, which `step` optimiser steps made."""
+        self._copies = [*self._copies, (step, self._copy())][-2:]
+
+    @property
+    def step(self) -> int:
+        """Optimiser steps behind `tensors`."""
+        return self._copies[0][0]
+
+    @property
+    def tensors(self) -> Mapping[str, Tensor]:
+        """Weights as `qgs.io.checkpoint.save` takes them."""
+        return self._copies[0][1]
+
+    def _copy(self) -> dict[str, Tensor]:
+        tensors = unique_tensors(self._model)
+        return {name: t.detach().to("cpu", copy=True) for name, t in tensors.items()}
+
+
+def not_finite(terms: Mapping[str, float], module: nn.Module, gradient: float) -> str:
+    """What is NaN or infinite: loss terms, else tensors with such gradients; "" if nothing is."""
+    bad = [
+        f"loss term {name} is {value}" for name, value in terms.items() if not math.isfinite(value)
+    ]
+    if bad:
+        return ", ".join(bad)
+    if math.isfinite(gradient):
+        return ""
+    names = [
+        name
+        for name, parameter in module.named_parameters()
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all()
+    ]
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return f"the gradient norm is {gradient}" + (f", from {shown}" if shown else "")

@@ -1,0 +1,88 @@
+"""The folder of one training run; nothing in it is ever overwritten by another run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self, TextIO
+
+import yaml
+
+from qgs.io.atomic import write_text
+
+
+class RunFolder:
+    """RUN/recipe.yaml, RUN/history.jsonl, RUN/checkpoint.safetensors, RUN/evaluation/."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._history: TextIO | None = None
+
+    @classmethod
+    def create(cls, path: str | Path) -> Self:
+        """A new folder at `path`; an empty one is taken as new.
+
+        Raises FileExistsError when `path` is a file or holds anything.
+        """
+        folder = cls(path)
+        if folder.path.is_file():
+            raise FileExistsError(f"{path} is a file; choose another folder for this run")
+        if folder.path.is_dir() and any(folder.path.iterdir()):
+            raise FileExistsError(
+                f"{path} is not empty and a run never overwrites another; choose another folder "
+                "or delete it yourself"
+            )
+        folder.path.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    @property
+    def checkpoint(self) -> Path:
+        """The latest good weights."""
+        return self.path / "checkpoint.safetensors"
+
+    @property
+    def evaluation(self) -> Path:
+        """Where `qgs eval` writes."""
+        return self.path / "evaluation"
+
+    def write_recipe(self, tree: Mapping[str, Any]) -> None:
+        """Write the resolved recipe."""
+        text = yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True)
+        write_text(self.path / "recipe.yaml", text)
+
+    def append(self, record: Mapping[str, float]) -> None:
+        """Add one line to the history."""
+        if self._history is None:
+            self._history = (self.path / "history.jsonl").open("a", encoding="utf-8")
+        self._history.write(json.dumps(record) + "\n")
+
+    def flush(self) -> None:
+        """Bring the history to disk."""
+        if self._history is not None:
+            self._history.flush()
+
+    def history(self) -> list[dict[str, float]]:
+        """All records so far, one per optimiser step."""
+        self.flush()
+        lines = (self.path / "history.jsonl").read_text(encoding="utf-8").splitlines()
+        return [json.loads(line) for line in lines]
+
+    def close(self) -> None:
+        """Close the history."""
+        if self._history is not None:
+            self._history.close()
+            self._history = None
+
+
+def checkpoint_of(path: str | Path) -> Path:
+    """The checkpoint file that `path`, a run folder or the file itself, stands for.
+
+    Raises FileNotFoundError.
+    """
+    file = RunFolder(path).checkpoint if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"no checkpoint at {file}; give a run folder of `qgs train` or a .safetensors file"
+        )
+    return file

@@ -1,0 +1,37 @@
+"""Scores that a model must beat: copying an input view, painting the mean colour."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras, Views
+
+
+def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
+    """For every target camera (B, T) the image of the nearest input view -> (B, T, 3, H, W).
+
+    Nearest by the distance of camera centres over the spread of the input cameras plus the angle
+    between viewing directions, in radians, so that of two cameras in one place the one that looks
+    the same way wins.
+    """
+    index = _distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
+    scene = torch.arange(index.shape[0], device=index.device)[:, None]
+    return inputs.images[scene, index]
+
+
+def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
+    """The mean RGB of a scene's input views everywhere -> (B, T, 3, H, W)."""
+    colour = inputs.images.mean((1, 3, 4))
+    return colour[:, None, :, None, None].expand(-1, targets.shape[1], -1, *targets.size)
+
+
+@full_precision
+def _distance(inputs: Tensor, targets: Tensor) -> Tensor:
+    """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4)."""
+    centres, seen_from = inputs[..., :3, 3], targets[..., :3, 3]
+    extent = torch.cdist(centres, centres).amax((-1, -2), keepdim=True)
+    apart = torch.cdist(seen_from, centres) / torch.where(extent > 0, extent, 1.0)
+    cosine = targets[..., :3, 2] @ inputs[..., :3, 2].transpose(-1, -2)
+    return apart + cosine.clamp(-1, 1).acos()
