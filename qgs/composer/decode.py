@@ -122,7 +122,7 @@ def _why_not(name: object, place: Place, registry: Registry) -> tuple[str, str]:
 def _no_plugin_named(name: str, installed: Mapping[str, object]) -> tuple[str, str]:
     if "." in name or ":" in name:
         reason = f"`{name}` is an import path; `type` only names installed components"
-        fix = "offer the class in a plugin (entry-point group `qgs.plugins`) and name it PLUGIN/NAME"
+        fix = "offer the class in a plugin (entry points `qgs.plugins`), name it PLUGIN/NAME"
         return reason, fix
     reason = f"`{name}` names no plugin: components are called PLUGIN/NAME"
     same = [known for known in installed if known.split("/")[1] == name]

@@ -23,10 +23,8 @@ class RecipeProblem:
     fix: str
 
     def __str__(self) -> str:
-        return "\n".join(
-            (f"{Origin(self.file, self.line)}: {self.path or 'recipe'}",)
-            + tuple(f"  {label} {text}" for label, text in (("why:", self.reason), ("fix:", self.fix)))
-        )
+        place = f"{Origin(self.file, self.line)}: {self.path or 'recipe'}"
+        return f"{place}\n  why: {self.reason}\n  fix: {self.fix}"
 
 
 class RecipeError(ValueError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -112,8 +111,8 @@ def _default(config: type[BaseModel], error: ErrorDetails) -> str:
     return f" (default: {_yaml_word(shown)})"
 
 
-def _yaml_word(value: Any) -> str:
-    words: Mapping[Any, str] = {"True": "true", "False": "false", "None": "null"}
+def _yaml_word(value: object) -> str:
+    words = {"True": "true", "False": "false", "None": "null"}
     return words.get(str(value), str(value))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, final
 
 Path: TypeAlias = tuple[str, ...]
 
@@ -21,6 +21,7 @@ class Origin:
         return f"{self.file}:{self.line}" if self.line else self.file
 
 
+@final
 @dataclass(frozen=True)
 class ScalarNode:
     """A string, number, bool or None."""
@@ -29,6 +30,7 @@ class ScalarNode:
     value: Any
 
 
+@final
 @dataclass(frozen=True)
 class ListNode:
     """A list."""
@@ -37,6 +39,7 @@ class ListNode:
     items: tuple[Node, ...] = ()
 
 
+@final
 @dataclass(frozen=True)
 class MapNode:
     """A mapping. keys: where each key was written."""

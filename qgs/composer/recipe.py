@@ -74,9 +74,7 @@ class Recipe:
         return build_plain(self.parts["data",])
 
 
-def resolve(
-    recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str] = ()
-) -> Recipe:
+def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
     """Read, merge and check a recipe.
 
     recipe: path of a YAML file, or a mapping of the same form. overrides: `a.b=value`, laid over
@@ -89,8 +87,7 @@ def resolve(
     tree = _with_default_losses(check_tree(tree, problems))
     settings = decode_settings(tree, problems)
     registry = load_plugins(tree, problems)
-    depth = settings.decoder.depth if settings.decoder else 1
-    places = expand(tree, depth, problems)
+    places = expand(tree, settings.decoder.depth, problems)
     places = apply_swaps(tree.child_map("swap"), places, problems)
     parts = decode_places(places, registry, problems)
     _check_components(parts, settings, registry, problems)
@@ -110,7 +107,7 @@ def _check_components(
     parts: Mapping[Path, Chosen | None], settings: Settings, registry: Registry, problems: Problems
 ) -> None:
     """Check components against the rest of the recipe, as far as that could be decoded."""
-    if settings.model is None or settings.decoder is None:
+    if not settings.sizes_known:
         return
     depth = settings.decoder.depth
     dims = ModelDims(settings.model.width, settings.model.heads, depth)
@@ -141,19 +138,17 @@ def _finish(
     parts: Mapping[Path, Chosen | None],
 ) -> Recipe:
     chosen = {path: part for path, part in parts.items() if part is not None}
-    recipe, model, decoder = settings.recipe, settings.model, settings.decoder
-    views, training, evaluation = settings.views, settings.training, settings.evaluation
-    assert recipe and model and decoder and views and training and evaluation
-    resolution = Resolution(tree, settings, registry, chosen, decoder.depth)
+    resolution = Resolution(tree, settings, registry, chosen)
+    model, decoder = settings.model, settings.decoder
     return Recipe(
         tree=resolution.tree,
         provenance=resolution.provenance,
         parts=chosen,
         dims=ModelDims(model.width, model.heads, decoder.depth),
         layer_scale=decoder.layer_scale,
-        seed=recipe.seed,
-        views=views,
-        training=training,
-        evaluation=evaluation,
+        seed=settings.recipe.seed,
+        views=settings.views,
+        training=settings.training,
+        evaluation=settings.evaluation,
         plugin_versions={name: plugin.version for name, plugin in registry.plugins.items()},
     )

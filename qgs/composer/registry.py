@@ -90,6 +90,17 @@ def load_registry(names: Iterable[str]) -> Registry:
     return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
 
 
+def load_sound_plugins() -> tuple[Registry, list[str]]:
+    """The components of every installed plugin that can be used, and why the others cannot."""
+    plugins, broken = {"qgs": builtin()}, []
+    for name in sorted(available_plugins()):
+        try:
+            plugins[name] = load_plugin(name)
+        except PluginError as error:
+            broken.append(str(error))
+    return Registry(plugins), broken
+
+
 def plugin_versions(names: Iterable[str]) -> dict[str, str]:
     """Plugin name to the version of its distribution, `qgs` included; raises PluginError."""
     return {name: plugin.version for name, plugin in load_registry(names).plugins.items()}

@@ -26,85 +26,74 @@ class Resolution:
         settings: Settings,
         registry: Registry,
         parts: Mapping[Path, Chosen],
-        depth: int,
     ) -> None:
         self.source = source
         self.parts = parts
         self.tree: dict[str, Any] = {}
         self.provenance: dict[str, str] = {}
-        recipe, model, decoder, views, training, evaluation = (
-            settings.recipe,
-            settings.model,
-            settings.decoder,
-            settings.views,
-            settings.training,
-            settings.evaluation,
-        )
-        assert recipe and model and decoder and views and training and evaluation
-        self.put_settings((), recipe)
+        self._put_settings((), settings.recipe)
         names = [name for name in registry.plugins if name != "qgs"]
-        self.put(("plugins",), names, self.written(("plugins",)))
-        self.put_settings(("model",), model)
+        self._put(("plugins",), names, self._written(("plugins",)))
+        self._put_settings(("model",), settings.model)
         for name in MODEL_SLOTS[:2]:
-            self.put_component(("model", name))
-        self.put_settings(("model", "decoder"), decoder)
-        self.put_decoder(depth)
+            self._put_component(("model", name))
+        self._put_settings(("model", "decoder"), settings.decoder)
+        self._put_decoder(settings.decoder.depth)
         for name in MODEL_SLOTS[2:]:
-            self.put_component(("model", name))
-        self.put_losses()
+            self._put_component(("model", name))
+        self._put_losses()
         if ("data",) in parts:
-            self.put_component(("data",))
-        self.put_settings(("views",), views)
-        self.put_settings(("training",), training)
-        self.put_settings(("evaluation",), evaluation)
+            self._put_component(("data",))
+        self._put_settings(("views",), settings.views)
+        self._put_settings(("training",), settings.training)
+        self._put_settings(("evaluation",), settings.evaluation)
 
-    def put_settings(self, path: Path, config: ComponentConfig) -> None:
+    def _put_settings(self, path: Path, config: ComponentConfig) -> None:
         for name, value in config.model_dump(mode="json").items():
-            self.put((*path, name), value, self.written((*path, name)))
+            self._put((*path, name), value, self._written((*path, name)))
 
-    def put_component(self, path: Path, chosen: Chosen | None = None) -> None:
+    def _put_component(self, path: Path, chosen: Chosen | None = None) -> None:
         chosen = chosen or self.parts[path]
         node = chosen.place.node
         items = node if isinstance(node, MapNode) else MapNode(chosen.place.origin)
         kind = items.keys.get("type")
-        self.put((*path, "type"), chosen.type, str(kind) if kind else "default of the slot")
+        self._put((*path, "type"), chosen.type, str(kind) if kind else "default of the slot")
         for name, value in chosen.config.model_dump(mode="json").items():
-            self.put_option((*path, name), value, items.items.get(name), items, chosen.type)
+            self._put_option((*path, name), value, items.items.get(name), items, chosen.type)
 
-    def put_option(
+    def _put_option(
         self, path: Path, value: Any, node: Node | None, parent: MapNode, owner: str
     ) -> None:
         """Put an option, going into mappings that are written in part."""
         if isinstance(value, dict) and value and isinstance(node, MapNode):
             for name, item in value.items():
-                self.put_option((*path, name), item, node.items.get(name), node, owner)
+                self._put_option((*path, name), item, node.items.get(name), node, owner)
             return
         origin = parent.keys.get(path[-1])
-        self.put(path, value, str(origin) if origin else f"default of {owner}")
+        self._put(path, value, str(origin) if origin else f"default of {owner}")
 
-    def put_decoder(self, depth: int) -> None:
+    def _put_decoder(self, depth: int) -> None:
         """The template, then every layer that differs; a template that no layer uses gives way."""
         overrides: list[tuple[int, str]] = []
         for name in LAYER_SLOTS:
             template = self.parts["model", "decoder", name]
             layers = [
-                self.parts["model", "decoder", "layers", str(index), name]
-                for index in range(depth)
+                self.parts["model", "decoder", "layers", str(index), name] for index in range(depth)
             ]
             if all(_same(layer, layers[0]) for layer in layers):
                 template = layers[0]
-            self.put_component(("model", "decoder", name), template)
+            self._put_component(("model", "decoder", name), template)
             overrides += [(i, name) for i, layer in enumerate(layers) if not _same(layer, template)]
         for index, name in sorted(overrides, key=lambda pair: pair[0]):
-            self.put_component(("model", "decoder", "layers", str(index), name))
+            self._put_component(("model", "decoder", "layers", str(index), name))
 
-    def put_losses(self) -> None:
+    def _put_losses(self) -> None:
         self.tree["losses"] = {}
         for path in self.parts:
             if path[0] == "losses":
-                self.put_component(path)
+                self._put_component(path)
 
-    def put(self, path: Path, value: Any, origin: str) -> None:
+    def _put(self, path: Path, value: Any, origin: str) -> None:
         node = self.tree
         for key in path[:-1]:
             node = node.setdefault(key, {})
@@ -115,7 +104,7 @@ class Resolution:
         else:
             self.provenance[".".join(path)] = origin
 
-    def written(self, path: Path) -> str:
+    def _written(self, path: Path) -> str:
         node = self.source
         for step in path[:-1]:
             node = node.child_map(step)

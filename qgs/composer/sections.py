@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from qgs.composer.decode import decode_config
+from qgs.composer.decode import ConfigT, decode_config
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Path, ScalarNode, is_null, kind_of
 from qgs.composer.registry import PluginError, Registry, builtin, load_plugin
@@ -37,15 +37,12 @@ class RecipeSettings(ComponentConfig):
     seed: int = Field(default=0, ge=0, lt=2**63)
 
 
-SETTINGS: dict[Path, type[ComponentConfig]] = {
+_SETTINGS: dict[Path, type[ComponentConfig]] = {
     (): RecipeSettings,
     ("model",): ModelSettings,
     ("model", "decoder"): DecoderSettings,
-    ("views",): ViewsConfig,
-    ("training",): TrainingConfig,
-    ("evaluation",): EvaluationConfig,
 }
-"""Where which settings stand."""
+"""Sections that hold settings beside other things."""
 
 TOP_SECTIONS = ("plugins", "swap", "model", "losses", "data", "views", "training", "evaluation")
 
@@ -70,14 +67,18 @@ _MAPPINGS: tuple[Path, ...] = (
 
 @dataclass(frozen=True)
 class Settings:
-    """Decoded settings; None for a section that has problems."""
+    """Decoded settings; defaults stand in for a section that has problems.
 
-    recipe: RecipeSettings | None
-    model: ModelSettings | None
-    decoder: DecoderSettings | None
-    views: ViewsConfig | None
-    training: TrainingConfig | None
-    evaluation: EvaluationConfig | None
+    sizes_known: whether `model` and `decoder` are what the recipe says.
+    """
+
+    recipe: RecipeSettings
+    model: ModelSettings
+    decoder: DecoderSettings
+    views: ViewsConfig
+    training: TrainingConfig
+    evaluation: EvaluationConfig
+    sizes_known: bool
 
 
 def check_tree(tree: MapNode, problems: Problems) -> MapNode:
@@ -109,7 +110,7 @@ def _report_unknown(tree: MapNode, problems: Problems) -> None:
         node = tree
         for step in path:
             node = node.child_map(step)
-        known = {*children, *SETTINGS[path].model_fields}
+        known = {*children, *_SETTINGS[path].model_fields}
         for key in sorted(set(node.items) - known):
             problems.add(
                 node.keys[key],
@@ -121,28 +122,41 @@ def _report_unknown(tree: MapNode, problems: Problems) -> None:
 
 def _fix_key(key: str, path: Path, known: set[str]) -> str:
     for home, children in _CHILDREN.items():
-        if home != path and key in {*children, *SETTINGS[home].model_fields}:
+        if home != path and key in {*children, *_SETTINGS[home].model_fields}:
             return f"did you mean `{'.'.join((*home, key))}`?"
     return did_you_mean(key, known, "keys")
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> Settings:
     """All settings of a checked tree; defaults where nothing is written."""
-    decoded = []
-    for path, config in SETTINGS.items():
+
+    def read(path: Path, config: type[ConfigT]) -> ConfigT | None:
         node = tree
         for step in path:
             node = node.child_map(step)
-        unknown = set(node.items) - set(config.model_fields)
-        known = node.without(*unknown) if path in _CHILDREN else node
-        decoded.append(decode_config(config, known, path, problems))
-    settings = Settings(*decoded)
-    _check_heads(tree.child_map("model"), settings.model, problems)
-    return settings
+        if path in _CHILDREN:
+            node = node.without(*{*node.items} - {*config.model_fields})
+        return decode_config(config, node, path, problems)
+
+    recipe = read((), RecipeSettings)
+    model, decoder = read(("model",), ModelSettings), read(("model", "decoder"), DecoderSettings)
+    views, training = read(("views",), ViewsConfig), read(("training",), TrainingConfig)
+    evaluation = read(("evaluation",), EvaluationConfig)
+    if model is not None:
+        _check_heads(tree.child_map("model"), model, problems)
+    return Settings(
+        recipe or RecipeSettings(recipe=1),
+        model or ModelSettings(),
+        decoder or DecoderSettings(),
+        views or ViewsConfig(),
+        training or TrainingConfig(),
+        evaluation or EvaluationConfig(),
+        sizes_known=model is not None and decoder is not None,
+    )
 
 
-def _check_heads(node: MapNode, model: ModelSettings | None, problems: Problems) -> None:
-    if model is not None and model.width % model.heads:
+def _check_heads(node: MapNode, model: ModelSettings, problems: Problems) -> None:
+    if model.width % model.heads:
         fitting = [n for n in range(1, model.width + 1) if model.width % n == 0]
         near = min(fitting, key=lambda n: abs(n - model.heads))
         problems.add(

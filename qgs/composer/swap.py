@@ -36,8 +36,7 @@ def apply_swaps(
                 problems.add(
                     origin,
                     path,
-                    f"`{'.'.join(place)}` is already swapped by `{other}` "
-                    f"({swaps.keys[other]})",
+                    f"`{'.'.join(place)}` is already swapped by `{other}` ({swaps.keys[other]})",
                     "narrow one of the two patterns, or remove one",
                 )
                 break
@@ -53,15 +52,8 @@ def _is_swappable(place: Path) -> bool:
 
 def _matches(pattern: str, place: Path) -> bool:
     parts = tuple(pattern.split("."))
-    if parts[0] != "model" and place[0] == "model":
-        place_parts = place[1:]
-    else:
-        place_parts = place
-    return (
-        _is_swappable(place)
-        and len(parts) == len(place_parts)
-        and all(map(fnmatchcase, place_parts, parts))
-    )
+    shown = place[1:] if place[0] == "model" and parts[0] != "model" else place
+    return _is_swappable(place) and len(parts) == len(shown) and all(map(fnmatchcase, shown, parts))
 
 
 def _names_component(node: Node, origin: Origin, path: str, problems: Problems) -> bool:

@@ -1,0 +1,39 @@
+"""The `qgs` command. Groups of commands register themselves; heavy imports wait for a command."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+
+import typer
+
+app = typer.Typer(
+    name="qgs",
+    help="Query-based feed-forward 3D Gaussian splatting from composable, checked components.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+GROUPS = ("inspect", "train", "reconstruct", "demo")
+
+for _group in GROUPS:
+    if find_spec(f"qgs.cli.{_group}"):
+        import_module(f"qgs.cli.{_group}").register(app)
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is printed without a traceback, exit code 2.
+
+    The environment variable QGS_DEBUG=1 shows the traceback.
+    """
+    try:
+        app()
+    except (ValueError, OSError) as error:
+        if os.environ.get("QGS_DEBUG"):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        print("(QGS_DEBUG=1 shows where it was raised)", file=sys.stderr)
+        raise SystemExit(2) from None

@@ -1,0 +1,138 @@
+"""Tables for the terminal: components, parameters, differences of recipes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+from rich.table import Table
+from torch import nn
+
+from qgs.composer import Recipe
+from qgs.composer.registry import InstalledPlugin, load_sound_plugins
+from qgs.composer.show import flat
+from qgs.composer.slots import LAYER_SLOTS, SLOTS
+from qgs.composer.suggest import did_you_mean
+from qgs.composer.yaml12 import dump
+from qgs.contracts import Component
+
+
+def component_tables(slot: str | None) -> tuple[list[Table], list[str]]:
+    """One table per slot, or that of `slot`; and why plugins were left out.
+
+    Raises ValueError for a slot that does not exist.
+    """
+    slot = slot.removeprefix("decoder.") if slot else None
+    if slot is not None and slot not in SLOTS:
+        raise ValueError(f"there is no slot `{slot}`; {did_you_mean(slot, SLOTS, 'slots')}")
+    registry, broken = load_sound_plugins()
+    tables = []
+    for name in [slot] if slot else SLOTS:
+        default = SLOTS[name].default
+        title = f"{name} (default {default})" if default else name
+        table = Table(title=title, title_justify="left")
+        for column in ("type", "options", "requires", "provides", "origin"):
+            table.add_column(column, overflow="fold")
+        for kind, component in registry.components(name).items():
+            table.add_row(kind, *_row(component, registry.plugins[kind.split("/")[0]]))
+        tables.append(table)
+    return tables, broken
+
+
+def parameter_table(recipe: Recipe) -> Table:
+    """Parameters of each component; built on the meta device."""
+    table = Table("component", "type", "parameters", title="parameters", title_justify="left")
+    table.columns[2].justify = "right"
+    counts = parameter_counts(recipe)
+    for name, count in counts.items():
+        table.add_row(name, _type_of(recipe, name), f"{count:,}")
+    table.add_section()
+    table.add_row("total", "", f"{sum(counts.values()):,}")
+    return table
+
+
+def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Table]:
+    """Values that differ, and parameters that differ, of two recipes called `a` and `b`."""
+    ours, theirs = flat(first.tree), flat(second.tree)
+    values = Table("path", a, b, title="values that differ", title_justify="left")
+    for path in [*ours, *(path for path in theirs if path not in ours)]:
+        if ours.get(path, _MISSING) != theirs.get(path, _MISSING):
+            values.add_row(path, _word(ours, path), _word(theirs, path))
+    counts, others = parameter_counts(first), parameter_counts(second)
+    parameters = Table("component", a, b, "difference", title="parameters", title_justify="left")
+    for column in parameters.columns[1:]:
+        column.justify = "right"
+    for name, count in counts.items():
+        _add_difference(parameters, name, count, others[name])
+    parameters.add_section()
+    _add_difference(parameters, "total", sum(counts.values()), sum(others.values()))
+    return [values, parameters]
+
+
+def parameter_counts(recipe: Recipe) -> dict[str, int]:
+    """Component to its number of parameters, decoder layers summed by slot."""
+    model = recipe.build_model("meta")
+    counts = {name: _count(getattr(model, name)) for name in ("encoder", "queries")}
+    for name in LAYER_SLOTS[:3]:
+        counts[f"decoder.{name}"] = sum(_count(getattr(layer, name)) for layer in model.decoder)
+    counts["decoder.refinement"] = _count(model.refinements)
+    counts["decoder.layer_scale"] = _count(model.decoder) - sum(
+        counts[f"decoder.{name}"] for name in LAYER_SLOTS[:3]
+    )
+    return counts | {name: _count(getattr(model, name)) for name in ("head", "centers")}
+
+
+_MISSING = object()
+
+
+def _count(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def _type_of(recipe: Recipe, name: str) -> str:
+    node: Any = recipe.tree["model"]
+    for key in name.split("."):
+        node = node.get(key, {}) if isinstance(node, Mapping) else {}
+    kinds = [node["type"]] if isinstance(node, Mapping) and "type" in node else []
+    slot = name.removeprefix("decoder.")
+    for layer in recipe.tree["model"]["decoder"].get("layers", {}).values():
+        kinds += [layer[slot]["type"]] if slot in layer else []
+    return ", ".join(dict.fromkeys(kinds))
+
+
+def _add_difference(table: Table, name: str, ours: int, theirs: int) -> None:
+    table.add_row(name, f"{ours:,}", f"{theirs:,}", f"{theirs - ours:+,}" if ours != theirs else "")
+
+
+def _row(component: type[Component], plugin: InstalledPlugin) -> tuple[str, str, str, str]:
+    options = []
+    for name, field in component.Config.model_fields.items():
+        default = "required" if field.is_required() else _plain(component, name)
+        options.append(f"{name}: {default}")
+    requires, provides = "depends on options", "depends on options"
+    try:
+        config = component.Config()
+    except ValidationError:
+        pass
+    else:
+        requires = _lines(f"{n}: {spec}" for n, spec in component.requires(config).items())
+        provides = _lines(f"{n}: {spec}" for n, spec in component.provides(config).items())
+    return _lines(options), requires, provides, f"{plugin.distribution} {plugin.version}"
+
+
+def _plain(component: type[Component], name: str) -> str:
+    schema = component.Config.model_json_schema()["properties"][name]
+    return _yaml(schema.get("default"))
+
+
+def _word(values: Mapping[str, Any], path: str) -> str:
+    return _yaml(values[path]) if path in values else "-"
+
+
+def _yaml(value: Any) -> str:
+    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
+
+
+def _lines(words: Iterable[str]) -> str:
+    return "\n".join(words) or "-"
