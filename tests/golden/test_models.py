@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from published import GOLDEN, our_weights, read_golden, recipe_of
+from golden.published import GOLDEN, our_weights, read_golden, recipe_of
 from torch import Tensor, nn
 
 import qgs

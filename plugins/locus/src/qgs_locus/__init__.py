@@ -6,6 +6,7 @@ from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
 from qgs_locus.refinement import AnchorRefinement
 from qgs_locus.self_attention import AnchorAwareSelfAttention
+from qgs_locus.visibility import AnchorVisibility
 
 plugin = Plugin(
     name="locus",
@@ -17,5 +18,6 @@ plugin = Plugin(
         AnchorRefinement,
         AnchorOffsetCenters,
         RadiusScaledCenters,
+        AnchorVisibility,
     ),
 )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
-import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
@@ -50,4 +50,4 @@ def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
 
 def raw_radius_of(radius: float) -> float:
     """softplus^-1: the rho whose softplus is `radius` > 0."""
-    return radius + float(torch.log(-torch.expm1(torch.tensor(-radius, dtype=torch.float64))))
+    return radius + math.log(-math.expm1(-radius))

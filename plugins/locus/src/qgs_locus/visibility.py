@@ -1,0 +1,48 @@
+"""`locus/anchor_visibility`: anchors that no supervised view sees are drawn towards one."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import Fields, Loss
+from qgs.losses import VisibilityOptions, view_visibility
+from qgs.types import LayerPrediction, Rendering, Views
+from qgs_locus.fields import CENTER, CENTER_FIELD
+
+
+class AnchorVisibility(Loss):
+    """Mean over queries of `qgs.losses.view_visibility` of their anchor centres (LocusGS)."""
+
+    name: ClassVar[str] = "anchor_visibility"
+
+    class Config(VisibilityOptions):
+        """See `qgs.losses.VisibilityOptions`.
+
+        z_guard: |z| below it is replaced by +z_guard before the division (LocusGS release).
+        """
+
+        weight: float = Field(default=0.1, ge=0)
+        z_guard: float = Field(default=1e-3, gt=0)
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """Centres."""
+        return CENTER_FIELD
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        """One term, `anchor_visibility`."""
+        per_anchor = view_visibility(
+            prediction.state[CENTER],
+            target.cameras,
+            clamp=self.config.clamp,
+            behind=self.config.near if self.config.behind_camera == "invisible" else None,
+            z_guard=self.config.z_guard,
+        )
+        return {"anchor_visibility": self.config.weight * per_anchor.mean()}
