@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 
+from qgs.cli import app
 from qgs.composer.slots import DEFAULT_LOSSES, SLOTS
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +29,11 @@ def test_slots_and_their_defaults() -> None:
     shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
     defaults = {name: [slot.default] for name, slot in SLOTS.items()}
     assert shown == {**defaults, "losses": list(DEFAULT_LOSSES.values())}
+
+
+def test_commands() -> None:
+    shown = re.findall(r"^\| `qgs (\w+)", section("On the command line"), re.MULTILINE)
+    assert sorted(shown) == sorted(command.name or "" for command in app.registered_commands)
 
 
 def test_paths_exist() -> None:
