@@ -14,6 +14,9 @@ dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -23,13 +26,23 @@ SUMS = 5
 GRADIENTS = 10  # of u, v, xx, xy, yy, depth, opacity, r, g, b
 
 _OPTIONS = {
-    "cache": True,
     "nogil": True,
     "error_model": "numpy",  # no branch on a division by zero
     "fastmath": {"contract", "reassoc", "arcp", "nsz"},
 }
+
+
+def _kernel(function: Callable[..., Any]) -> Any:
+    """Compile `function` on first use, kept on disk where there is a place that can be written."""
+    try:
+        return njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # numba found none
+        return njit(**_OPTIONS)(function)
+
+
 _LANES = np.uint64(TILE)
-_STATE = np.uint64(8 * TILE)  # floats per row of a tile
+_ROW = 9 * TILE  # floats per row of a tile
+_STATE = np.uint64(_ROW)
 _CHECK_EVERY = 16  # splats between two looks at which rows are still open
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
@@ -41,7 +54,7 @@ _C0, _C1, _C2, _C3, _C4, _C5 = (
 )
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _exp2(x):
     """2^x for float32 x in [-126, 0]."""
     whole = np.floor(x)
@@ -51,7 +64,7 @@ def _exp2(x):
     return mantissa * exponent.view(np.float32)
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _by_depth(splats, top, bottom, width):
     """Indices of the splats that touch rows [top, bottom) of the image, by ascending depth.
 
@@ -86,7 +99,7 @@ def _by_depth(splats, top, bottom, width):
     return order[:n]
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _touching_rows(order, splats, top, bottom, out):
     """Copy to `out` the splats of `order` that touch rows [top, bottom); return how many."""
     n = 0
@@ -98,25 +111,25 @@ def _touching_rows(order, splats, top, bottom, out):
     return n
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _open(state, live, rows, columns):
     """Start a tile: transmittance 1 in lane block 0, 1 in block 1 for pixels inside the image."""
     state[:] = _ZERO
     for row in range(TILE):
         live[row] = row < rows
-        base = row * 8 * TILE
+        base = row * _ROW
         for lane in range(TILE):
             state[base + lane] = _ONE
             state[base + TILE + lane] = _ONE if row < rows and lane < columns else _ZERO
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _close_rows(state, live):
     """Mark rows in which every pixel has stopped; return whether any row is still open."""
     any_live = False
     for row in range(TILE):
         total = _ZERO
-        base = row * 8 * TILE + TILE
+        base = row * _ROW + TILE
         for lane in range(TILE):
             total += state[base + lane]
         live[row] = total > _ZERO
@@ -124,7 +137,7 @@ def _close_rows(state, live):
     return any_live
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _blend_row(state, base, dx0, linear, quadratic, constant, opacity, r, g, b, z, options):
     """Blend a splat into one row. power(dx) = (quadratic dx + linear) dx + constant, in base 2."""
     alpha_min, alpha_cap, transmittance_min = options
@@ -143,9 +156,10 @@ def _blend_row(state, base, dx0, linear, quadratic, constant, opacity, r, g, b, 
         state[i + np.uint64(3) * _LANES] += weight * g
         state[i + np.uint64(4) * _LANES] += weight * b
         state[i + np.uint64(5) * _LANES] += weight * z
+        state[i + np.uint64(6) * _LANES] += weight
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _row_span(v, ey, top):
     """The rows of the tile at `top` whose pixel centres lie within `ey` of `v`."""
     first = max(0, int(np.ceil(v - ey - top - _HALF)))
@@ -153,14 +167,14 @@ def _row_span(v, ey, top):
     return first, last
 
 
-@njit(**_OPTIONS)
+@_kernel
 def forward_unit(splats, opacities, colors, tile_rows, options, sums):
     """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 8)."""
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
     row_order = np.empty(order.shape[0] + 1, np.int32)
-    state = np.empty(TILE * 8 * TILE, np.float32)
+    state = np.empty(TILE * _ROW, np.float32)
     live = np.empty(TILE, np.bool_)
     for y0 in range(top, bottom, TILE):
         rows = min(TILE, height - y0)
@@ -194,13 +208,12 @@ def forward_unit(splats, opacities, colors, tile_rows, options, sums):
                         break
             for row in range(rows):
                 for lane in range(columns):
-                    base = row * 8 * TILE + lane
-                    for channel in range(4):
+                    base = row * _ROW + lane
+                    for channel in range(SUMS):
                         sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
-                    sums[4, y0 + row, x0 + lane] = _ONE - state[base]
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _backward_row(
     state, base, totals, dx0, dy, linear, quadratic, constant, opacity, r, g, b, z, options
 ):
@@ -224,7 +237,8 @@ def _backward_row(
         state[i + _LANES] = live
         g_r, g_g = state[i + np.uint64(3) * _LANES], state[i + np.uint64(4) * _LANES]
         g_b, g_z = state[i + np.uint64(5) * _LANES], state[i + np.uint64(6) * _LANES]
-        value = g_r * r + g_g * g + g_b * b + g_z * z + state[i + np.uint64(7) * _LANES]
+        z_here = z - state[i + np.uint64(8) * _LANES]
+        value = g_r * r + g_g * g + g_b * b + g_z * z_here + state[i + np.uint64(7) * _LANES]
         rest = state[i + np.uint64(2) * _LANES] - weight * value
         state[i + np.uint64(2) * _LANES] = rest
         slope = before * value - rest / (_ONE - alpha)
@@ -242,7 +256,7 @@ def _backward_row(
         totals[lane + np.uint64(9) * _LANES] += weight * g_b
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _add_gradients(totals, xx, xy, yy, opacity, out):
     """Reduce the lanes of `totals` and add one splat's gradients to `out` (10,)."""
     t = np.empty(GRADIENTS, np.float32)
@@ -262,21 +276,30 @@ def _add_gradients(totals, xx, xy, yy, opacity, out):
         out[7 + channel] += t[7 + channel]
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
-    """Put dL/dsums in blocks 3 to 7 of a tile and sum_j w_j v_j of all its splats in block 2."""
+    """Put sum_j w_j v_j of a tile in block 2, dL/dsums in blocks 3 to 7, depth in block 8.
+
+    v holds (z - depth) dL/dsums_z + (dL/dsums_w + depth dL/dsums_z): taken about the pixel's
+    depth, the large gradients of nearly transparent pixels do not cancel in float32.
+    """
     for row in range(rows):
         for lane in range(columns):
-            base = row * 8 * TILE + lane
-            rest = _ZERO
-            for channel in range(SUMS):
-                slope = slopes[channel, y0 + row, x0 + lane]
-                rest += slope * sums[channel, y0 + row, x0 + lane]
-                state[base + (3 + channel) * TILE] = slope
+            y, x, base = y0 + row, x0 + lane, row * _ROW + lane
+            weight = sums[4, y, x]
+            depth = sums[3, y, x] / weight if weight > _ZERO else _ZERO
+            for channel in range(4):
+                state[base + (3 + channel) * TILE] = slopes[channel, y, x]
+            of_weight = slopes[4, y, x] + depth * slopes[3, y, x]
+            rest = of_weight * weight
+            for channel in range(3):
+                rest += slopes[channel, y, x] * sums[channel, y, x]
             state[base + 2 * TILE] = rest
+            state[base + 7 * TILE] = of_weight
+            state[base + 8 * TILE] = depth
 
 
-@njit(**_OPTIONS)
+@_kernel
 def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out):
     """Add the gradients of the unit that `forward_unit` rendered to `out` (G, 10).
 
@@ -286,7 +309,7 @@ def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, o
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
     row_order = np.empty(order.shape[0] + 1, np.int32)
-    state = np.empty(TILE * 8 * TILE, np.float32)
+    state = np.empty(TILE * _ROW, np.float32)
     totals = np.empty(GRADIENTS * TILE, np.float32)
     live = np.empty(TILE, np.bool_)
     for y0 in range(top, bottom, TILE):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.rotations import quat_to_matrix
@@ -39,11 +40,13 @@ def project(
 ) -> Splats:
     """Splats (B, V, G) of Gaussians (B, G) in cameras (B, V) of one dtype, autocast being off.
 
-    Differentiable in means, scales, quats, c2w and intrinsics. In the Jacobian, x/z and y/z are
-    clamped to 15 % of the image beyond its borders, as gsplat does.
+    Differentiable in means, scales, quats (normalised here), c2w and intrinsics. In the Jacobian,
+    x/z and y/z are clamped to 15 % of the image beyond its borders, as gsplat does.
     """
     w2c = cameras.w2c
-    factors = quat_to_matrix(gaussians.quats) * gaussians.scales[..., None, :]  # (B, G, 3, 3)
+    factors = (
+        quat_to_matrix(F.normalize(gaussians.quats, dim=-1)) * gaussians.scales[..., None, :]
+    )  # (B, G, 3, 3)
     position = w2c[..., :3, :3] @ gaussians.means.transpose(-1, -2)[:, None] + w2c[..., :3, 3:]
     x, y, z = position.unbind(-2)  # (B, V, G) each
     in_range = (z >= near) & (z <= far)
