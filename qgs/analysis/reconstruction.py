@@ -1,0 +1,161 @@
+"""A scene from photos to files: Gaussians, renders beside truth, depth, an orbit, cameras."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from qgs.analysis.orbit import orbit
+from qgs.analysis.pictures.figures import figure_picture, grid_figure
+from qgs.analysis.pictures.images import (
+    Picture,
+    depth_picture,
+    depth_range,
+    finer,
+    rgb_picture,
+    side_by_side,
+)
+from qgs.data.sampling import Sample
+from qgs.io.atomic import write_text
+from qgs.io.pictures import write_gif, write_png
+from qgs.io.ply import write_ply
+from qgs.metrics import psnr
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Gaussians, Rendering
+
+ORBIT_FRAMES = 48
+ORBIT_SIDE = 320
+FRAMES_PER_SECOND = 16
+OVERVIEW_COLUMNS = 8
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One rendered view against its photo; psnr in dB."""
+
+    frame: int
+    is_input: bool
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Gaussians (1, G) of a sample, and what its input and target cameras see of them."""
+
+    sample: Sample
+    gaussians: Gaussians
+    rendering: Rendering
+    scores: list[ViewScore]
+
+
+@torch.no_grad()
+def reconstruct(model: QueryGaussianModel, sample: Sample) -> Reconstruction:
+    """Gaussians from the inputs of `sample`, rendered from its inputs, then its targets."""
+    gaussians = model(sample.inputs).gaussians
+    rendering = model.render(gaussians, _cameras(sample))
+    photos = torch.cat([sample.inputs.images, sample.targets.images], 1)
+    quality = psnr(rendering.rgb[0], photos[0]).tolist()
+    frames = (*sample.input_frames, *sample.target_frames)
+    inputs = len(sample.input_frames)
+    scores = [
+        ViewScore(frame, index < inputs, value)
+        for index, (frame, value) in enumerate(zip(frames, quality, strict=True))
+    ]
+    return Reconstruction(sample, gaussians, rendering, scores)
+
+
+def write_reconstruction(
+    model: QueryGaussianModel, reconstruction: Reconstruction, out: Path
+) -> list[Path]:
+    """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
+
+    views/ holds photo and render side by side. Everything is in the normalised world of the model,
+    in which cameras.json tells the cameras.
+    """
+    ply, cameras = out / "gaussians.ply", out / "cameras.json"
+    write_ply(reconstruction.gaussians, ply)
+    pictures = _write_views(reconstruction, out)
+    path = _write_orbit(model, reconstruction, out / "orbit.gif")
+    write_text(cameras, json.dumps(_camera_record(reconstruction, path), indent=1))
+    return [ply, *pictures, out / "orbit.gif", cameras]
+
+
+def _write_views(reconstruction: Reconstruction, out: Path) -> list[Path]:
+    sample, rendering = reconstruction.sample, reconstruction.rendering
+    photos = [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])]
+    renders = [rgb_picture(image) for image in rendering.rgb[0]]
+    near, far = depth_range(rendering.depth)
+    depths = [depth_picture(depth, near, far) for depth in rendering.depth[0]]
+    for score, photo, render, depth in zip(
+        reconstruction.scores, photos, renders, depths, strict=True
+    ):
+        name = f"{score.frame:05d}_{'input' if score.is_input else 'novel'}.png"
+        write_png(side_by_side([photo, render]), out / "views" / name)
+        write_png(depth, out / "depth" / name)
+    rows = {"photo": photos, "render": renders, "depth": depths}
+    overview = _overview(reconstruction.scores, rows, near, far)
+    write_png(overview, out / "overview.png")
+    return [out / "overview.png", out / "views", out / "depth"]
+
+
+def _overview(
+    scores: list[ViewScore], rows: dict[str, list[Picture]], near: float, far: float
+) -> Picture:
+    """At most OVERVIEW_COLUMNS views, the inputs last to be left out."""
+    shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
+    titles = [
+        f"frame {scores[i].frame}, {'input' if scores[i].is_input else 'novel'}\n"
+        f"{scores[i].psnr:.1f} dB"
+        for i in shown
+    ]
+    chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
+    return figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
+
+
+def _write_orbit(model: QueryGaussianModel, reconstruction: Reconstruction, file: Path) -> Cameras:
+    path = orbit_path(reconstruction.sample.inputs.cameras, reconstruction.rendering.depth)
+    with torch.no_grad():
+        frames = model.render(reconstruction.gaussians, path).rgb[0]
+    write_gif([rgb_picture(frame) for frame in frames], file, FRAMES_PER_SECOND)
+    return path
+
+
+def orbit_path(
+    inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
+) -> Cameras:
+    """The loop of `qgs.analysis.orbit` about the middle of the rendered depths."""
+    near, far = depth_range(depths)
+    return finer(orbit(inputs, (near + far) / 2, frames), side)
+
+
+def _cameras(sample: Sample) -> Cameras:
+    a, b = sample.inputs.cameras, sample.targets.cameras
+    intrinsics = torch.cat([a.intrinsics, b.intrinsics], 1)
+    return Cameras(torch.cat([a.c2w, b.c2w], 1), intrinsics, a.size)
+
+
+def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, Any]:
+    cameras = _cameras(reconstruction.sample)
+    views = [
+        {"frame": s.frame, "input": s.is_input, "psnr": round(s.psnr, 3), **_plain(cameras[:, [i]])}
+        for i, s in enumerate(reconstruction.scores)
+    ]
+    return {
+        "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
+        "scene": reconstruction.sample.scene,
+        "views": views,
+        "orbit": [_plain(path[:, [i]]) for i in range(path.shape[1])],
+    }
+
+
+def _plain(camera: Cameras) -> dict[str, Any]:
+    return {
+        "c2w": camera.c2w[0, 0].tolist(),
+        "intrinsics": camera.intrinsics[0, 0].tolist(),
+        "size": list(camera.size),
+    }

@@ -1,0 +1,143 @@
+"""Training and judging several recipes under one budget."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import yaml
+from rich.table import Table
+
+from qgs.analysis.pictures.figures import Curves
+from qgs.analysis.report import Baseline, Contender
+from qgs.composer import Recipe, resolve
+from qgs.engine import Evaluation, RunFolder, evaluate, train
+
+SAME = ("data", "views", "evaluation", "training")
+"""Parts of the recipes that must be equal, so that only the models differ."""
+
+NO_STEP_LIMIT = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One recipe after training and evaluation."""
+
+    recipe: Recipe
+    contender: Contender
+    evaluation: Evaluation
+
+
+def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
+    """Recipes by file name, under one time budget and seed.
+
+    Raises ValueError when two files share a name, or differ in anything but the model and losses.
+    """
+    overrides = [
+        f"training.seconds={seconds}",
+        f"training.steps={NO_STEP_LIMIT}",
+        f"seed={seed}",
+    ]
+    recipes = {file.stem: resolve(file, overrides) for file in files}
+    if len(recipes) < len(files):
+        raise ValueError(f"recipes are told apart by file name, got {[f.name for f in files]}")
+    first = next(iter(recipes))
+    for name, recipe in recipes.items():
+        unequal = [part for part in SAME if recipe.tree[part] != recipes[first].tree[part]]
+        if unequal:
+            raise ValueError(
+                f"{name} and {first} differ in {', '.join(unequal)}, so their figures could not be "
+                "compared; make these parts equal, or train them with `qgs train`"
+            )
+    return recipes
+
+
+def compete(name: str, recipe: Recipe, run: Path) -> Entry:
+    """Train and evaluate one recipe. Raises KeyboardInterrupt when training was stopped."""
+    result = train(recipe, run)
+    if result.stopped_by:
+        raise KeyboardInterrupt(result.stopped_by)
+    evaluation = evaluate(result.model, recipe)
+    evaluation.write(result.folder.evaluation)
+    dispersion = evaluation.summary()["dispersion_over_gaussians"]
+    contender = Contender(
+        name=name,
+        model=result.model,
+        psnr=evaluation.mean("psnr"),
+        ssim=evaluation.mean("ssim"),
+        dispersion_mean=dispersion["mean"]["mean"],
+        dispersion_median=dispersion["median"]["median"],
+        gaussians=evaluation.gaussians,
+        parameters=sum(p.numel() for p in result.model.parameters()),
+        seconds=result.seconds,
+        curves=curves_of(result.folder),
+        recipe=yaml.safe_dump(dict(recipe.tree), sort_keys=False, allow_unicode=True),
+    )
+    return Entry(recipe, contender, evaluation)
+
+
+def curves_of(folder: RunFolder) -> Curves:
+    """The history of a run."""
+    history = folder.history()
+    return Curves(*([record[key] for record in history] for key in ("seconds", "loss", "psnr")))
+
+
+def baselines(entry: Entry) -> list[Baseline]:
+    """What needs no model, on the views that `entry` was judged on."""
+    return [
+        Baseline(name, entry.evaluation.mean("psnr", key), entry.evaluation.mean("ssim", key))
+        for name, key in (("Nearest input", "nearest_input"), ("Mean colour", "mean_colour"))
+    ]
+
+
+def facts(recipe: Recipe, seconds: float, seed: int) -> dict[str, str]:
+    """What was run where."""
+    height, width = recipe.tree["data"]["image_size"]
+    views = recipe.views
+    versions = ", ".join(f"{name} {version}" for name, version in recipe.plugin_versions.items())
+    return {
+        "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
+        "Views": f"{views.inputs} inputs, judged between and around them",
+        "Budget": f"{seconds:g} seconds of training each, seed {seed}",
+        "Machine": f"{_device()}, {torch.get_num_threads()} threads, {platform.system()}",
+        "Software": f"torch {torch.__version__}, {versions}",
+    }
+
+
+def _device() -> str:
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name()
+    return f"CPU with {os.cpu_count()} cores ({platform.machine()})"
+
+
+def table_of(entries: Sequence[Entry]) -> Table:
+    """The comparison as a table for the terminal."""
+    rows = [entry.contender for entry in entries]
+    table = Table(
+        title="Unseen scenes",
+        caption="median, mean: token dispersion in world units; best in green",
+    )
+    table.add_column("", no_wrap=True)
+    for column in ("PSNR", "SSIM", "median", "mean", "Gaussians", "parameters", "seconds"):
+        table.add_column(column, justify="right", no_wrap=True)
+    best = (
+        max(c.psnr for c in rows),
+        max(c.ssim for c in rows),
+        min(c.dispersion_median for c in rows),
+        min(c.dispersion_mean for c in rows),
+    )
+    for c in rows:
+        scores = (c.psnr, c.ssim, c.dispersion_median, c.dispersion_mean)
+        cells = [
+            f"[green]{value:.{digits}f}[/green]" if value == top else f"{value:.{digits}f}"
+            for value, top, digits in zip(scores, best, (2, 3, 3, 3), strict=True)
+        ]
+        table.add_row(c.name, *cells, f"{c.gaussians:,}", f"{c.parameters:,}", f"{c.seconds:.0f}")
+    table.add_section()
+    for b in baselines(entries[0]):
+        table.add_row(b.name, f"{b.psnr:.2f}", f"{b.ssim:.3f}", *["–"] * 5, style="dim")
+    return table

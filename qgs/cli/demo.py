@@ -1,0 +1,130 @@
+"""`qgs demo`: train recipes side by side, compare them on unseen views, write a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from qgs.analysis.report import Report
+    from qgs.cli.contest import Entry
+    from qgs.composer import Recipe
+
+DEFAULT_RECIPES = ("tokengs.yaml", "locus.yaml")
+PICTURED_SCENES = 3
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("demo")(demo)
+
+
+def demo(
+    recipes: Annotated[
+        list[Path] | None, typer.Argument(help="Recipe files to compare; default: the tiny two.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=1, help="Training time of each recipe.")] = 120,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every recipe.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder for everything; default: demo, demo-2, ...")
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Option("--recipes", help="Folder of the tiny recipes.")
+    ] = None,
+) -> None:
+    """Train the tiny TokenGS and LocusGS on the same rooms, compare them, write report.html."""
+    files = recipes or default_recipes(folder)
+    target = new_folder(out)
+
+    from rich.console import Console
+
+    from qgs.cli.contest import compete, resolve_fairly, table_of
+    from qgs.io.atomic import write_text
+
+    console = Console()
+    resolved = resolve_fairly(files, seconds, seed)
+    entries = []
+    for number, (name, recipe) in enumerate(resolved.items(), start=1):
+        console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
+        entries.append(compete(name, recipe, target / name))
+    console.print(table_of(entries))
+    console.print("Writing the report", style="dim")
+    from qgs.analysis.report import report_html
+
+    report = _report(entries, seconds, seed)
+    write_text(target / "report.html", report_html(report))
+    _write_example(entries, report, target)
+    _say_where(console, target, entries)
+
+
+def default_recipes(folder: Path | None) -> list[Path]:
+    """The tiny recipes in `folder`, else in ./recipes/tiny, else in the clone that qgs runs from.
+
+    Raises FileNotFoundError that names every place where they were looked for.
+    """
+    import qgs
+
+    clone = Path(qgs.__file__).parents[1]
+    places = [folder] if folder else [Path("recipes/tiny"), clone / "recipes" / "tiny"]
+    for place in places:
+        files = [place / name for name in DEFAULT_RECIPES]
+        if all(file.is_file() for file in files):
+            return files
+    looked = ", ".join(str(place) for place in places)
+    raise FileNotFoundError(
+        f"found no {' and '.join(DEFAULT_RECIPES)} in {looked}; run this in a clone of the "
+        "repository, or give --recipes FOLDER or the recipe files themselves"
+    )
+
+
+def new_folder(out: Path | None) -> Path:
+    """`out`, refused when it holds anything; None takes the first of demo, demo-2, ... not used."""
+    if out is None:
+        number, out = 1, Path("demo")
+        while out.exists():
+            number += 1
+            out = Path(f"demo-{number}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")
+    return out
+
+
+def _report(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
+    from qgs.analysis.report import Report
+    from qgs.cli.contest import baselines, facts
+    from qgs.data.loader import evaluation_samples
+
+    recipe: Recipe = entries[0].recipe
+    few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
+    samples = evaluation_samples(recipe.build_data(), recipe.views, few)[:PICTURED_SCENES]
+    names = [entry.contender.name for entry in entries]
+    return Report(
+        title=" and ".join(names) + f", {seconds:g} seconds of training each",
+        contenders=[entry.contender for entry in entries],
+        baselines=baselines(entries[0]),
+        samples=samples,
+        facts=facts(recipe, seconds, seed),
+    )
+
+
+def _write_example(entries: Sequence[Entry], report: Report, target: Path) -> None:
+    import torch
+
+    from qgs.io.ply import write_ply
+
+    for entry in entries:
+        with torch.no_grad():
+            gaussians = entry.contender.model(report.samples[0].inputs).gaussians
+        write_ply(gaussians, target / entry.contender.name / "example.ply")
+
+
+def _say_where(console: Console, target: Path, entries: Sequence[Entry]) -> None:
+    console.print(f"\n[bold]Report:[/bold] {(target / 'report.html').resolve()}", soft_wrap=True)
+    for entry in entries:
+        run = target / entry.contender.name
+        console.print(f"{entry.contender.name}: {run}/checkpoint.safetensors, {run}/example.ply")
