@@ -1,8 +1,8 @@
 """The ray caster: exact intersections, one nearest hit per sample, no bounces.
 
 A ray is o + t d with d = R (x, y, 1), so that t is the camera-frame z of the hit. Before an image
-is cast, `visible` bounds each shape on the screen and sorts the shapes by their nearest z; a tile
-of pixels tests those that overlap it, nearest first, and a ray stops at the first shape that
+is cast, `visible` bounds each shape on the screen and sorts the shapes by their nearest z; a ray
+tests those that overlap its pixel, nearest first, and a ray stops at the first shape that
 begins behind what it has hit.
 """
 
@@ -28,13 +28,19 @@ def _away_from_zero(x):
 
 
 @njit(**OPTIONS)
+def _slab(o, d, h):
+    """Where a ray is between -h and h along one axis: entry and exit."""
+    inverse = 1 / _away_from_zero(d)
+    a, b = (-h - o) * inverse, (h - o) * inverse
+    return min(a, b), max(a, b)
+
+
+@njit(**OPTIONS)
 def _hit_box(o, d, h):
-    """Where the ray enters the box, or inf."""
-    near, far = -np.inf, np.inf
-    for k in range(3):
-        inverse = 1 / _away_from_zero(d[k])
-        a, b = (-h[k] - o[k]) * inverse, (h[k] - o[k]) * inverse
-        near, far = max(near, min(a, b)), min(far, max(a, b))
+    near_x, far_x = _slab(o[0], d[0], h[0])
+    near_y, far_y = _slab(o[1], d[1], h[1])
+    near_z, far_z = _slab(o[2], d[2], h[2])
+    near, far = max(near_x, near_y, near_z), min(far_x, far_y, far_z)
     return near if NEAR < near <= far else np.inf
 
 
@@ -52,9 +58,7 @@ def _hit_sphere(o, d, radius):
 
 @njit(**OPTIONS)
 def _hit_cylinder(o, d, radius, half):
-    inverse = 1 / _away_from_zero(d[2])
-    a, b = (-half - o[2]) * inverse, (half - o[2]) * inverse
-    near, far = min(a, b), max(a, b)
+    near, far = _slab(o[2], d[2], half)
     a = _away_from_zero(d[0] * d[0] + d[1] * d[1])
     b = o[0] * d[0] + o[1] * d[1]
     root = b * b - a * (o[0] * o[0] + o[1] * o[1] - radius * radius)
@@ -66,22 +70,17 @@ def _hit_cylinder(o, d, radius, half):
 
 
 @njit(**OPTIONS)
-def hit(shape, o, d):
-    """t at which the ray (o relative to the world, d) enters `shape`, or inf.
-
-    Returns t, and the local origin and direction.
-    """
-    cos, sin = shape[7], shape[8]
-    x, y, z = o[0] - shape[1], o[1] - shape[2], o[2] - shape[3]
+def hit(shapes, i, o, d):
+    """t at which the ray o + t d enters shape i, or inf."""
+    cos, sin = shapes[i, 7], shapes[i, 8]
+    x, y, z = o[0] - shapes[i, 1], o[1] - shapes[i, 2], o[2] - shapes[i, 3]
     lo = (cos * x + sin * y, cos * y - sin * x, z)
     ld = (cos * d[0] + sin * d[1], cos * d[1] - sin * d[0], d[2])
-    if shape[0] == _BOX:
-        t = _hit_box(lo, ld, (shape[4], shape[5], shape[6]))
-    elif shape[0] == _SPHERE:
-        t = _hit_sphere(lo, ld, shape[4])
-    else:
-        t = _hit_cylinder(lo, ld, shape[4], shape[6])
-    return t, lo, ld
+    if shapes[i, 0] == _BOX:
+        return _hit_box(lo, ld, (shapes[i, 4], shapes[i, 5], shapes[i, 6]))
+    if shapes[i, 0] == _SPHERE:
+        return _hit_sphere(lo, ld, shapes[i, 4])
+    return _hit_cylinder(lo, ld, shapes[i, 4], shapes[i, 6])
 
 
 @njit(**OPTIONS)
@@ -100,13 +99,13 @@ def _hit_walls(o, d, size):
 
 
 @njit(**OPTIONS)
-def _corner(shape, k, c2w):
-    """Camera-frame position of corner k of the box around `shape`."""
-    lx = shape[4] if k & 1 else -shape[4]
-    ly = shape[5] if k & 2 else -shape[5]
-    x = shape[1] + shape[7] * lx - shape[8] * ly - c2w[0, 3]
-    y = shape[2] + shape[8] * lx + shape[7] * ly - c2w[1, 3]
-    z = shape[3] + (shape[6] if k & 4 else -shape[6]) - c2w[2, 3]
+def _corner(shapes, i, k, c2w):
+    """Camera-frame position of corner k of the box around shape i."""
+    lx = shapes[i, 4] if k & 1 else -shapes[i, 4]
+    ly = shapes[i, 5] if k & 2 else -shapes[i, 5]
+    x = shapes[i, 1] + shapes[i, 7] * lx - shapes[i, 8] * ly - c2w[0, 3]
+    y = shapes[i, 2] + shapes[i, 8] * lx + shapes[i, 7] * ly - c2w[1, 3]
+    z = shapes[i, 3] + (shapes[i, 6] if k & 4 else -shapes[i, 6]) - c2w[2, 3]
     return (
         c2w[0, 0] * x + c2w[1, 0] * y + c2w[2, 0] * z,
         c2w[0, 1] * x + c2w[1, 1] * y + c2w[2, 1] * z,
@@ -123,7 +122,7 @@ def visible(shapes, c2w, intrinsics):
         nearest, u0, u1, v0, v1 = np.inf, np.inf, -np.inf, np.inf, -np.inf
         farthest = -np.inf
         for k in range(8):
-            x, y, z = _corner(shapes[i], k, c2w)
+            x, y, z = _corner(shapes, i, k, c2w)
             nearest, farthest = min(nearest, z), max(farthest, z)
             if z > NEAR:
                 u = intrinsics[0] * x / z + intrinsics[2]
@@ -133,7 +132,8 @@ def visible(shapes, c2w, intrinsics):
             nearest = np.inf
         elif nearest <= NEAR:
             u0, u1, v0, v1 = -np.inf, np.inf, -np.inf, np.inf
-        bounds[i] = nearest, u0, u1, v0, v1
+        bounds[i, 0] = nearest
+        bounds[i, 1], bounds[i, 2], bounds[i, 3], bounds[i, 4] = u0, u1, v0, v1
     order = np.argsort(bounds[:, 0])
     shown = 0
     while shown < count and bounds[order[shown], 0] < np.inf:
@@ -142,12 +142,16 @@ def visible(shapes, c2w, intrinsics):
 
 
 @njit(**OPTIONS)
-def _candidates(order, bounds, column, row, found):
-    """Fill `found` with the shapes that may touch the tile; return how many."""
+def _candidates(order, count, bounds, column, row, extent, found):
+    """Fill `found` with those of the first `count` shapes of `order` that may touch a square.
+
+    The square of `extent` pixels begins at (column, row). Returns how many were found.
+    """
     n = 0
-    for i in order:
-        outside = bounds[i, 1] > column + TILE or bounds[i, 2] < column
-        if not (outside or bounds[i, 3] > row + TILE or bounds[i, 4] < row):
+    for k in range(count):
+        i = order[k]
+        outside = bounds[i, 1] > column + extent or bounds[i, 2] < column
+        if not (outside or bounds[i, 3] > row + extent or bounds[i, 4] < row):
             found[n] = i
             n += 1
     return n
@@ -172,7 +176,7 @@ def _nearest(shapes, size, bounds, found, count, o, d):
         i = found[k]
         if bounds[i, 0] > best:
             break
-        t = hit(shapes[i], o, d)[0]
+        t = hit(shapes, i, o, d)
         if t < best:
             best, index = t, i
     return best, face, index
@@ -187,15 +191,17 @@ def cast_colors(image, rows, samples, room, floor, c2w, intrinsics, view):
     shapes, textures, size, lights = room
     order, bounds = view
     width = image.shape[1]
+    in_tile = np.empty(shapes.shape[0], np.int64)
     found = np.empty(shapes.shape[0], np.int64)
     o = (c2w[0, 3], c2w[1, 3], c2w[2, 3])
     spread = 1 / (intrinsics[0] * samples)
     gain = 255.0 / (samples * samples)
     for top in range(rows[0], rows[1], TILE):
         for left in range(0, width, TILE):
-            count = _candidates(order, bounds, left, top, found)
+            tiled = _candidates(order, len(order), bounds, left, top, TILE, in_tile)
             for row in range(top, min(top + TILE, rows[1])):
                 for column in range(left, min(left + TILE, width)):
+                    count = _candidates(in_tile, tiled, bounds, column, row, 1, found)
                     r = g = b = 0.0
                     for k in range(samples * samples):
                         u = column + (k % samples + 0.5) / samples
@@ -216,12 +222,14 @@ def cast_depths(depth, rows, room, c2w, intrinsics, view):
     """Write rows [rows[0], rows[1]) of depth (H, W) float32: z of the ray through pixel centres."""
     shapes, _, size, _ = room
     order, bounds = view
+    in_tile = np.empty(shapes.shape[0], np.int64)
     found = np.empty(shapes.shape[0], np.int64)
     o = (c2w[0, 3], c2w[1, 3], c2w[2, 3])
     for top in range(rows[0], rows[1], TILE):
         for left in range(0, depth.shape[1], TILE):
-            count = _candidates(order, bounds, left, top, found)
+            tiled = _candidates(order, len(order), bounds, left, top, TILE, in_tile)
             for row in range(top, min(top + TILE, rows[1])):
                 for column in range(left, min(left + TILE, depth.shape[1])):
+                    count = _candidates(in_tile, tiled, bounds, column, row, 1, found)
                     d = _direction(c2w, intrinsics, column + 0.5, row + 0.5)
                     depth[row, column] = _nearest(shapes, size, bounds, found, count, o, d)[0]

@@ -51,7 +51,7 @@ def _on_round(x, y, z, h, kind):
 @njit(**OPTIONS)
 def _lit(point, normal, lights):
     """Light that arrives: a bright ceiling above, a lamp, a window."""
-    light = 0.50 + 0.10 * normal[2]
+    light = 0.42 + 0.12 * normal[2]
     for k in range(lights.shape[0]):
         x, y, z = lights[k, 0] - point[0], lights[k, 1] - point[1], lights[k, 2] - point[2]
         square = x * x + y * y + z * z
@@ -93,30 +93,50 @@ def shade(shapes, textures, size, lights, floor, o, d, t, face, index, footprint
     x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
     if index < 0:
         normal, u, v, p, q = _on_wall(x, y, z, size, face)
-        texture = textures[face]
+        texture = face
         shadow = _corners(x, y, z, size, face)
         if face == 4:
             shadow *= _floor_light(floor, x, y, size)
     else:
-        shape = shapes[index]
-        cos, sin = shape[7], shape[8]
-        h = (shape[4], shape[5], shape[6])
-        lx, ly, lz = x - shape[1], y - shape[2], z - shape[3]
+        cos, sin = shapes[index, 7], shapes[index, 8]
+        h = (shapes[index, 4], shapes[index, 5], shapes[index, 6])
+        lx, ly, lz = x - shapes[index, 1], y - shapes[index, 2], z - shapes[index, 3]
         lx, ly = cos * lx + sin * ly, cos * ly - sin * lx
-        if shape[0] == _BOX:
+        if shapes[index, 0] == _BOX:
             n, u, v, p, q = _on_box(lx, ly, lz, h)
         else:
-            n, u, v, p, q = _on_round(lx, ly, lz, h, shape[0])
+            n, u, v, p, q = _on_round(lx, ly, lz, h, shapes[index, 0])
         normal = (cos * n[0] - sin * n[1], sin * n[0] + cos * n[1], n[2])
-        texture = textures[int(shape[9])]
+        texture = int(shapes[index, 9])
         flat = z < _FLAT and normal[2] > 0.5
         shadow = _floor_light(floor, x, y, size) if flat else 1 - 0.35 * math.exp(-6 * z)
-    m, k = mixture(int(texture[0]), texture[1], int(texture[2]), u, v, p, q, footprint)
+    m, k = mixture(
+        int(textures[texture, 0]),
+        textures[texture, 1],
+        int(textures[texture, 2]),
+        u,
+        v,
+        p,
+        q,
+        footprint,
+    )
     light = _lit((x, y, z), normal, lights) * shadow
-    light = light + (1 - light) * texture[3]
+    light = light + (1 - light) * textures[texture, 3]
     a, b, c = (1 - m) * (1 - k), m * (1 - k), k
     return (
-        min(light * (a * texture[4] + b * texture[7] + c * texture[10]), 1.0),
-        min(light * (a * texture[5] + b * texture[8] + c * texture[11]), 1.0),
-        min(light * (a * texture[6] + b * texture[9] + c * texture[12]), 1.0),
+        min(
+            light
+            * (a * textures[texture, 4] + b * textures[texture, 7] + c * textures[texture, 10]),
+            1.0,
+        ),
+        min(
+            light
+            * (a * textures[texture, 5] + b * textures[texture, 8] + c * textures[texture, 11]),
+            1.0,
+        ),
+        min(
+            light
+            * (a * textures[texture, 6] + b * textures[texture, 9] + c * textures[texture, 12]),
+            1.0,
+        ),
     )

@@ -12,33 +12,33 @@ from qgs.data.rooms.textures import OPTIONS
 
 
 @njit(**OPTIONS)
-def _extent(shape):
-    """Half extents of the shape's bounding box along the world's x and y."""
-    cos, sin = abs(shape[7]), abs(shape[8])
-    return cos * shape[4] + sin * shape[5], sin * shape[4] + cos * shape[5]
+def _extent(shapes, i):
+    """Half extents of shape i's bounding box along the world's x and y."""
+    cos, sin = abs(shapes[i, 7]), abs(shapes[i, 8])
+    return cos * shapes[i, 4] + sin * shapes[i, 5], sin * shapes[i, 4] + cos * shapes[i, 5]
 
 
 @njit(**OPTIONS)
 def _range(low, high, extent, cells):
     """Indices of the map's cells between two world coordinates."""
-    first = int(math.floor((low / extent + 0.5) * (cells - 1)))
-    last = int(math.ceil((high / extent + 0.5) * (cells - 1))) + 1
+    first = math.floor((low / extent + 0.5) * (cells - 1))
+    last = math.ceil((high / extent + 0.5) * (cells - 1)) + 1
     return max(first, 0), min(last, cells)
 
 
 @njit(**OPTIONS)
-def _darken(darkness, shape, size, lamp):
-    """Add the shadow that a shape throws from the lamp, and the dimness right below it."""
+def _darken(darkness, shapes, s, size, lamp):
+    """Add the shadow that shape s throws from the lamp, and the dimness right below it."""
     cells = darkness.shape[0]
-    bottom, top = shape[3] - shape[6], shape[3] + shape[6]
+    bottom, top = shapes[s, 3] - shapes[s, 6], shapes[s, 3] + shapes[s, 6]
     if bottom > 1.2 or top < 0.03 or top > lamp[2] - 0.2:
         return
-    ex, ey = _extent(shape)
+    ex, ey = _extent(shapes, s)
     reach = lamp[2] / (lamp[2] - top)
-    x0 = min(shape[1] - ex, lamp[0] + (shape[1] - ex - lamp[0]) * reach)
-    x1 = max(shape[1] + ex, lamp[0] + (shape[1] + ex - lamp[0]) * reach)
-    y0 = min(shape[2] - ey, lamp[1] + (shape[2] - ey - lamp[1]) * reach)
-    y1 = max(shape[2] + ey, lamp[1] + (shape[2] + ey - lamp[1]) * reach)
+    x0 = min(shapes[s, 1] - ex, lamp[0] + (shapes[s, 1] - ex - lamp[0]) * reach)
+    x1 = max(shapes[s, 1] + ex, lamp[0] + (shapes[s, 1] + ex - lamp[0]) * reach)
+    y0 = min(shapes[s, 2] - ey, lamp[1] + (shapes[s, 2] - ey - lamp[1]) * reach)
+    y1 = max(shapes[s, 2] + ey, lamp[1] + (shapes[s, 2] + ey - lamp[1]) * reach)
     i0, i1 = _range(x0, x1, size[0], cells)
     j0, j1 = _range(y0, y1, size[1], cells)
     below = 0.55 * math.exp(-3 * bottom)
@@ -47,9 +47,12 @@ def _darken(darkness, shape, size, lamp):
         for j in range(j0, j1):
             y = (j / (cells - 1) - 0.5) * size[1]
             dark = 0.0
-            if hit(shape, (x, y, -0.05), (0.0, 0.0, 10.0))[0] < 1.0:
+            if hit(shapes, s, (x, y, -1.0), (0.0, 0.0, 10.0)) < 1.0:
                 dark = below
-            if hit(shape, (lamp[0], lamp[1], lamp[2]), (x - lamp[0], y - lamp[1], -lamp[2]))[0] < 1:
+            if (
+                hit(shapes, s, (lamp[0], lamp[1], lamp[2]), (x - lamp[0], y - lamp[1], -lamp[2]))
+                < 1
+            ):
                 dark = max(dark, 0.32)
             darkness[i, j] = max(darkness[i, j], dark)
 
@@ -74,5 +77,5 @@ def floor_shadows(shapes, size, lamp, cells):
     """(cells, cells) factor of the light that reaches the floor, indexed by x, then y."""
     darkness = np.zeros((cells, cells))
     for i in range(shapes.shape[0]):
-        _darken(darkness, shapes[i], size, lamp)
+        _darken(darkness, shapes, i, size, lamp)
     return 1 - _blurred(_blurred(darkness))

@@ -8,7 +8,12 @@ from numba import njit
 
 from qgs.data.rooms import shapes as s
 
-OPTIONS = {"cache": True, "nogil": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+OPTIONS = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+}
 
 PLAIN, CHECKER, STRIPES, PLANKS, TILES = s.PLAIN, s.CHECKER, s.STRIPES, s.PLANKS, s.TILES
 BRICKS, CLOUDS, GRADIENT, PICTURE = s.BRICKS, s.CLOUDS, s.GRADIENT, s.PICTURE
@@ -26,9 +31,8 @@ def _hash(i, j, seed):
 @njit(**OPTIONS)
 def _noise(x, y, seed):
     """Value noise in [0, 1] with unit period."""
-    fx, fy = math.floor(x), math.floor(y)
-    i, j = int(fx), int(fy)
-    a, b = x - fx, y - fy
+    i, j = math.floor(x), math.floor(y)
+    a, b = x - i, y - j
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
     low = _hash(i, j, seed) * (1 - a) + _hash(i + 1, j, seed) * a
     high = _hash(i, j + 1, seed) * (1 - a) + _hash(i + 1, j + 1, seed) * a
@@ -46,16 +50,16 @@ def _seam(x, width):
 def _grid(x, y, shift, seed, softness):
     """Tiles of unit size: a tone for each, and the joints between them."""
     row = math.floor(y)
-    x = x + shift * (int(row) & 1)
-    tone = 0.6 * _hash(int(math.floor(x)), int(row), seed) + 0.4 * _noise(3 * x, 3 * y, seed)
+    x = x + shift * (row & 1)
+    tone = 0.6 * _hash(math.floor(x), row, seed) + 0.4 * _noise(3 * x, 3 * y, seed)
     return tone, softness * max(_seam(x, 0.03), _seam(y, 0.03 * (1 + 2 * shift)))
 
 
 @njit(**OPTIONS)
 def _planks(x, y, seed, fade):
     board = math.floor(x)
-    along = y * 0.16 + 7.0 * _hash(int(board), 3, seed)
-    tone = 0.6 * _hash(int(board), int(math.floor(along)), seed)
+    along = y * 0.16 + 7.0 * _hash(board, 3, seed)
+    tone = 0.6 * _hash(board, math.floor(along), seed)
     tone += 0.4 * _noise(x * 9, y * 0.7, seed) * fade + 0.2 * (1 - fade)
     return tone, fade * max(_seam(x, 0.03), _seam(along, 0.005))
 
@@ -112,7 +116,7 @@ def mixture(kind, period, seed, u, v, p, q, footprint):
     x, y = u / period, v / period
     fade = min(max(1.6 - 3 * footprint / period, 0.0), 1.0)
     if kind == CHECKER:
-        odd = (int(math.floor(x)) + int(math.floor(y))) & 1
+        odd = (math.floor(x) + math.floor(y)) & 1
         return 0.5 + fade * (odd - 0.5), 0.0
     if kind == STRIPES:
         f = x - math.floor(x)
@@ -137,6 +141,6 @@ def mixture(kind, period, seed, u, v, p, q, footprint):
         a, b = x - math.floor(x) - 0.5, y - math.floor(y) - 0.5
         return 0.0, (fade if a * a + b * b < 0.08 else 0.2 * (1 - fade))
     if kind == BOOKS:
-        i = int(math.floor(x + 0.3 * _noise(x, 0.5, seed)))
+        i = math.floor(x + 0.3 * _noise(x, 0.5, seed))
         return _hash(i, 1, seed), (0.9 * _hash(i, 2, seed) if _hash(i, 3, seed) > 0.5 else 0.0)
     return 0.5 * _noise(3 * u, 3 * v, seed) + 0.25, 0.0
