@@ -10,30 +10,38 @@ import numpy as np
 def choose_frames(
     total: int,
     inputs: int,
+    span: int,
     frames: Sequence[int] | None = None,
     compare: Sequence[int] | None = None,
     novel: int = 6,
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Input frames and novel frames, from 0 to total - 1.
 
-    frames: the inputs; None spreads `inputs` of them evenly over all frames. compare: the novel
-    ones; None takes at most `novel`, evenly spread over the frames between the inputs.
+    frames: the inputs; None spreads `inputs` of them over `span` frames in the middle of all, both
+    ends included, or over all when there are fewer. compare: the novel ones; None takes at most
+    `novel`, evenly spread over the frames between the inputs.
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
-    chosen = _spread(range(total), inputs) if frames is None else tuple(frames)
-    if not chosen or len(chosen) > total or (len(chosen) < inputs and frames is None):
-        raise ValueError(f"{inputs} input views were asked for, but there are {total} photos")
+    chosen = _middle(total, inputs, max(span, inputs)) if frames is None else tuple(frames)
     if compare is None:
         between = [f for f in range(min(chosen), max(chosen) + 1) if f not in chosen]
-        compare = _spread(between, min(novel, len(between)))
+        compare = _evenly(between, min(novel, len(between)))
     _check([*chosen, *compare], total)
     return chosen, tuple(compare)
 
 
-def _spread(frames: Sequence[int], count: int) -> tuple[int, ...]:
-    if count > len(frames):
-        return ()
-    places = (np.arange(count) + 0.5) * len(frames) / max(count, 1)
+def _middle(total: int, count: int, span: int) -> tuple[int, ...]:
+    if count > total:
+        raise ValueError(f"{count} input views were asked for, but there are {total} photos")
+    span = min(span, total)
+    first = (total - span) // 2
+    return _evenly(range(first, first + span), count)
+
+
+def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
+    """`count` of `frames`, the first and the last among them; one alone is the middle one."""
+    last = len(frames) - 1
+    places = np.linspace(0, last, count).round() if count > 1 else np.full(count, last // 2)
     return tuple(frames[int(place)] for place in places)
 
 

@@ -65,5 +65,5 @@ def _draw_outline(
     circle = torch.stack([angle.cos(), angle.sin()])
     outline = (ellipses.centers[index][:, None] + ellipses.axes[index] @ circle) * scale
     points = [tuple(point) for point in outline.T.clamp(-1e5, 1e5).tolist()]
-    draw.polygon(points, fill=(*color, 36))
+    draw.polygon(points, fill=(*color, 22))
     draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
