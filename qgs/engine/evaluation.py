@@ -55,10 +55,8 @@ class Evaluation:
     def summary(self) -> dict:
         """Means over samples, and mean, variance and median of the dispersion over samples."""
         dispersions = {
-            over: asdict(
-                spread(torch.tensor([getattr(r, f"dispersion_{over}") for r in self.rows]))
-            )
-            for over in ("mean", "median")
+            "mean": asdict(spread(torch.tensor([row.dispersion_mean for row in self.rows]))),
+            "median": asdict(spread(torch.tensor([row.dispersion_median for row in self.rows]))),
         }
         return {
             "samples": len(self.rows),

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Self, TextIO
 
-import yaml
-
+from qgs.composer import Recipe
+from qgs.composer.show import annotated
 from qgs.io.atomic import write_text
 
 
@@ -46,10 +46,9 @@ class RunFolder:
         """Where `qgs eval` writes."""
         return self.path / "evaluation"
 
-    def write_recipe(self, tree: Mapping[str, Any]) -> None:
-        """Write the resolved recipe."""
-        text = yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True)
-        write_text(self.path / "recipe.yaml", text)
+    def write_recipe(self, recipe: Recipe) -> None:
+        """Write the resolved recipe; comments say what set each value."""
+        write_text(self.path / "recipe.yaml", annotated(recipe) + "\n")
 
     def append(self, record: Mapping[str, float]) -> None:
         """Add one line to the history."""

@@ -15,7 +15,7 @@ from qgs.types import LayerPrediction, Rendering, Views
 
 @dataclass(frozen=True)
 class Outcome:
-    """total: 0-d. terms: each loss term weighted by layer, detached. rendering: the last layer's."""
+    """total: 0-d. terms: weighted by layer, detached. rendering: the last layer's."""
 
     total: Tensor
     terms: Mapping[str, Tensor]

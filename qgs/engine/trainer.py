@@ -62,8 +62,8 @@ def train(recipe: Recipe, run: str | Path, *, console: Console | None = None) ->
     checkpoint then holds the last good weights.
     """
     folder = RunFolder.create(run)
-    folder.write_recipe(recipe.tree)
-    set_seed(int(recipe.tree["seed"]))
+    folder.write_recipe(recipe)
+    set_seed(recipe.seed)
     trainer = Trainer(recipe, folder)
     try:
         with TrainingProgress(console or Console(stderr=True)) as progress, stop_requests() as stop:
@@ -78,9 +78,7 @@ class Trainer:
     def __init__(self, recipe: Recipe, folder: RunFolder) -> None:
         self.config = recipe.training
         self.folder = folder
-        self.accelerator = Accelerator(
-            cpu=not torch.cuda.is_available(), mixed_precision="no", log_with=None
-        )
+        self.accelerator = Accelerator(cpu=not torch.cuda.is_available(), mixed_precision="no")
         self.device = self.accelerator.device
         self.model = recipe.build_model(device=self.device).train()
         self._batches = self._stream(recipe)
@@ -125,7 +123,7 @@ class Trainer:
 
     def _stream(self, recipe: Recipe) -> Iterator[Batch]:
         rank = self.accelerator.process_index
-        seed = int(recipe.tree["seed"]) + 1_000_003 * rank
+        seed = recipe.seed + 1_000_003 * rank
         return iter(
             training_batches(recipe.build_data(), recipe.views, self.config.batch_size, seed)
         )
