@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydantic import ValidationError
 from rich.table import Table
 from torch import nn
 
 from qgs.composer import Recipe
-from qgs.composer.registry import InstalledPlugin, load_sound_plugins
+from qgs.composer.registry import InstalledPlugin, default_config, load_sound_plugins
 from qgs.composer.show import flat
 from qgs.composer.slots import LAYER_SLOTS, SLOTS
 from qgs.composer.suggest import did_you_mean
@@ -110,15 +109,13 @@ def _row(component: type[Component], plugin: InstalledPlugin) -> tuple[str, str,
     for name, field in component.Config.model_fields.items():
         default = "required" if field.is_required() else _plain(component, name)
         options.append(f"{name}: {default}")
-    requires, provides = "depends on options", "depends on options"
-    try:
-        config = component.Config()
-    except ValidationError:
-        pass
-    else:
-        requires = _lines(f"{n}: {spec}" for n, spec in component.requires(config).items())
-        provides = _lines(f"{n}: {spec}" for n, spec in component.provides(config).items())
-    return _lines(options), requires, provides, f"{plugin.distribution} {plugin.version}"
+    origin = f"{plugin.distribution} {plugin.version}"
+    config = default_config(component)
+    if config is None:
+        return _lines(options), "depends on options", "depends on options", origin
+    requires = _lines(f"{n}: {spec}" for n, spec in component.requires(config).items())
+    provides = _lines(f"{n}: {spec}" for n, spec in component.provides(config).items())
+    return _lines(options), requires, provides, origin
 
 
 def _plain(component: type[Component], name: str) -> str:

@@ -13,8 +13,8 @@ BUILTIN = Plugin(
     contract_version=CONTRACT_VERSION,
     components=(
         *qgs.components.COMPONENTS,
-        *getattr(qgs.renderers, "COMPONENTS", ()),
-        *getattr(qgs.losses, "COMPONENTS", ()),
-        *getattr(qgs.data, "COMPONENTS", ()),
+        *qgs.renderers.COMPONENTS,
+        *qgs.losses.COMPONENTS,
+        *qgs.data.COMPONENTS,
     ),
 )

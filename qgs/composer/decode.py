@@ -92,6 +92,8 @@ def _find(
     installed = registry.components(place.slot.name)
     if isinstance(name, str) and name in installed:
         return installed[name]
+    if isinstance(name, str) and name.partition("/")[0] in registry.unusable:
+        return None  # its plugin is a problem already
     reason, fix = _why_not(name, place, registry)
     problems.add(origin, ".".join([*place.source, "type"]), reason, fix)
     return None

@@ -9,7 +9,9 @@ from qgs.composer.nodes import ListNode, MapNode, Node, Origin, Path, ScalarNode
 from qgs.composer.yaml12 import Yaml12Loader, scalar_value
 
 _STANDARD = "tag:yaml.org,2002:"
-_SCALARS = ("null", "bool", "int", "float", "str")
+_TAGS = frozenset(
+    _STANDARD + name for name in ("null", "bool", "int", "float", "str", "map", "seq")
+)
 
 
 def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
@@ -60,8 +62,16 @@ class _Reader:
 
     def read(self, node: yaml.Node, path: Path) -> Node:
         if any(node is parent for parent in self.open):
-            self.add(node, path, "an alias stands inside its own anchor", "write the value out")
-            return ScalarNode(self.origin(node), None)
+            return self.refuse(
+                node, path, "an alias stands inside its own anchor", "write the value out"
+            )
+        if node.tag not in _TAGS:
+            return self.refuse(
+                node,
+                path,
+                f"the tag {node.tag!r} is not allowed in a recipe",
+                "remove the tag; components are named with `type`",
+            )
         self.open.append(node)
         try:
             if isinstance(node, yaml.MappingNode):
@@ -107,21 +117,15 @@ class _Reader:
         return node.value
 
     def read_scalar(self, node: yaml.Node, path: Path) -> ScalarNode:
-        origin = self.origin(node)
-        if node.tag not in {_STANDARD + name for name in _SCALARS}:
-            self.add(
-                node,
-                path,
-                f"the tag {node.tag!r} is not allowed in a recipe",
-                "remove the tag; components are named with `type`",
-            )
-            return ScalarNode(origin, None)
         try:
-            return ScalarNode(origin, scalar_value(node.tag, node.value))
+            return ScalarNode(self.origin(node), scalar_value(node.tag, node.value))
         except ValueError:
             kind = node.tag.removeprefix(_STANDARD)
-            self.add(node, path, f"{node.value!r} is tagged as {kind}", "remove the tag")
-            return ScalarNode(origin, None)
+            return self.refuse(node, path, f"{node.value!r} is no {kind}", "remove the tag")
+
+    def refuse(self, node: yaml.Node, path: Path, reason: str, fix: str) -> ScalarNode:
+        self.problems.stop(self.origin(node), ".".join(path), reason, fix)
+        return ScalarNode(self.origin(node), None)
 
     def add(self, node: yaml.Node, path: Path, reason: str, fix: str) -> None:
         self.problems.add(self.origin(node), ".".join(path), reason, fix)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args, get_origin
 
-from pydantic import ValidationError
-
 from qgs.composer.decode import Chosen
-from qgs.composer.registry import Registry
+from qgs.composer.registry import Registry, default_config
 from qgs.composer.slots import SLOTS
 from qgs.composer.yaml12 import dump
 from qgs.contracts import Component, ComponentConfig
@@ -54,9 +52,8 @@ def _installed_providers(name: str, registry: Registry) -> Iterator[str]:
 
 
 def _default_configs(component: type[Component]) -> Iterator[tuple[str, ComponentConfig]]:
-    try:
-        config = component.Config()
-    except ValidationError:
+    config = default_config(component)
+    if config is None:
         return
     yield "", config
     for option, value, variant in _variants(config):

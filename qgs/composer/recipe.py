@@ -28,6 +28,7 @@ from qgs.contracts import (
     ModelDims,
     RecipeContext,
     SceneSource,
+    SceneSourceConfig,
     TrainingConfig,
     ViewsConfig,
 )
@@ -77,8 +78,8 @@ class Recipe:
 def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
     """Read, merge and check a recipe.
 
-    recipe: path of a YAML file, or a mapping of the same form. overrides: `a.b=value`, laid over
-        it in order.
+    recipe: path of a YAML file, or a mapping of the same form, whose `extends` is relative to the
+        working directory. overrides: `a.b=value`, laid over it in order.
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
@@ -112,7 +113,9 @@ def _check_components(
     depth = settings.decoder.depth
     dims = ModelDims(settings.model.width, settings.model.heads, depth)
     data = parts.get(("data",))
-    context = RecipeContext(dims, getattr(data.config, "image_size", None) if data else None)
+    source = data.config if data else None
+    size = source.image_size if isinstance(source, SceneSourceConfig) else None
+    context = RecipeContext(dims, size)
     for chosen in parts.values():
         if chosen is not None:
             _check_options(chosen, context, problems)

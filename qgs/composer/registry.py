@@ -39,9 +39,13 @@ class InstalledPlugin:
 
 @dataclass(frozen=True)
 class Registry:
-    """The components of the plugins that one recipe uses."""
+    """The components of the plugins that one recipe uses.
+
+    unusable: plugins that it names and that could not be loaded.
+    """
 
     plugins: Mapping[str, InstalledPlugin]
+    unusable: frozenset[str] = frozenset()
 
     def components(self, slot: str) -> dict[str, type[Component]]:
         """`PLUGIN/NAME` to component, of one slot."""
@@ -51,6 +55,12 @@ class Registry:
             for component in installed.plugin.components
             if component.slot == slot
         }
+
+
+def default_config(component: type[Component]) -> ComponentConfig | None:
+    """The options that `component` has by default; None if it has options without a default."""
+    fields = component.Config.model_fields.values()
+    return None if any(field.is_required() for field in fields) else component.Config()
 
 
 def builtin() -> InstalledPlugin:

@@ -32,7 +32,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
     recipe["properties"] |= {
         "extends": {"anyOf": [{"type": "string"}, _NAMES]},
         "plugins": _NAMES,
-        "swap": _mapping_of({"anyOf": [_ref(name) for name in SLOTS]}),
+        "swap": _mapping_of({"anyOf": [*map(_ref, SLOTS), {"type": "null"}]}),
         "model": model,
         "losses": _mapping_of({"anyOf": [_ref("losses"), {"type": "null"}]}),
         "data": {"anyOf": [_ref("data"), {"type": "null"}]},

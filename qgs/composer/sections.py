@@ -19,14 +19,14 @@ from qgs.contracts import ComponentConfig, EvaluationConfig, TrainingConfig, Vie
 class ModelSettings(ComponentConfig):
     """width: D. heads: h, a divisor of D (both papers)."""
 
-    width: int = Field(default=1024, ge=1)
+    width: int = Field(default=1024, ge=1, le=65_536)
     heads: int = Field(default=16, ge=1)
 
 
 class DecoderSettings(ComponentConfig):
     """depth: L. layer_scale: initial LayerScale of every sublayer (TokenGS release)."""
 
-    depth: int = Field(default=12, ge=1)
+    depth: int = Field(default=12, ge=1, le=1024)
     layer_scale: float = 5e-5
 
 
@@ -169,7 +169,7 @@ def _check_heads(node: MapNode, model: ModelSettings, problems: Problems) -> Non
 
 def load_plugins(tree: MapNode, problems: Problems) -> Registry:
     """The components of the recipe's `plugins`; a problem for each that cannot be used."""
-    plugins = {"qgs": builtin()}
+    plugins, unusable = {"qgs": builtin()}, set()
     written = tree.items.get("plugins")
     if written is not None and not isinstance(written, ListNode) and not is_null(written):
         reason = f"`plugins` is a list, this is {kind_of(written)}"
@@ -183,5 +183,6 @@ def load_plugins(tree: MapNode, problems: Problems) -> Registry:
         try:
             plugins[item.value] = load_plugin(item.value)
         except PluginError as error:
+            unusable.add(item.value)
             problems.add(item.origin, path, error.reason, error.fix)
-    return Registry(plugins)
+    return Registry(plugins, frozenset(unusable))

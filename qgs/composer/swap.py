@@ -7,7 +7,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 
 from qgs.composer.errors import Problems
-from qgs.composer.nodes import MapNode, Node, Origin, Path, kind_of
+from qgs.composer.nodes import MapNode, Node, Origin, Path, is_null, kind_of
 from qgs.composer.places import Place
 from qgs.composer.suggest import nearest
 
@@ -19,12 +19,13 @@ def apply_swaps(
 
     A pattern is a place's path in which `*`, `?` and `[...]` stand for parts of one segment, with
     or without the leading `model.`; decoder layers are addressed as `decoder.layers.INDEX.SLOT`.
+    `null` in place of a component drops a swap that was inherited.
     """
     swapped: dict[Path, str] = {}
     result = dict(places)
     for pattern, node in swaps.items.items():
         origin, path = swaps.keys[pattern], f"swap.{pattern}"
-        if not _names_component(node, origin, path, problems):
+        if is_null(node) or not _names_component(node, origin, path, problems):
             continue
         hits = [place for place in places if _matches(pattern, place)]
         if not hits:

@@ -1,0 +1,104 @@
+"""`qgs list`, `compose`, `diff`, `schema`, and what the command does with mistakes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from qgs.cli import app, main
+from qgs.composer import resolve
+
+SMALL = """recipe: 1
+model:
+  width: 16
+  heads: 2
+  encoder: {depth: 1}
+  queries: {count: 4}
+  decoder: {depth: 2}
+  head: {gaussians_per_query: 2}
+  supervision: {layers: [2]}
+"""
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    (tmp_path / "a.yaml").write_text(SMALL)
+    return "a.yaml"
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_list_shows_options_and_origin(recipe):
+    output = run("list", "queries")
+    assert "qgs/latent" in output
+    assert "count: 4096" in output
+    assert "qgs/mlp" not in output
+    assert "qgs/mlp" in run("list")
+
+
+def test_compose_prints_a_recipe_that_composes_again(recipe, tmp_path):
+    output = run("compose", recipe, "--set", "model.queries.count=5")
+    text, _, parameters = output.partition("parameters  ")
+    assert "--set #1" in text
+    assert "a.yaml:3" in text
+    (tmp_path / "again.yaml").write_text(text)
+    first = resolve(recipe, ["model.queries.count=5"])
+    assert resolve("again.yaml").tree == first.tree
+    total = sum(p.numel() for p in first.build_model("meta").parameters())
+    assert f"{total:,}" in parameters
+
+
+def test_diff_shows_what_differs(recipe, tmp_path):
+    overlay = "recipe: 1\nextends: a.yaml\nmodel: {queries: {count: 7}}\n"
+    (tmp_path / "b.yaml").write_text(overlay)
+    output = run("diff", recipe, "b.yaml")
+    assert "model.queries.count" in output
+    assert "model.width" not in output
+    assert f"{3 * 16:+,}" in output
+
+
+def test_schema_goes_to_a_file(recipe, tmp_path):
+    run("schema", "--out", "schema.json")
+    assert "model" in json.loads((tmp_path / "schema.json").read_text())["properties"]
+    assert [path.name for path in tmp_path.glob("*.partial")] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["compose", "a.yaml", "--set", "model.queries.cuont=5"], "did you mean `count`"),
+        (["compose", "absent.yaml"], "absent.yaml does not exist"),
+        (["list", "querys"], "did you mean `queries`"),
+    ],
+)
+def test_mistakes_are_printed_without_a_traceback(arguments, words, recipe, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["qgs", *arguments])
+    monkeypatch.delenv("QGS_DEBUG", raising=False)
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert "Traceback" not in error
+
+
+def test_debug_shows_where_it_was_raised(recipe, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["qgs", "compose", "absent.yaml"])
+    monkeypatch.setenv("QGS_DEBUG", "1")
+    with pytest.raises(ValueError, match=r"absent\.yaml"):
+        main()
+
+
+def test_help_does_not_import_torch():
+    code = "import sys, qgs.cli; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,258 @@
+"""Merging, swapping, provenance, and what a resolved recipe is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from qgs.composer import RecipeError, compose, plugin_versions, resolve
+from qgs.composer.errors import Problems
+from qgs.composer.loader import load_text
+from qgs.composer.merge import merge
+from qgs.composer.nodes import Origin, from_plain, to_plain
+from qgs.composer.show import annotated
+from qgs.composer.yaml12 import dump
+
+RECIPES = sorted((Path(__file__).parents[2] / "recipes").glob("*/*.yaml"))
+SMALL = {
+    "recipe": 1,
+    "model": {
+        "width": 16,
+        "heads": 2,
+        "encoder": {"depth": 1},
+        "queries": {"count": 4},
+        "decoder": {"depth": 3},
+        "head": {"gaussians_per_query": 2},
+        "supervision": {"layers": [3]},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-4", 1e-4),
+        ("1.", 1.0),
+        (".5", 0.5),
+        ("-3", -3),
+        ("0o17", 15),
+        ("0xff", 255),
+        ("017", 17),
+        ("1_000", "1_000"),
+        ("off", "off"),
+        ("yes", "yes"),
+        ("12:30", "12:30"),
+        ("2024-01-01", "2024-01-01"),
+        ("true", True),
+        ("False", False),
+        ("~", None),
+        ("", None),
+        ("'1'", "1"),
+        ("-.inf", -float("inf")),
+        ("[a, *x]", None),
+    ],
+)
+def test_yaml_12_scalars(text, value):
+    problems = Problems()
+    node = load_text(text, "f", problems)
+    if "*" in text:
+        with pytest.raises(RecipeError, match="f:1"):
+            problems.raise_any()
+        return
+    assert node is not None
+    result = to_plain(node)
+    assert result == value
+    assert type(result) is type(value)
+
+
+def test_anchors_and_aliases_are_written_out():
+    node = load_text("a: &x {p: 1}\nb: *x\n", "f", Problems())
+    assert node is not None
+    assert to_plain(node) == {"a": {"p": 1}, "b": {"p": 1}}
+
+
+WORDS = st.sampled_from(["1e-4", "off", "12:30", "true", "null", "", "0o17", ".5", "- a", "a: b"])
+TEXTS = st.text(st.characters(codec="utf-8"), max_size=6) | WORDS
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXTS
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.dictionaries(TEXTS, SCALARS | st.lists(SCALARS, max_size=3), max_size=4))
+def test_what_is_dumped_is_read_back(value):
+    node = load_text(dump(value), "f", Problems())
+    assert node is not None
+    assert to_plain(node) == value
+
+
+TREES = st.dictionaries(
+    st.sampled_from("abc"),
+    st.recursive(
+        st.integers() | st.lists(st.integers(), max_size=2),
+        lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
+        max_leaves=6,
+    ),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(TREES, TREES)
+def test_merging_twice_is_merging_once_and_nothing_changes_nothing(a, b):
+    a, b, empty = (from_plain(tree, Origin("f")) for tree in (a, b, {}))
+    assert to_plain(merge(a, a)) == to_plain(a)
+    assert to_plain(merge(merge(a, b), b)) == to_plain(merge(a, b))
+    assert to_plain(merge(empty, a)) == to_plain(merge(a, empty)) == to_plain(a)
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_every_recipe_resolves_to_itself_and_builds_without_memory(path):
+    recipe = resolve(path)
+    again = resolve(json.loads(json.dumps(recipe.tree)))
+    assert again.tree == recipe.tree
+    model = recipe.build_model("meta")
+    assert all(parameter.is_meta for parameter in model.parameters())
+    assert model.recipe == recipe.tree
+    assert set(recipe.build_losses()) == set(recipe.tree["losses"])
+
+
+def test_annotated_recipe_composes_again(write):
+    recipe = resolve(SMALL)
+    assert resolve(write(annotated(recipe))).tree == recipe.tree
+
+
+def test_extends_merges_mappings_replaces_lists_and_replaces_nodes_of_another_type(write):
+    write(
+        """
+        recipe: 1
+        model:
+          head: {norm: true, init_std: 0.1}
+          queries: {count: 7, std: 0.3}
+          supervision: {layers: [3, 12]}
+        """,
+        "a.yaml",
+    )
+    write("recipe: 1\nmodel:\n  head: {init_std: 0.2}\n", "b.yaml")
+    recipe = write(
+        """
+        recipe: 1
+        extends: [a.yaml, b.yaml]
+        plugins: [spatial]
+        model:
+          queries: {type: qgs/latent, std: 0.4}
+          supervision: {layers: [5]}
+        """
+    )
+    with pytest.raises(RecipeError, match="plugin `spatial`"):
+        resolve(recipe)
+    model = resolve(recipe, ["plugins=[]"]).tree["model"]
+    assert model["head"]["norm"] is True
+    assert model["head"]["init_std"] == 0.2
+    assert model["queries"] == {"type": "qgs/latent", "count": 7, "std": 0.4}
+    assert model["supervision"]["layers"] == [5]
+
+
+def test_another_type_forgets_the_options_of_the_first(write, spatial):
+    write("recipe: 1\nplugins: [spatial]\nmodel: {queries: {count: 7, std: 0.3}}\n", "a.yaml")
+    overlay = "recipe: 1\nextends: a.yaml\nmodel: {queries: {type: spatial/placed}}\n"
+    queries = resolve(write(overlay)).tree["model"]["queries"]
+    assert queries == {"type": "spatial/placed", "count": 4, "radius": True}
+
+
+def test_null_leaves_the_default(write):
+    write("recipe: 1\nmodel: {head: {norm: true}}\ntraining: {steps: 3}\n", "a.yaml")
+    overlay = "recipe: 1\nextends: a.yaml\nmodel: {head: null}\ntraining:\nlosses: {}\n"
+    tree = resolve(write(overlay), ["model.head.position_std=0.1"]).tree
+    assert tree["model"]["head"]["norm"] is False
+    assert tree["training"]["steps"] == 150_000
+    assert tree["losses"] == {}
+    dropped = resolve({"recipe": 1, "losses": {"a": {"type": "qgs/photometric"}}}, ["losses.a="])
+    assert dropped.tree["losses"] == {}
+
+
+def test_overrides_are_read_like_files_and_the_last_wins():
+    recipe = resolve(SMALL, ["training.learning_rate=1e-4", "seed=3", "seed=0o10"])
+    assert recipe.tree["training"]["learning_rate"] == 1e-4
+    assert recipe.seed == 8
+    assert recipe.provenance["seed"] == "--set #3"
+
+
+def test_provenance_names_file_line_override_or_default(write):
+    write("recipe: 1\nmodel:\n  queries: {count: 3}\n  head:\n    norm: true\n", "a.yaml")
+    recipe = write("recipe: 1\nextends: a.yaml\nmodel:\n  head:\n    init_std: 0.1\n")
+    origin = resolve(recipe, ["model.queries.std=1"]).provenance
+    assert origin["model.queries.count"] == "a.yaml:3"
+    assert origin["model.queries.std"] == "--set #1"
+    assert origin["model.queries.type"] == "default of the slot"
+    assert origin["model.head.norm"] == "a.yaml:5"
+    assert origin["model.head.init_std"] == "recipe.yaml:5"
+    assert origin["model.head.quat_eps"] == "default of qgs/gaussian_head"
+    assert origin["model.width"] == "default"
+
+
+def test_swap_changes_every_place_and_gives_a_readable_tree(write):
+    write("recipe: 1\nmodel: {decoder: {depth: 4}, supervision: {layers: [4]}}\n", "a.yaml")
+    everywhere = write(
+        "recipe: 1\nextends: a.yaml\nswap:\n"
+        "  model.decoder.layers.*.feed_forward: {type: qgs/mlp, ratio: 2}\n"
+    )
+    tree = resolve(everywhere).tree
+    assert tree["model"]["decoder"]["feed_forward"]["ratio"] == 2
+    assert "layers" not in tree["model"]["decoder"]
+    assert "swap" not in tree
+    once = resolve(
+        everywhere,
+        ["swap={model.decoder.layers.*.feed_forward: null}"],
+    )
+    assert once.tree["model"]["decoder"]["feed_forward"]["ratio"] == 4
+    some = resolve(
+        {"recipe": 1, "swap": {"decoder.layers.[13].feed_forward": {"type": "qgs/mlp", "ratio": 3}}}
+    )
+    layers = some.tree["model"]["decoder"]["layers"]
+    assert layers == {i: {"feed_forward": {"type": "qgs/mlp", "ratio": 3}} for i in ("1", "3")}
+    assert resolve(some.tree).tree == some.tree
+
+
+def test_layer_override_lies_over_the_template():
+    decoder = {"feed_forward": {"ratio": 2}, "layers": {1: {"feed_forward": {"ratio": 5}}}}
+    recipe = resolve(SMALL | {"model": SMALL["model"] | {"decoder": decoder | {"depth": 3}}})
+    ratios = [layer.feed_forward.mlp.fc1.out_features for layer in recipe.build_model().decoder]
+    assert ratios == [32, 80, 32]
+
+
+def test_same_recipe_same_parameters_and_the_global_random_state_stays():
+    before = torch.get_rng_state()
+    first, second = compose(SMALL).state_dict(), compose(SMALL).state_dict()
+    other = compose(SMALL, ["seed=1"]).state_dict()
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["queries.features"], other["queries.features"])
+
+
+def test_layers_with_equal_refinement_share_a_module():
+    assert len(compose(SMALL, device="meta").refinements) == 1
+
+
+def test_plugin_versions(spatial):
+    assert plugin_versions(["spatial"])["spatial"] == "1.2"
+    with pytest.raises(ValueError, match="no installed distribution offers a plugin `absent`"):
+        plugin_versions(["absent"])
+
+
+def test_recipe_without_data_says_so():
+    with pytest.raises(ValueError, match="this recipe has no data"):
+        resolve(SMALL).build_data()
+
+
+def test_mapping_with_a_value_that_yaml_cannot_hold():
+    with pytest.raises(ValueError, match="a recipe holds mappings"):
+        resolve({"recipe": 1, "seed": torch.zeros(1)})
+
+
+def test_missing_file_suggests_its_neighbour(write):
+    write("recipe: 1\n", "tokengs.yaml")
+    with pytest.raises(RecipeError, match=r"did you mean `tokengs\.yaml`"):
+        resolve("tokngs.yaml")

@@ -1,0 +1,54 @@
+"""The JSON Schema agrees with the composer, and the committed copy with the code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+
+from qgs.composer.registry import available_plugins, load_registry
+from qgs.composer.schema import recipe_schema
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+@pytest.fixture(scope="module")
+def schema():
+    if "locus" not in available_plugins():
+        pytest.skip("the committed schema covers the locus plugin, which is not installed")
+    return recipe_schema(load_registry(["locus"]))
+
+
+def test_committed_schema_is_fresh(schema):
+    committed = json.loads((RECIPES / "recipe.schema.json").read_text())
+    assert committed == schema, "run `qgs schema --out recipes/recipe.schema.json`"
+
+
+def test_schema_is_a_schema(schema):
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(RECIPES.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}/{path.stem}"
+)
+def test_recipes_validate(path, schema):
+    jsonschema.validate(yaml.safe_load(path.read_text()), schema)
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        {"modle": {}},
+        {"model": {"queries": {"type": "qgs/latnet"}}},
+        {"model": {"queries": {"type": "qgs/latent", "count": -1}}},
+        {"model": {"queries": {"cuont": 1}}},
+        {"model": {"decoder": {"layers": {"x": {}}}}},
+        {"training": {"precision": "fp8"}},
+    ],
+)
+def test_mistakes_do_not_validate(recipe, schema):
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(recipe, schema)
