@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 from torch import nn
 
@@ -34,7 +35,8 @@ def component_tables(slot: str | None) -> tuple[list[Table], list[str]]:
         for column in ("type", "options", "requires", "provides", "origin"):
             table.add_column(column, overflow="fold")
         for kind, component in registry.components(name).items():
-            table.add_row(kind, *_row(component, registry.plugins[kind.split("/")[0]]))
+            row = _row(component, registry.plugins[kind.split("/")[0]])
+            table.add_row(kind, *map(escape, row))
         tables.append(table)
     return tables, broken
 
@@ -57,7 +59,7 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
     values = Table("path", a, b, title="values that differ", title_justify="left")
     for path in [*ours, *(path for path in theirs if path not in ours)]:
         if ours.get(path, _MISSING) != theirs.get(path, _MISSING):
-            values.add_row(path, _word(ours, path), _word(theirs, path))
+            values.add_row(path, escape(_word(ours, path)), escape(_word(theirs, path)))
     counts, others = parameter_counts(first), parameter_counts(second)
     parameters = Table("component", a, b, "difference", title="parameters", title_justify="left")
     for column in parameters.columns[1:]:

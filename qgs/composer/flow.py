@@ -11,7 +11,7 @@ from qgs.composer.nodes import Path
 from qgs.composer.providers import fix_mismatch, fix_unmet
 from qgs.composer.registry import Registry
 from qgs.composer.slots import LAYER_SLOTS
-from qgs.contracts import FieldSpec, Supervision
+from qgs.contracts import Fields, FieldSpec, Supervision
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,10 @@ def check_flow(steps: Sequence[Step], registry: Registry, problems: Problems) ->
             uncertain = True
             continue
         _check_step(steps, position, fields, uncertain, registry, problems)
-        provided = step.chosen.component.provides(step.chosen.config)
-        fields.update({name: (spec, step.chosen) for name, spec in provided.items()})
+        lacking = set(_requires(step.chosen)) - set(fields)
+        for name, spec in step.chosen.component.provides(step.chosen.config).items():
+            if name not in lacking:
+                fields[name] = (spec, step.chosen)
 
 
 def _check_step(
@@ -81,13 +83,13 @@ def _check_step(
 ) -> None:
     chosen = steps[position].chosen
     assert chosen is not None
-    for name, spec in chosen.component.requires(chosen.config).items():
+    for name, spec in _requires(chosen).items():
         if name not in fields:
             if not uncertain:
                 before = [step.chosen for step in steps[:position] if step.chosen]
                 after = [step.chosen for step in steps[position + 1 :] if step.chosen]
                 reason = f"`{chosen.type}` needs {name} ({spec}), which nothing before it provides"
-                later = next((c for c in after if _provides(c, name)), None)
+                later = next((c for c in after if _originates(c, name)), None)
                 if later:
                     reason += f"; `{later.type}` at {later.written_at} provides it too late"
                 fix = fix_unmet(name, chosen, before, registry)
@@ -103,5 +105,10 @@ def _check_step(
             )
 
 
-def _provides(chosen: Chosen, name: str) -> bool:
-    return name in chosen.component.provides(chosen.config)
+def _requires(chosen: Chosen) -> Fields:
+    return chosen.component.requires(chosen.config)
+
+
+def _originates(chosen: Chosen, name: str) -> bool:
+    """Whether `chosen` provides a field without needing it itself."""
+    return name in chosen.component.provides(chosen.config) and name not in _requires(chosen)

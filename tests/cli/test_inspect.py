@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
+from io import StringIO
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from qgs.cli import app, main
+from qgs.cli.tables import difference_tables
 from qgs.composer import resolve
 
 SMALL = """recipe: 1
@@ -65,6 +69,14 @@ def test_diff_shows_what_differs(recipe, tmp_path):
     assert "model.queries.count" in output
     assert "model.width" not in output
     assert f"{3 * 16:+,}" in output
+
+
+def test_words_in_brackets_are_not_taken_for_styles():
+    console = Console(width=200, record=True, file=StringIO())
+    one, other = resolve({"recipe": 1}), resolve({"recipe": 1})
+    other = replace(other, tree={**other.tree, "plugins": ["red"]})
+    console.print(difference_tables(one, other, "a", "b")[0])
+    assert "[red]" in console.export_text()
 
 
 def test_schema_goes_to_a_file(recipe, tmp_path):

@@ -217,6 +217,31 @@ def test_all_errors_come_together_sorted_by_line(write, spatial):
     assert str(caught.value).startswith("8 problems")
 
 
+def test_a_component_that_refines_a_field_is_no_provider_of_it(write, install):
+    install(
+        "qgs-chain",
+        "chain",
+        """
+        from qgs.contracts import FieldSpec, Plugin, Refinement
+        class Refine(Refinement):
+            name = "refine"
+            @classmethod
+            def requires(cls, config):
+                return {"place": FieldSpec((3,))}
+            provides = requires
+            def forward(self, state):
+                return state
+        plugin = Plugin("chain", 1, (Refine,))
+        """,
+    )
+    text = "recipe: 1\nplugins: [chain]\nmodel: {decoder: {refinement: {type: chain/refine}}}\n"
+    with pytest.raises(RecipeError) as caught:
+        resolve(write(text))
+    (problem,) = caught.value.problems
+    assert "needs place" in problem.reason
+    assert "too late" not in problem.reason
+
+
 def test_cycle_is_named_with_its_whole_chain(write):
     write("recipe: 1\nextends: b.yaml\n", "a.yaml")
     write("recipe: 1\nextends: c.yaml\n", "b.yaml")
