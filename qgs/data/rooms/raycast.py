@@ -24,7 +24,9 @@ _BOX, _SPHERE = s.BOX, s.SPHERE
 
 @njit(**OPTIONS)
 def _away_from_zero(x):
-    return x if abs(x) > 1e-9 else 1e-9
+    if abs(x) > 1e-9:
+        return x
+    return 1e-9 if x > 0 else -1e-9
 
 
 @njit(**OPTIONS)

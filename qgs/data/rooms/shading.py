@@ -88,6 +88,13 @@ def _floor_light(floor, x, y, size):
 
 
 @njit(**OPTIONS)
+def _film(value):
+    """A contrast curve from [0, inf) to [0, 1]."""
+    value = min(value, 1.0)
+    return value * value * (3 - 2 * value)
+
+
+@njit(**OPTIONS)
 def shade(shapes, textures, size, lights, floor, o, d, t, face, index, footprint):
     """RGB in [0, 1] of the hit at o + t d, on wall `face` or, if index >= 0, on that shape."""
     x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]

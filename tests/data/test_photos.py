@@ -1,0 +1,151 @@
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from qgs.data import PhotosSource, read_photos
+from qgs.data.images import CropResize
+
+PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
+GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
+
+
+def folder(path: Path, count: int = 10, size=(64, 48), frame=None, **top) -> Path:
+    """Photos whose red channel is the frame's number; `frame` changes entries of frame 1."""
+    (path / "images").mkdir(exist_ok=True)
+    frames = []
+    for i in range(count):
+        Image.new("RGB", size, (10 * i, 50, 200)).save(path / "images" / f"{i}.png")
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    frames[1].update(frame or {})
+    (path / "transforms.json").write_text(json.dumps({**GLOBAL, **top, "frames": frames}))
+    return path
+
+
+def opened(path: Path, **options) -> PhotosSource:
+    return PhotosSource(PhotosSource.Config(path=str(path), **{"image_size": (24, 24), **options}))
+
+
+def test_poses_become_opencv_and_intrinsics_follow(tmp_path):
+    scene = opened(folder(tmp_path)).scenes("train")[0]
+    expected = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    expected[0, 3] = 3
+    assert torch.equal(scene.cameras.c2w[3], expected)
+    assert scene.cameras.intrinsics[0].tolist() == pytest.approx([50, 55, 11.5, 12.5])
+    assert scene.images([7])[0, :, 5, 5].mul(255).round().tolist() == [70, 50, 200]
+
+
+def test_intrinsics_of_one_frame_and_of_a_smaller_copy(tmp_path):
+    path = folder(tmp_path, size=(32, 24), frame={"fl_x": 200.0})
+    cameras = opened(path, image_size=(24, 32)).scenes("test")[0].cameras
+    assert cameras.intrinsics[0].tolist() == pytest.approx([50, 55, 15.5, 12.5])
+    assert cameras.intrinsics[1, 0] == pytest.approx(100)
+
+
+def test_focal_length_from_the_angle_of_view(tmp_path):
+    path = folder(tmp_path, fl_x=None, fl_y=None, camera_angle_x=math.pi / 2)
+    cameras = opened(path, image_size=(48, 64)).scenes("train")[0].cameras
+    assert cameras.intrinsics[0, :2].tolist() == pytest.approx([32, 32])
+
+
+def test_crop_then_resize():
+    crop = CropResize((100, 300), (50, 50))
+    assert crop.box == (100, 0, 200, 100)
+    assert crop.intrinsics(torch.tensor([90.0, 80, 150, 50])).tolist() == [45, 40, 25, 25]
+
+
+def test_held_out_frames(tmp_path):
+    assert opened(folder(tmp_path)).scenes("test")[0].held_out == (4,)
+    assert opened(tmp_path, holdout=3).scenes("test")[0].held_out == (1, 4, 7)
+    assert opened(tmp_path, holdout=0).scenes("test")[0].held_out == ()
+
+
+def test_missing_images_are_counted_and_named(tmp_path, caplog):
+    folder(tmp_path)
+    (tmp_path / "images" / "3.png").unlink()
+    source = opened(tmp_path)
+    assert source.missing == [str(tmp_path / "images" / "3.png")]
+    assert "1 of 10" in caplog.text
+    assert "3.png" in caplog.text
+    assert len(source.scenes("train")[0]) == 9
+    for i in set(range(10)) - {3, 5}:
+        (tmp_path / "images" / f"{i}.png").unlink()
+    with pytest.raises(FileNotFoundError, match="10 images, of which 1 exist"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("frame", "top", "message"),
+    [
+        ({"transform_matrix": [[math.nan] * 4] * 4}, {}, r"frame 1 \(images/1.png\).*NaN"),
+        ({"transform_matrix": np.diag([2, 1, 1, 1]).tolist()}, {}, "frame 1 .*not rigid"),
+        ({"transform_matrix": np.diag([-1, 1, 1, 1]).tolist()}, {}, "frame 1 .*not rigid"),
+        ({"transform_matrix": [1, 2]}, {}, "frame 1 .*4 x 4"),
+        ({"file_path": None}, {}, "frame 1 has no 'file_path'"),
+        ({}, {"fl_x": None}, "no focal length"),
+        ({}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*undistort"),
+        ({}, {"k4": 0.1}, "k4"),
+        ({}, {"w": 48}, "another aspect ratio"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(tmp_path, frame, top, message):
+    with pytest.raises(ValueError, match=message):
+        opened(folder(tmp_path, frame=frame, **top))
+
+
+def test_folders_and_files_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        opened(tmp_path / "nothing")
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    with pytest.raises(FileNotFoundError, match=r"holds a.png \(1 images\)"):
+        opened(tmp_path)
+    (tmp_path / "transforms.json").write_text("{")
+    with pytest.raises(ValueError, match="not valid JSON"):
+        opened(tmp_path)
+
+
+def test_transparent_pixels_show_the_background(tmp_path):
+    folder(tmp_path)
+    Image.new("RGBA", (64, 48), (0, 0, 0, 0)).save(tmp_path / "images" / "0.png")
+    scene = opened(tmp_path, background=(1.0, 0.0, 0.0)).scenes("train")[0]
+    assert scene.images([0])[0, :, 3, 3].tolist() == [1, 0, 0]
+
+
+def test_lens_distortion_is_undone(tmp_path):
+    distorted = folder(tmp_path, k1=-0.5, cx=32.0, cy=24.0)
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    pixels[:, :, 0] = np.arange(64) * 4
+    Image.fromarray(pixels).save(tmp_path / "images" / "0.png")
+    image = opened(distorted, image_size=(48, 64)).scenes("train")[0].images([0])[0, 0] * 255
+    x = (60.5 - 32) / 100
+    y = 0.5 / 110
+    expected = 32 + 100 * x * (1 - 0.5 * (x * x + y * y)) - 0.5
+    assert image[24, 60].item() == pytest.approx(4 * expected, abs=2)
+
+
+def test_read_photos(tmp_path):
+    views = read_photos(folder(tmp_path), (12, 16), frames=[2, 5])
+    assert views.images.shape == (1, 2, 3, 12, 16)
+    assert views.cameras.c2w[0, :, 0, 3].tolist() == [2, 5]
+    with pytest.raises(IndexError, match="0 to 9"):
+        read_photos(tmp_path, (12, 16), frames=[10])
+
+
+@pytest.mark.parametrize(("name", "count"), [("mary_rose", 69), ("office_walk", 186), ("desk", 7)])
+def test_real_photos(name, count):
+    path = PHOTOS / name
+    if not path.is_dir():
+        pytest.skip(f"{path} is missing; set QGS_PHOTOS to the folder of real photos")
+    source = opened(path)
+    scene = source.scenes("train")[0]
+    assert len(scene) == count
+    assert source.missing == []
+    assert scene.images([0]).shape == (1, 3, 24, 24)
+    assert scene.cameras.intrinsics[:, 2:].sub(12).abs().max() < 2

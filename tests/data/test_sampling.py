@@ -1,0 +1,137 @@
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+
+from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.data.evaluation import evaluation_samples, held_out_windows
+from qgs.data.loader import training_batches
+from qgs.data.sampling import draw_frames, make_sample, mirrored_views
+from qgs.types import Cameras
+
+
+class Line(Scene):
+    """Cameras along a line; frame f is an image of the value f / 100, brighter to the right."""
+
+    def __init__(self, count: int, held_out=(), step: float = 0.5) -> None:
+        self.name, self.held_out, self.count, self.step = f"line{count}", held_out, count, step
+
+    @property
+    def cameras(self) -> Cameras:
+        c2w = torch.eye(4).repeat(self.count, 1, 1)
+        c2w[:, 0, 3] = self.step * torch.arange(self.count) + 3
+        return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
+
+    def images(self, frames):
+        value = torch.tensor(list(frames)).float() / 100
+        return value[:, None, None, None] + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
+
+
+class Lines(SceneSource):
+    name = "lines"
+
+    def __init__(self, *scenes: Scene) -> None:
+        super().__init__(SceneSourceConfig(image_size=(8, 8)))
+        self._scenes = scenes
+
+    def scenes(self, split):
+        return self._scenes
+
+
+@pytest.mark.parametrize(("inputs", "gap"), [(2, (2, 5)), (4, (5, 9)), (1, (3, 3)), (3, (50, 90))])
+def test_frames_follow_the_rules(inputs, gap):
+    views = ViewsConfig(inputs=inputs, targets=3, gap=gap)
+    scene = Line(20, held_out=(4, 12))
+    usable = [f for f in range(20) if f not in scene.held_out]
+    gaps = set()
+    for seed in range(60):
+        chosen, targets = draw_frames(scene, views, np.random.default_rng(seed))
+        assert list(chosen) == sorted(set(chosen))
+        assert len(chosen) == inputs
+        assert len(targets) == 3
+        assert not set(scene.held_out) & {*chosen, *targets}
+        if inputs > 1:
+            gaps.add(usable.index(chosen[-1]) - usable.index(chosen[0]))
+            assert chosen[0] <= min(targets) <= max(targets) <= chosen[-1]
+    if inputs > 1:
+        assert gaps == set(range(min(gap[0], 17), min(gap[1], 17) + 1))
+
+
+def test_targets_are_novel_while_there_are_enough():
+    views = ViewsConfig(inputs=2, targets=3, gap=(4, 4))
+    for seed in range(20):
+        inputs, targets = draw_frames(Line(9), views, np.random.default_rng(seed))
+        assert len({*inputs, *targets}) == 5
+
+
+def test_normalised_poses():
+    scene = Line(9)
+    first = make_sample(scene, (2, 6), (4,), ViewsConfig(inputs=2, scale_factor=0.4), False)
+    assert torch.equal(first.inputs.cameras.c2w[0, 0], torch.eye(4))
+    assert first.inputs.cameras.c2w[0, 1, 0, 3] == pytest.approx(4 * 0.5 * 0.4)
+    assert first.targets.cameras.c2w[0, 0, 0, 3] == pytest.approx(2 * 0.5 * 0.4)
+    config = ViewsConfig(inputs=2, scale="distance", scale_factor=1.0, frame="mean_cam")
+    mean = make_sample(scene, (2, 6), (4,), config, False)
+    centres = mean.inputs.cameras.c2w[0, :, 0, 3]
+    assert centres.tolist() == pytest.approx([-0.5, 0.5])
+
+
+def test_scale_by_distance_needs_cameras_that_moved():
+    config = ViewsConfig(inputs=2, scale="distance")
+    with pytest.raises(ValueError, match="stand on one point"):
+        make_sample(Line(5, step=0.0), (0, 3), (1,), config, False)
+
+
+def test_mirroring_flips_images_poses_and_principal_point():
+    plain = make_sample(Line(5), (0, 3), (1,), ViewsConfig(inputs=2), False).inputs
+    flipped = mirrored_views(plain)
+    assert torch.equal(flipped.images, plain.images.flip(-1))
+    assert flipped.cameras.intrinsics[0, 0].tolist() == [8, 8, 5, 4]
+    assert flipped.cameras.c2w[0, 1, 0, 3] == -plain.cameras.c2w[0, 1, 0, 3]
+
+
+def test_too_few_frames_and_a_gap_too_short_are_explained():
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"line3.*has 3 frames"):
+        draw_frames(Line(3), ViewsConfig(inputs=4), rng)
+    with pytest.raises(ValueError, match=r"views\.gap \[2, 3\] spans only 4"):
+        draw_frames(Line(30), ViewsConfig(inputs=6, gap=(2, 3)), rng)
+
+
+def test_every_held_out_frame_is_a_target_once():
+    scene = Line(40, held_out=tuple(range(4, 40, 8)))
+    windows = held_out_windows(scene, ViewsConfig(inputs=3, gap=(5, 6)))
+    assert sorted(f for _, targets in windows for f in targets) == list(scene.held_out)
+    for inputs, targets in windows:
+        assert len(inputs) == 3
+        assert not set(inputs) & set(scene.held_out)
+        assert inputs[0] < targets[0] <= targets[-1] < inputs[-1]
+
+
+def test_evaluation_is_deterministic_novel_and_never_mirrored():
+    source = Lines(Line(8), Line(9), Line(10))
+    views = ViewsConfig(inputs=2, gap=(3, 5), mirror=1.0)
+    config = EvaluationConfig(scenes=2, samples=3)
+    first, again = (evaluation_samples(source, views, config) for _ in range(2))
+    assert [s.input_frames for s in first] == [s.input_frames for s in again]
+    assert len(first) == 6
+    for sample in first:
+        low, high = sample.input_frames
+        assert sample.target_frames == tuple(range(low + 1, high))
+        assert sample.inputs.images[0, 0, 0, 0, 0] < sample.inputs.images[0, 0, 0, 0, -1]
+
+
+def test_training_resumes_exactly():
+    source = Lines(*(Line(n) for n in range(8, 13)))
+    views = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
+    through = list(islice(training_batches(source, views, 2, seed=3), 8))
+    resumed = list(islice(training_batches(source, views, 2, seed=3, start=5), 3))
+    for a, b in zip(through[5:], resumed, strict=True):
+        assert a.scenes == b.scenes
+        assert torch.equal(a.inputs.images, b.inputs.images)
+        assert torch.equal(a.targets.cameras.c2w, b.targets.cameras.c2w)
+    names = [name for batch in through for name in batch.scenes][:5]
+    assert len(set(names)) == 5, "an epoch visits every scene once"
+    assert through[0].inputs.images.is_contiguous()
+    assert through[0].targets.images.shape == (2, 3, 3, 8, 8)
