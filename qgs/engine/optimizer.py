@@ -15,7 +15,7 @@ def make_optimizer(module: nn.Module, config: TrainingConfig) -> AdamW:
         {"params": decayed, "weight_decay": config.weight_decay},
         {"params": undecayed, "weight_decay": 0.0},
     ]
-    return AdamW(groups, lr=config.learning_rate, betas=config.betas)
+    return AdamW(groups, lr=config.learning_rate, betas=config.betas, fused=True)
 
 
 def parameter_groups(module: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
