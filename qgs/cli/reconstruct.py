@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from qgs.analysis.reconstruction import Reconstruction
+    from qgs.composer import Recipe
+    from qgs.data.photos import PhotosConfig
 
 
 def register(app: typer.Typer) -> None:
@@ -48,7 +50,7 @@ def reconstruct(
     from qgs.analysis.frames import choose_frames
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.analysis.reconstruction import write_reconstruction
-    from qgs.data.photos import read_photos
+    from qgs.data.photos import PhotosSource
     from qgs.data.sampling import make_sample
     from qgs.engine.folder import checkpoint_of
     from qgs.io.checkpoint import load, load_recipe
@@ -56,7 +58,7 @@ def reconstruct(
     device = "cuda" if torch.cuda.is_available() else "cpu"
     file = checkpoint_of(checkpoint)
     model, recipe = load(file, device), load_recipe(file)
-    scene = read_photos(photos, tuple(recipe.tree["data"]["image_size"]))
+    (scene,) = PhotosSource(photos_config(recipe, photos)).scenes("test")
     wanted = inputs or recipe.views.inputs
     span = recipe.views.gap[1] + 1
     picked = choose_frames(len(scene), wanted, span, chosen, compared)
@@ -67,6 +69,22 @@ def reconstruct(
     console.print(score_table(result))
     for path in write_reconstruction(model, result, out):
         console.print(f"wrote {path}", soft_wrap=True)
+
+
+def photos_config(recipe: Recipe, photos: Path) -> PhotosConfig:
+    """How to read `photos` for a model of `recipe`: at the image size that it was trained on.
+
+    Raises ValueError for a recipe without data, which has no image size.
+    """
+    from qgs.data.photos import PhotosConfig
+
+    if ("data",) not in recipe.parts:
+        raise ValueError("the checkpoint's recipe has no data, so its image size is not known")
+    trained = recipe.parts["data",].config
+    if isinstance(trained, PhotosConfig):
+        every = {"path": str(photos), "holdout": 0, "max_frames": 0}
+        return trained.model_copy(update=every)
+    return PhotosConfig(path=str(photos), image_size=trained.image_size, holdout=0)
 
 
 def check_out(out: Path, overwrite: bool) -> None:

@@ -1,0 +1,102 @@
+import re
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+import qgs
+from qgs.cli import app
+from qgs.cli.contest import resolve_fairly
+from qgs.cli.demo import default_recipes, new_folder
+from qgs.io.ply import read_ply
+
+RECIPE = {
+    "recipe": 1,
+    "model": {
+        "width": 16,
+        "heads": 2,
+        "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
+        "queries": {"type": "qgs/latent", "count": 8, "std": 1.0},
+        "decoder": {"depth": 1},
+        "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
+        "supervision": {"type": "qgs/layers", "layers": [1]},
+    },
+    "data": {"type": "qgs/rooms", "image_size": [16, 16], "scenes": 4, "test_scenes": 3},
+    "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
+    "training": {"batch_size": 2, "warmup": 5, "precision": "float32"},
+    "evaluation": {"scenes": 2},
+}
+
+
+@pytest.fixture
+def recipes(tmp_path):
+    """Two recipes that differ in the number of queries."""
+    (tmp_path / "few.yaml").write_text(yaml.safe_dump(RECIPE))
+    overlay = {"recipe": 1, "extends": "few.yaml", "model": {"queries": {"count": 12}}}
+    (tmp_path / "more.yaml").write_text(yaml.safe_dump(overlay))
+    return [tmp_path / "few.yaml", tmp_path / "more.yaml"]
+
+
+def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
+    out = tmp_path / "demo"
+    arguments = [*map(str, recipes), "--seconds", "1", "--out", str(out)]
+    result = CliRunner().invoke(app, ["demo", *arguments])
+    assert result.exception is None
+    for name, queries in (("few", 8), ("more", 12)):
+        assert (out / name / "checkpoint.safetensors").is_file()
+        assert read_ply(out / name / "example.ply").count == 4 * queries
+        assert name in result.output
+    assert "Mean colour" in result.output
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") > 10
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
+    assert "count: 12" in page
+
+
+def test_recipes_with_other_data_are_not_compared(recipes):
+    overlay = {"recipe": 1, "extends": "few.yaml", "views": {"gap": [2, 5]}}
+    recipes[1].write_text(yaml.safe_dump(overlay))
+    with pytest.raises(ValueError, match="more and few differ in views"):
+        resolve_fairly(recipes, seconds=1, seed=0)
+
+
+def test_budget_and_seed_are_those_asked_for(recipes):
+    for recipe in resolve_fairly(recipes, seconds=7, seed=3).values():
+        assert recipe.training.seconds == 7
+        assert recipe.tree["seed"] == 3
+
+
+def test_two_recipes_of_one_name_are_refused(recipes):
+    with pytest.raises(ValueError, match="told apart by file name"):
+        resolve_fairly([recipes[0], recipes[0]], seconds=1, seed=0)
+
+
+def test_missing_recipes_say_where_they_were_looked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(qgs, "__file__", str(tmp_path / "site-packages" / "qgs" / "__init__.py"))
+    with pytest.raises(FileNotFoundError, match=r"recipes/tiny.*--recipes FOLDER"):
+        default_recipes(None)
+    with pytest.raises(FileNotFoundError, match="elsewhere"):
+        default_recipes(tmp_path / "elsewhere")
+
+
+def test_recipes_beside_the_user_come_first(tmp_path, monkeypatch):
+    folder = tmp_path / "recipes" / "tiny"
+    folder.mkdir(parents=True)
+    for name in ("tokengs.yaml", "locus.yaml"):
+        (folder / name).touch()
+    monkeypatch.chdir(tmp_path)
+    assert [path.resolve() for path in default_recipes(None)] == [
+        folder / "tokengs.yaml",
+        folder / "locus.yaml",
+    ]
+
+
+def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert new_folder(None).name == "demo"
+    (tmp_path / "demo").mkdir()
+    assert new_folder(None).name == "demo-2"
+    (tmp_path / "demo" / "report.html").touch()
+    with pytest.raises(FileExistsError, match="not empty"):
+        new_folder(tmp_path / "demo")

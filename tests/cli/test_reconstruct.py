@@ -1,0 +1,110 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+import qgs
+from qgs.cli import app
+from qgs.cli.reconstruct import frame_list
+from qgs.io.ply import read_ply
+
+RECIPE = {
+    "recipe": 1,
+    "model": {
+        "width": 16,
+        "heads": 2,
+        "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
+        "queries": {"type": "qgs/latent", "count": 8, "std": 1.0},
+        "decoder": {"depth": 1},
+        "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
+        "supervision": {"type": "qgs/layers", "layers": [1]},
+    },
+    "data": {"type": "qgs/rooms", "image_size": [16, 16]},
+    "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"},
+}
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "checkpoint.safetensors"
+    qgs.save(qgs.compose(RECIPE), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """Seven noisy photos of 24x20 pixels, taken along a line."""
+    folder = tmp_path_factory.mktemp("photos")
+    rng = np.random.default_rng(0)
+    frames = []
+    for index in range(7):
+        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{index}.png")
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * index
+        frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
+    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    return folder
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["reconstruct", *map(str, arguments)])
+
+
+def test_everything_is_written(checkpoint, photos, tmp_path):
+    result = run(checkpoint, photos, "--out", tmp_path / "scene")
+    assert result.exception is None
+    out = tmp_path / "scene"
+    assert read_ply(out / "gaussians.ply").count == 32
+    cameras = json.loads((out / "cameras.json").read_text())
+    assert [(view["frame"], view["input"]) for view in cameras["views"]] == [
+        (1, True),
+        (5, True),
+        (2, False),
+        (3, False),
+        (4, False),
+    ]
+    np.testing.assert_allclose(cameras["views"][0]["c2w"], np.eye(4), atol=1e-6)
+    assert Image.open(out / "views" / "00003_novel.png").size == (36, 16)
+    assert Image.open(out / "depth" / "00005_input.png").size == (16, 16)
+    assert Image.open(out / "overview.png").size[0] > 500
+    assert Image.open(out / "orbit.gif").n_frames == len(cameras["orbit"])
+    assert "novel, mean" in result.output
+
+
+def test_named_frames_are_used(checkpoint, photos, tmp_path):
+    result = run(checkpoint, photos, "--out", tmp_path, "--frames", "0,3,6", "--holdout", "1")
+    assert result.exception is None
+    views = json.loads((tmp_path / "cameras.json").read_text())["views"]
+    assert [view["frame"] for view in views] == [0, 3, 6, 1]
+
+
+def test_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    refused = run(checkpoint, photos, "--out", tmp_path)
+    assert isinstance(refused.exception, FileExistsError)
+    assert "--overwrite" in str(refused.exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    allowed = run(checkpoint, photos, "--out", tmp_path, "--overwrite")
+    assert allowed.exception is None
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert (tmp_path / "gaussians.ply").is_file()
+
+
+def test_a_missing_checkpoint_and_missing_photos_are_told(checkpoint, photos, tmp_path):
+    no_checkpoint = run(tmp_path / "none.safetensors", photos, "--out", tmp_path / "a")
+    assert "none.safetensors" in str(no_checkpoint.exception)
+    no_photos = run(checkpoint, tmp_path / "nowhere", "--out", tmp_path / "b")
+    assert "nowhere" in str(no_photos.exception)
+    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "b").exists()
+
+
+def test_frames_that_are_no_numbers_are_refused():
+    assert frame_list("0,8", "--frames") == [0, 8]
+    assert frame_list(None, "--frames") is None
+    with pytest.raises(ValueError, match=r"--frames takes frame numbers.*'0-8'"):
+        frame_list("0-8", "--frames")
