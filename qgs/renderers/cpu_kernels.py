@@ -7,6 +7,9 @@ in one flat float32 buffer at constant offsets, which is what lets LLVM vectoris
 Splats are rows of 8 float32: u, v, conic xx, xy, yy, depth, half extents in x and y (pixels; not
 positive for what is not visible). Sums are 5 planes: w r, w g, w b, w z, w.
 
+For each row of a tile, the buffer holds blocks of 16 lanes: transmittance, 1 until the
+pixel stops, then the sums (forward) or what `_load_gradients` puts there (backward).
+
 The backward pass repeats the forward one, so both take the same decisions. With v_i = dL/dw_i,
 transmittance T_i and what is still to come, S_i = sum_{j>i} w_j v_j,
 dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
