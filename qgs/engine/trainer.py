@@ -135,9 +135,8 @@ class Trainer:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         measured = self._backward()
-        measured["gradient"] = self.accelerator.clip_grad_norm_(
-            self.objective.parameters(), self.config.clip
-        ).detach()
+        norm = self.accelerator.clip_grad_norm_(self.objective.parameters(), self.config.clip)
+        measured["gradient"] = torch.as_tensor(norm, device=self.device).detach()
         record = self._read(measured, stop)
         self._refuse_nonfinite(record)
         self.optimizer.step()
@@ -186,17 +185,20 @@ class Trainer:
         """Numbers of one step, the mean over processes; the only synchronisation of a step."""
         asked = torch.tensor(float(bool(stop)), device=self.device)
         values = torch.stack([v.float() for v in (*measured.values(), asked)])
-        values = self.accelerator.reduce(values, "mean")
-        return dict(zip([*measured, "stop"], values.tolist(), strict=True))
+        return dict(zip([*measured, "stop"], self._mean(values).tolist(), strict=True))
 
     def _tick(self) -> None:
         now = time.perf_counter()
         if self._clock_started is None:
             self._clock_started = now
-        elapsed = torch.tensor(now - self._clock_started, dtype=torch.float64)
-        if self.accelerator.num_processes > 1:
-            elapsed = self.accelerator.reduce(elapsed.to(self.device).float(), "mean")
-        self.seconds = float(elapsed)
+        elapsed = torch.tensor(now - self._clock_started, device=self.device)
+        self.seconds = float(self._mean(elapsed))
+
+    def _mean(self, value: Tensor) -> Tensor:
+        """Mean over processes, so that all of them decide alike."""
+        reduced = self.accelerator.reduce(value, "mean")
+        assert isinstance(reduced, Tensor)
+        return reduced
 
     def _refuse_nonfinite(self, record: dict[str, float]) -> None:
         terms = {k: v for k, v in record.items() if k not in ("gradient", "stop", "psnr")}

@@ -1,0 +1,86 @@
+"""`qgs train` and `qgs eval` as a user types them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from qgs.cli import app
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
+SMALL = (
+    "model.width=16",
+    "model.heads=2",
+    "model.queries.count=8",
+    "data.image_size=[32, 32]",
+    "views.targets=2",
+    "evaluation.scenes=2",
+    "training.seconds=null",
+    "training.steps=2",
+)
+
+
+def qgs(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def train(out: Path, *overrides: str) -> Result:
+    sets = [word for setting in (*SMALL, *overrides) for word in ("--set", setting)]
+    return qgs("train", RECIPE, "--out", out, *sets)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("cli") / "run"
+    result = train(out)
+    assert result.exit_code == 0, result.output
+    return out
+
+
+def test_training_ends_with_an_evaluation(run: Path) -> None:
+    assert {path.name for path in run.iterdir()} == {
+        "checkpoint.safetensors",
+        "evaluation",
+        "history.jsonl",
+        "recipe.yaml",
+    }
+
+
+def test_eval_gives_the_same_numbers_and_shows_all_methods(run: Path) -> None:
+    before = (run / "evaluation" / "summary.json").read_bytes()
+    result = qgs("eval", run)
+    assert result.exit_code == 0, result.output
+    assert (run / "evaluation" / "summary.json").read_bytes() == before
+    for word in ("model", "nearest input", "mean colour"):
+        assert word in result.output
+
+
+def test_eval_of_other_data(run: Path, tmp_path: Path) -> None:
+    checkpoint = run / "checkpoint.safetensors"
+    result = qgs("eval", checkpoint, "--set", "evaluation.scenes=1", "--out", tmp_path / "new")
+    assert result.exit_code == 0, result.output
+    assert json.loads((tmp_path / "new" / "summary.json").read_text())["scenes"] == 1
+
+
+def test_eval_refuses_to_change_the_model(run: Path) -> None:
+    result = qgs("eval", run, "--set", "model.queries.count=9")
+    assert isinstance(result.exception, ValueError)
+    assert "would change the trained model" in str(result.exception)
+
+
+def test_a_second_run_in_one_folder_is_refused(run: Path) -> None:
+    before = (run / "checkpoint.safetensors").stat().st_mtime_ns
+    result = train(run)
+    assert isinstance(result.exception, FileExistsError)
+    assert (run / "checkpoint.safetensors").stat().st_mtime_ns == before
+
+
+def test_a_collapse_is_told_without_a_traceback(tmp_path: Path) -> None:
+    result = train(tmp_path / "run", "model.head.opacity_bias=-20.0")
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    assert "training collapsed" in result.output
+    assert (tmp_path / "run" / "checkpoint.safetensors").is_file()

@@ -1,0 +1,152 @@
+"""Runs that die are noticed, said so, and leave good weights."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+import qgs
+from qgs.composer import Recipe
+from qgs.data.loader import evaluation_samples
+from qgs.engine import CollapseError, RunFolder, train
+from qgs.engine.collapse import (
+    EMPTY_ALPHA,
+    CollapseDetector,
+    GoodWeights,
+    Vitals,
+    not_finite,
+)
+from qgs.engine.interrupt import StopRequest
+from qgs.engine.progress import TrainingProgress
+from qgs.engine.trainer import Trainer
+from qgs.io.checkpoint import load_extra
+
+ALIVE = Vitals(alpha=0.5, deviation=0.3, gradient=0.1)
+QUIET = Console(quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("dead", "words"),
+    [
+        (Vitals(1e-4, 0.3, 0.1), "empty"),
+        (Vitals(0.5, 0.3, 0.0), "vanished"),
+        (Vitals(0.5, 1e-4, 0.1), "equal the background"),
+    ],
+)
+def test_a_window_of_dead_steps_is_a_collapse(dead: Vitals, words: str) -> None:
+    detector = CollapseDetector(10)
+    detector.observe(ALIVE)
+    for _ in range(9):
+        detector.observe(dead)
+    assert not detector.collapsed
+    detector.observe(dead)
+    assert detector.collapsed
+    assert words in detector.symptom
+
+
+def test_one_living_step_starts_the_count_again() -> None:
+    detector = CollapseDetector(10)
+    for _ in range(5):
+        for _ in range(9):
+            detector.observe(Vitals(0.0, 0.0, 0.0))
+        detector.observe(ALIVE)
+    assert not detector.collapsed
+
+
+def test_images_that_are_still_plain_at_the_start_are_no_collapse() -> None:
+    detector = CollapseDetector(10)
+    for _ in range(50):
+        detector.observe(Vitals(alpha=0.5, deviation=1e-4, gradient=0.1))
+    assert not detector.collapsed
+
+
+def test_good_weights_are_the_older_of_two_copies() -> None:
+    module = torch.nn.Linear(2, 2)
+    good = GoodWeights(module)
+    for step in (10, 20, 30):
+        torch.nn.init.constant_(module.weight, step)
+        good.refresh(step)
+    torch.nn.init.constant_(module.weight, 99)
+    assert good.step == 20
+    assert (good.tensors["weight"] == 20).all()
+
+
+def test_what_is_not_finite_is_named() -> None:
+    module = torch.nn.Linear(2, 2)
+    assert not_finite({"mse": 1.0}, module, 0.5) == ""
+    assert "mse is nan" in not_finite({"mse": float("nan")}, module, 0.5)
+    module.weight.grad = torch.full((2, 2), torch.inf)
+    module.bias.grad = torch.zeros(2)
+    message = not_finite({"mse": 1.0}, module, float("inf"))
+    assert message.endswith("from weight")
+
+
+def mean_alpha(checkpoint: Path, recipe: Recipe) -> float:
+    model = qgs.load(checkpoint)
+    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
+    with torch.no_grad():
+        gaussians = model(sample.inputs).gaussians
+        return float(model.render(gaussians, sample.targets.cameras).alpha.mean())
+
+
+def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny(
+        "tokengs",
+        "training.steps=400",
+        "training.warmup=60",
+        "training.learning_rate=5.0",
+        "training.initial_divisor=1e5",
+        "training.collapse_window=10",
+        "training.save_every=1",
+    )
+    with pytest.raises(CollapseError) as caught:
+        train(recipe, tmp_path / "run", console=QUIET)
+    message = str(caught.value)
+    for cause in ("learning_rate", "visibility", "opacity_bias", "checkpoint.safetensors"):
+        assert cause in message
+    folder = RunFolder(tmp_path / "run")
+    history = folder.history()
+    kept = int(load_extra(folder.checkpoint)["step"])
+    assert kept < len(history) < 160
+    assert mean_alpha(folder.checkpoint, recipe) > EMPTY_ALPHA
+
+
+def test_gaussians_invisible_from_the_start_are_noticed_within_the_window(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny(
+        "tokengs",
+        "model.head.opacity_bias=-20.0",
+        "training.steps=400",
+        "training.collapse_window=20",
+    )
+    with pytest.raises(CollapseError, match="renderings are empty"):
+        train(recipe, tmp_path / "run", console=QUIET)
+    lines = (tmp_path / "run" / "history.jsonl").read_text().splitlines()
+    assert len(lines) == recipe.training.collapse_window
+    assert json.loads(lines[-1])["step"] == recipe.training.collapse_window
+
+
+def test_a_run_that_ends_inside_a_collapse_fails_too(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
+    with pytest.raises(CollapseError, match="for the last 12 steps"):
+        train(recipe, tmp_path / "run", console=QUIET)
+
+
+def test_nan_stops_at_once_with_finite_weights(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    trainer = Trainer(tiny("locus"), RunFolder.create(tmp_path / "run"))
+    with torch.no_grad():
+        trainer.model.decoder[0].feed_forward_scale.gamma.fill_(torch.nan)
+    with pytest.raises(CollapseError, match=r"step 0: .*nan"):
+        trainer.run(TrainingProgress(QUIET), StopRequest())
+    model = qgs.load(trainer.folder.checkpoint)
+    assert all(p.isfinite().all() for p in model.parameters())

@@ -1,0 +1,52 @@
+"""The schedule against torch's, and under a time budget."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from qgs.contracts import TrainingConfig
+from qgs.engine.schedule import OneCycle
+
+
+@pytest.mark.parametrize(("steps", "warmup"), [(40, 10), (100, 2), (7, 3), (500, 400)])
+def test_steps_alone_follow_torch(steps: int, warmup: int) -> None:
+    config = TrainingConfig(steps=steps, warmup=warmup, learning_rate=4e-4)
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    reference = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer,
+        max_lr=config.learning_rate,
+        total_steps=steps,
+        pct_start=warmup / steps,
+        div_factor=config.initial_divisor,
+        final_div_factor=config.final_divisor,
+    )
+    schedule = OneCycle(config)
+    for step in range(steps):
+        assert schedule.rate(step, 0.0) == pytest.approx(reference.get_last_lr()[0], rel=1e-9)
+        optimizer.step()
+        if step < steps - 1:
+            reference.step()
+
+
+def test_a_time_budget_takes_over_when_it_runs_out_first() -> None:
+    schedule = OneCycle(TrainingConfig(steps=10_000, warmup=10, seconds=20.0))
+    rates = [schedule.rate(step, step * 0.1) for step in range(201)]
+    assert max(rates) == pytest.approx(schedule.peak)
+    assert rates.index(max(rates)) == 9
+    assert rates[9:] == sorted(rates[9:], reverse=True)
+    assert rates[-1] == pytest.approx(schedule.last)
+
+
+def test_steps_take_over_when_time_is_plenty() -> None:
+    timed = OneCycle(TrainingConfig(steps=50, warmup=10, seconds=1e6))
+    plain = OneCycle(TrainingConfig(steps=50, warmup=10))
+    for step in range(50):
+        assert timed.rate(step, step * 0.1) == pytest.approx(plain.rate(step, 0.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("warmup", [0, 1])
+def test_without_warm_up_the_peak_comes_first(warmup: int) -> None:
+    schedule = OneCycle(TrainingConfig(steps=10, warmup=warmup))
+    assert schedule.rate(0, 0.0) == pytest.approx(schedule.peak)
+    assert schedule.rate(9, 0.0) == pytest.approx(schedule.last)

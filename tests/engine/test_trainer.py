@@ -1,0 +1,133 @@
+"""Whole runs of tiny models on procedural rooms."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+import qgs
+from qgs.composer import Recipe, resolve
+from qgs.data.loader import training_batches
+from qgs.engine import RunFolder, train
+from qgs.engine.folder import checkpoint_of
+from qgs.io.checkpoint import load_extra
+
+QUIET = Console(quiet=True)
+
+
+@pytest.mark.parametrize("name", ["tokengs", "locus"])
+def test_training_lowers_the_loss(tiny: Callable[..., Recipe], tmp_path: Path, name: str) -> None:
+    recipe = tiny(
+        name, "training.steps=40", "training.warmup=4", "data.scenes=1", "views.mirror=0.0"
+    )
+    result = train(recipe, tmp_path / "run", console=QUIET)
+    losses = [record["loss"] for record in result.folder.history()]
+    assert result.steps == len(losses) == 40
+    assert sum(losses[-10:]) < 0.95 * sum(losses[:10])
+
+
+def test_a_run_leaves_recipe_history_and_checkpoint(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("locus")
+    result = train(recipe, tmp_path / "run", console=QUIET)
+    assert resolve(tmp_path / "run" / "recipe.yaml").tree == recipe.tree
+    history = result.folder.history()
+    assert [record["step"] for record in history] == [1, 2, 3, 4]
+    terms = {"mse", "ssim", "visibility", "anchor_visibility"}
+    assert terms | {"loss", "psnr", "lr", "seconds", "gradient"} <= history[0].keys()
+    for record in history:
+        assert record["loss"] == pytest.approx(sum(record[term] for term in terms))
+    assert load_extra(result.folder.checkpoint) == {"step": "4"}
+    loaded, batch = (
+        qgs.load(result.folder.checkpoint),
+        next(training_batches(recipe.build_data(), recipe.views, 1, seed=1)),
+    )
+    with torch.no_grad():
+        torch.testing.assert_close(
+            loaded(batch.inputs).gaussians.means, result.model(batch.inputs).gaussians.means
+        )
+
+
+def test_the_same_recipe_trains_the_same(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    runs = [train(tiny("locus"), tmp_path / name, console=QUIET) for name in ("a", "b")]
+    losses = [[record["loss"] for record in run.folder.history()] for run in runs]
+    assert losses[0] == losses[1]
+
+
+def test_accumulated_batches_are_one_larger_batch(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    first = []
+    for batch_size, accumulate in ((2, 1), (1, 2)):
+        recipe = tiny(
+            "tokengs",
+            f"training.batch_size={batch_size}",
+            f"training.accumulate={accumulate}",
+            "training.steps=1",
+        )
+        run = train(recipe, tmp_path / str(accumulate), console=QUIET)
+        first.append(run.folder.history()[0])
+    for key in ("loss", "mse", "visibility", "gradient"):
+        assert first[0][key] == pytest.approx(first[1][key], rel=1e-4)
+
+
+def test_bf16_trains_with_finite_numbers(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    result = train(tiny("locus", "training.precision=bf16"), tmp_path / "run", console=QUIET)
+    assert all(p.dtype == torch.float32 for p in result.model.parameters())
+    assert all(p.isfinite().all() for p in result.model.parameters())
+
+
+def test_a_time_budget_ends_the_run(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.0")
+    result = train(recipe, tmp_path / "run", console=QUIET)
+    assert 1.0 <= result.seconds < 10.0
+    assert 1 < result.steps < 100_000
+    history = result.folder.history()
+    assert history[0]["seconds"] == 0
+    assert history[-1]["lr"] < history[len(history) // 2]["lr"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_ends(
+    tiny: Callable[..., Recipe], tmp_path: Path, number: signal.Signals
+) -> None:
+    before = signal.getsignal(number)
+    history = tmp_path / "run" / "history.jsonl"
+
+    def interrupt_once_training() -> None:
+        while not history.exists():
+            threading.Event().wait(0.05)
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=interrupt_once_training, daemon=True)
+    thread.start()
+    result = train(tiny("tokengs", "training.steps=100000"), history.parent, console=QUIET)
+    thread.join()
+    assert result.stopped_by == number.name
+    assert result.steps == len(result.folder.history())
+    assert load_extra(result.folder.checkpoint)["step"] == str(result.steps)
+    assert signal.getsignal(number) is before
+
+
+def test_a_folder_in_use_is_refused_untouched(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="never overwrites"):
+        train(tiny("tokengs"), tmp_path, console=QUIET)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    with pytest.raises(FileExistsError, match="is a file"):
+        RunFolder.create(tmp_path / "notes.txt")
+
+
+def test_the_checkpoint_of_a_run_is_found(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="give a run folder"):
+        checkpoint_of(tmp_path)
+    (tmp_path / "checkpoint.safetensors").touch()
+    assert checkpoint_of(tmp_path) == checkpoint_of(tmp_path / "checkpoint.safetensors")

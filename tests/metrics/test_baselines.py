@@ -1,0 +1,72 @@
+"""Copying the nearest input view, and the mean colour."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from qgs.metrics import mean_colour, nearest_input
+from qgs.types import Cameras, Views
+
+
+def pose(x: float, turn: float = 0.0) -> Tensor:
+    """A camera at (x, 0, 0), turned by `turn` radians about y."""
+    c, s = math.cos(turn), math.sin(turn)
+    return torch.tensor([[c, 0, s, x], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+
+
+def cameras(*poses: Tensor) -> Cameras:
+    c2w = torch.stack(poses)[None]
+    return Cameras(c2w, torch.tensor([8.0, 8.0, 4.0, 4.0]).expand(1, len(poses), 4), (8, 8))
+
+
+def views(*poses: Tensor) -> Views:
+    images = torch.rand(1, len(poses), 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    return Views(images, cameras(*poses))
+
+
+def test_the_nearest_centre_is_copied() -> None:
+    inputs = views(pose(0.0), pose(1.0), pose(3.0))
+    found = nearest_input(inputs, cameras(pose(2.7), pose(0.1), pose(1.4)))
+    torch.testing.assert_close(found, inputs.images[:, [2, 0, 1]])
+
+
+def test_direction_decides_between_cameras_in_one_place() -> None:
+    inputs = views(pose(0.0, 1.5), pose(0.0, -1.5), pose(0.0, 0.1))
+    found = nearest_input(inputs, cameras(pose(0.0, 0.0), pose(0.0, -1.2)))
+    torch.testing.assert_close(found, inputs.images[:, [2, 1]])
+
+
+def test_scale_of_the_scene_does_not_matter() -> None:
+    choices = []
+    for scale in (0.01, 100.0):
+        inputs = views(pose(0.0, 0.3), pose(scale))
+        found = nearest_input(inputs, cameras(pose(0.6 * scale)))
+        choices.append((found == inputs.images[:, :1]).all())
+    assert choices[0] == choices[1]
+
+
+def test_each_scene_copies_its_own_views() -> None:
+    one, other = views(pose(0.0), pose(1.0)), views(pose(0.0), pose(1.0))
+    images = torch.cat([one.images, 1 - other.images])
+    c2w = torch.cat([one.cameras.c2w, other.cameras.c2w.flip(1)])
+    both = Views(images, Cameras(c2w, one.cameras.intrinsics.expand(2, -1, -1), (8, 8)))
+    target = cameras(pose(0.1))
+    targets = Cameras(target.c2w.expand(2, -1, -1, -1), target.intrinsics.expand(2, -1, -1), (8, 8))
+    found = nearest_input(both, targets)
+    torch.testing.assert_close(found, torch.stack([images[0, :1], images[1, 1:]]))
+
+
+def test_mean_colour_is_flat_and_the_best_flat_guess() -> None:
+    inputs = views(pose(0.0), pose(1.0))
+    found = mean_colour(inputs, cameras(pose(0.5), pose(2.0)))
+    assert found.shape == (1, 2, 3, 8, 8)
+    assert float(found.std((-1, -2)).max()) < 1e-6
+
+    def error(image: Tensor) -> Tensor:
+        return (inputs.images - image).square().mean()
+
+    assert error(found[:, :1]) < error(found[:, :1] + 0.01)
+    assert error(found[:, :1]) < error(found[:, :1] - 0.01)

@@ -1,0 +1,64 @@
+"""PSNR and SSIM against scikit-image."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from qgs.metrics import psnr, ssim
+
+
+def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(2, 3, 6, 8, generator=generator)
+    truth = torch.nn.functional.interpolate(coarse, size, mode="bilinear")
+    return truth + noise * torch.randn(truth.shape, generator=generator), truth
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.2, 1.0])
+def test_ssim_equals_scikit_image(noise: float) -> None:
+    images, truth = pair(noise)
+    expected = [
+        structural_similarity(
+            a.clamp(0, 1).double().numpy(),
+            b.double().numpy(),
+            channel_axis=0,
+            data_range=1.0,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+        for a, b in zip(images, truth, strict=True)
+    ]
+    torch.testing.assert_close(
+        ssim(images, truth).double(), torch.tensor(expected), rtol=0, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("noise", [0.02, 1.0])
+def test_psnr_equals_scikit_image_on_clipped_images(noise: float) -> None:
+    images, truth = pair(noise)
+    expected = [
+        peak_signal_noise_ratio(b.numpy(), a.clamp(0, 1).numpy(), data_range=1.0)
+        for a, b in zip(images, truth, strict=True)
+    ]
+    torch.testing.assert_close(
+        psnr(images, truth), torch.tensor(expected, dtype=torch.float32), rtol=1e-5, atol=1e-4
+    )
+
+
+def test_leading_dimensions_are_kept() -> None:
+    images, truth = (x[:, None].expand(-1, 4, -1, -1, -1) for x in pair(0.1))
+    assert psnr(images, truth).shape == ssim(images, truth).shape == (2, 4)
+
+
+def test_identical_images() -> None:
+    _, truth = pair(0.0)
+    torch.testing.assert_close(ssim(truth, truth), torch.ones(2))
+    assert psnr(truth, truth).isfinite().all()
+
+
+def test_images_smaller_than_the_window_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10x20"):
+        ssim(*pair(0.1, (10, 20)))
