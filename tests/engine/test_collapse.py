@@ -100,8 +100,8 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     recipe = tiny(
         "tokengs",
         "training.steps=400",
-        "training.warmup=60",
-        "training.learning_rate=5.0",
+        "training.warmup=300",
+        "training.learning_rate=2.0",
         "training.initial_divisor=1e5",
         "training.collapse_window=10",
         "training.save_every=1",
@@ -114,7 +114,7 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     folder = RunFolder(tmp_path / "run")
     history = folder.history()
     kept = int(load_extra(folder.checkpoint)["step"])
-    assert kept < len(history) < 160
+    assert 0 < kept < len(history) < 300
     assert mean_alpha(folder.checkpoint, recipe) > EMPTY_ALPHA
 
 
