@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import yaml
+from rich import box
 from rich.table import Table
 
 from qgs.analysis.pictures.figures import Curves
@@ -94,33 +92,11 @@ def baselines(entry: Entry) -> list[Baseline]:
     ]
 
 
-def facts(recipe: Recipe, seconds: float, seed: int) -> dict[str, str]:
-    """What was run where."""
-    height, width = recipe.tree["data"]["image_size"]
-    views = recipe.views
-    versions = ", ".join(f"{name} {version}" for name, version in recipe.plugin_versions.items())
-    return {
-        "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
-        "Views": f"{views.inputs} inputs, judged between and around them",
-        "Budget": f"{seconds:g} seconds of training each, seed {seed}",
-        "Machine": f"{_device()}, {torch.get_num_threads()} threads, {platform.system()}",
-        "Software": f"torch {torch.__version__}, {versions}",
-    }
-
-
-def _device() -> str:
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"CPU with {os.cpu_count()} cores ({platform.machine()})"
-
-
 def table_of(entries: Sequence[Entry]) -> Table:
     """The comparison as a table for the terminal."""
     rows = [entry.contender for entry in entries]
-    table = Table(
-        title="Unseen scenes",
-        caption="median, mean: token dispersion in world units; best in green",
-    )
+    caption = "median, mean: token dispersion in world units; best in green"
+    table = Table(title="Unseen scenes", caption=caption, box=box.SIMPLE_HEAD)
     table.add_column("", no_wrap=True)
     for column in ("PSNR", "SSIM", "median", "mean", "Gaussians", "parameters", "seconds"):
         table.add_column(column, justify="right", no_wrap=True)
@@ -136,7 +112,8 @@ def table_of(entries: Sequence[Entry]) -> Table:
             f"[green]{value:.{digits}f}[/green]" if value == top else f"{value:.{digits}f}"
             for value, top, digits in zip(scores, best, (2, 3, 3, 3), strict=True)
         ]
-        table.add_row(c.name, *cells, f"{c.gaussians:,}", f"{c.parameters:,}", f"{c.seconds:.0f}")
+        cells += [f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}"]
+        table.add_row(c.name, *cells)
     table.add_section()
     for b in baselines(entries[0]):
         table.add_row(b.name, f"{b.psnr:.2f}", f"{b.ssim:.3f}", *["–"] * 5, style="dim")

@@ -11,12 +11,9 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from qgs.analysis.report import Report
     from qgs.cli.contest import Entry
-    from qgs.composer import Recipe
 
 DEFAULT_RECIPES = ("tokengs.yaml", "locus.yaml")
-PICTURED_SCENES = 3
 
 
 def register(app: typer.Typer) -> None:
@@ -43,7 +40,9 @@ def demo(
 
     from rich.console import Console
 
+    from qgs.analysis.report import report_html
     from qgs.cli.contest import compete, resolve_fairly, table_of
+    from qgs.cli.contest_report import report_of, write_examples
     from qgs.io.atomic import write_text
 
     console = Console()
@@ -54,11 +53,9 @@ def demo(
         entries.append(compete(name, recipe, target / name))
     console.print(table_of(entries))
     console.print("Writing the report", style="dim")
-    from qgs.analysis.report import report_html
-
-    report = _report(entries, seconds, seed)
+    report = report_of(entries, seconds, seed)
     write_text(target / "report.html", report_html(report))
-    _write_example(entries, report, target)
+    write_examples(report, target)
     _say_where(console, target, entries)
 
 
@@ -92,35 +89,6 @@ def new_folder(out: Path | None) -> Path:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")
     return out
-
-
-def _report(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
-    from qgs.analysis.report import Report
-    from qgs.cli.contest import baselines, facts
-    from qgs.data.loader import evaluation_samples
-
-    recipe: Recipe = entries[0].recipe
-    few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
-    samples = evaluation_samples(recipe.build_data(), recipe.views, few)[:PICTURED_SCENES]
-    names = [entry.contender.name for entry in entries]
-    return Report(
-        title=" and ".join(names) + f", {seconds:g} seconds of training each",
-        contenders=[entry.contender for entry in entries],
-        baselines=baselines(entries[0]),
-        samples=samples,
-        facts=facts(recipe, seconds, seed),
-    )
-
-
-def _write_example(entries: Sequence[Entry], report: Report, target: Path) -> None:
-    import torch
-
-    from qgs.io.ply import write_ply
-
-    for entry in entries:
-        with torch.no_grad():
-            gaussians = entry.contender.model(report.samples[0].inputs).gaussians
-        write_ply(gaussians, target / entry.contender.name / "example.ply")
 
 
 def _say_where(console: Console, target: Path, entries: Sequence[Entry]) -> None:

@@ -76,11 +76,13 @@ def photos_config(recipe: Recipe, photos: Path) -> PhotosConfig:
 
     Raises ValueError for a recipe without data, which has no image size.
     """
+    from qgs.contracts import SceneSourceConfig
     from qgs.data.photos import PhotosConfig
 
     if ("data",) not in recipe.parts:
         raise ValueError("the checkpoint's recipe has no data, so its image size is not known")
     trained = recipe.parts["data",].config
+    assert isinstance(trained, SceneSourceConfig)
     if isinstance(trained, PhotosConfig):
         every = {"path": str(photos), "holdout": 0, "max_frames": 0}
         return trained.model_copy(update=every)

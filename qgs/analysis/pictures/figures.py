@@ -96,7 +96,9 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
         loss_axis.set(title="Training loss", xlabel="seconds", yscale="log")
         psnr_axis.set(title="PSNR of the training views, dB", xlabel="seconds")
         psnr_axis.legend(loc="lower right")
-        loss_axis.tick_params(which="minor", color=hex_color(MUTED))
+        loss_axis.yaxis.set_major_formatter("{x:g}")
+        loss_axis.yaxis.set_minor_formatter("{x:g}")
+        loss_axis.tick_params(which="minor", color=hex_color(MUTED), labelsize=7)
     return figure
 
 

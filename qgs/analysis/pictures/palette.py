@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 Color = tuple[int, int, int]
 
@@ -43,7 +44,7 @@ def figure_style() -> Iterator[None]:
     from matplotlib import rc_context
 
     ink = hex_color(INK)
-    style = {
+    style: dict[Any, Any] = {
         "font.family": "sans-serif",
         "font.size": 9,
         "text.color": ink,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from qgs.analysis.pictures.figures import Curves
 from qgs.data.sampling import Sample
 from qgs.model import QueryGaussianModel
@@ -45,12 +47,14 @@ class Baseline:
 class Report:
     """A comparison.
 
-    contenders: in the order in which they are shown. samples: the unseen scenes to picture. facts:
-    name to value, what was run where.
+    contenders: in the order in which they are shown. samples: the unseen scenes to picture. depths:
+    for each of them the true depth (T, 1, H, W) of its targets in the model's units, where known.
+    facts: name to value, what was run where.
     """
 
     title: str
     contenders: Sequence[Contender]
     baselines: Sequence[Baseline]
     samples: Sequence[Sample]
+    depths: Sequence[Tensor | None]
     facts: Mapping[str, str]

@@ -65,23 +65,30 @@ class TokenGallery:
 def scene_gallery(
     sample: Sample,
     predictions: Sequence[tuple[str, QueryGaussianModel, Prediction]],
+    depth: torch.Tensor | None = None,
     targets: int = 2,
 ) -> SceneGallery:
-    """Renders and depth beside truth for the first `targets` target views."""
+    """Renders and depth beside truth for the first `targets` target views.
+
+    depth: the true one (T, 1, H, W), where it is known.
+    """
     shown = sample.targets.select(slice(targets))
     renderings = [model.render(p.gaussians, shown.cameras) for _, model, p in predictions]
-    near, far = depth_range(torch.cat([rendering.depth for rendering in renderings]))
     names = [name for name, _, _ in predictions]
+    depths = {f"{n}, depth": r.depth[0] for n, r in zip(names, renderings, strict=True)}
+    if depth is not None:
+        depths = {"Truth, depth": depth[:targets]} | depths
+    near, far = depth_range(torch.cat(list(depths.values())))
     columns = [_photo_tiles(shown.images[0], sample.target_frames)]
     columns += [_render_tiles(rendering, shown.images[0]) for rendering in renderings]
     columns += [
-        [Tile(depth_picture(depth, near, far), "") for depth in rendering.depth[0]]
-        for rendering in renderings
+        [Tile(depth_picture(depth, near, far), "") for depth in column]
+        for column in depths.values()
     ]
     return SceneGallery(
         name=sample.scene,
         inputs=_photo_tiles(sample.inputs.images[0], sample.input_frames),
-        columns=["Truth", *names, *(f"{name}, depth" for name in names)],
+        columns=["Truth", *names, *depths],
         rows=[list(row) for row in zip(*columns, strict=True)],
     )
 

@@ -43,8 +43,10 @@ def _contents(report: Report) -> dict[str, Any]:
     return {
         "report": report,
         "scenes": [
-            gallery.scene_gallery(sample, of_sample)
-            for sample, of_sample in zip(report.samples, predictions, strict=True)
+            gallery.scene_gallery(sample, of_sample, depth)
+            for sample, of_sample, depth in zip(
+                report.samples, predictions, report.depths, strict=True
+            )
         ],
         "tokens": [gallery.token_gallery(c, of_first[c.name], first) for c in report.contenders],
         "anchors": {c.name: gallery.anchor_tiles(c, first) for c in report.contenders},
