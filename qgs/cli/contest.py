@@ -96,7 +96,13 @@ def table_of(entries: Sequence[Entry]) -> Table:
     """The comparison as a table for the terminal."""
     rows = [entry.contender for entry in entries]
     caption = "median, mean: token dispersion in world units; best in green"
-    table = Table(title="Unseen scenes", caption=caption, box=box.SIMPLE_HEAD)
+    table = Table(
+        title="Unseen scenes",
+        caption=caption,
+        box=box.SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+    )
     table.add_column("", no_wrap=True)
     for column in ("PSNR", "SSIM", "median", "mean", "Gaussians", "parameters", "seconds"):
         table.add_column(column, justify="right", no_wrap=True)
