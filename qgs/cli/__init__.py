@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
-from importlib.util import find_spec
 
 import typer
+
+from qgs.cli import demo, inspect, reconstruct, train
 
 app = typer.Typer(
     name="qgs",
@@ -17,11 +17,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-GROUPS = ("inspect", "train", "reconstruct", "demo")
-
-for _group in GROUPS:
-    if find_spec(f"qgs.cli.{_group}"):
-        import_module(f"qgs.cli.{_group}").register(app)
+for _group in (inspect, train, reconstruct, demo):
+    _group.register(app)
 
 
 def main() -> None:

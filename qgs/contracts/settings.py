@@ -44,9 +44,8 @@ class TrainingConfig(ComponentConfig):
     step and process. accumulate: batches per optimiser step. learning_rate: peak of the one-cycle
     cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
     final_divisor: first rate over last rate (torch's OneCycleLR). clip: gradient norm. precision:
-    autocast dtype. save_every, evaluate_every: steps between checkpoints and between evaluations,
-    0 for never but at the end. collapse_window: steps of background-only output after which
-    training stops.
+    autocast dtype. save_every: steps between checkpoints, 0 for never but at the end.
+    collapse_window: steps of background-only output after which training stops.
     """
 
     steps: int = Field(default=150_000, ge=1)
@@ -61,9 +60,7 @@ class TrainingConfig(ComponentConfig):
     weight_decay: float = Field(default=0.05, ge=0)
     clip: float = Field(default=1.0, gt=0)
     precision: Literal["float32", "bf16"] = "bf16"
-    workers: int = Field(default=0, ge=0)
     save_every: int = Field(default=1000, ge=0)
-    evaluate_every: int = Field(default=0, ge=0)
     collapse_window: int = Field(default=50, ge=10, le=100)
 
 
