@@ -64,7 +64,7 @@ def compete(name: str, recipe: Recipe, run: Path) -> Entry:
     dispersion = evaluation.summary()["dispersion_over_gaussians"]
     contender = Contender(
         name=name,
-        model=result.model,
+        model=result.model.cpu(),
         psnr=evaluation.mean("psnr"),
         ssim=evaluation.mean("ssim"),
         dispersion_mean=dispersion["mean"]["mean"],

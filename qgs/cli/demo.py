@@ -43,6 +43,7 @@ def demo(
     from qgs.analysis.report import report_html
     from qgs.cli.contest import compete, resolve_fairly, table_of
     from qgs.cli.contest_report import report_of, write_examples
+    from qgs.engine import CollapseError
     from qgs.io.atomic import write_text
 
     console = Console()
@@ -50,7 +51,11 @@ def demo(
     entries = []
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
-        entries.append(compete(name, recipe, target / name))
+        try:
+            entries.append(compete(name, recipe, target / name))
+        except CollapseError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from None
     console.print(table_of(entries))
     console.print("Writing the report", style="dim")
     report = report_of(entries, seconds, seed)

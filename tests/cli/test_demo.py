@@ -8,6 +8,7 @@ import qgs
 from qgs.cli import app
 from qgs.cli.contest import resolve_fairly
 from qgs.cli.demo import default_recipes, new_folder
+from qgs.engine import CollapseError
 from qgs.io.ply import read_ply
 
 RECIPE = {
@@ -100,3 +101,14 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo" / "report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo")
+
+
+def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch):
+    def collapse(*_):
+        raise CollapseError("training collapsed at step 7")
+
+    monkeypatch.setattr("qgs.cli.contest.compete", collapse)
+    out = tmp_path / "demo"
+    result = CliRunner().invoke(app, ["demo", str(recipes[0]), "--out", str(out)])
+    assert result.exit_code == 1
+    assert "collapsed at step 7" in result.stderr
