@@ -77,7 +77,7 @@ def furnish(rng: np.random.Generator, size: tuple[float, float, float], eyes: np
     window_side = int(rng.integers(4))
     shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
     head = [m.rows[i] for i in surfaces]
-    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes])
+    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes], np.float32)
     return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from qgs.data.rooms.raycast import hit
+from qgs.data.rooms.intersections import hit
 from qgs.data.rooms.textures import OPTIONS
 
 

@@ -66,7 +66,7 @@ def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
 class Room:
     """A furnished room, ready to be cast.
 
-    shapes: (S, SHAPE_FIELDS) float64. textures: (T, TEXTURE_FIELDS) float64; the first six are
+    shapes: (S, SHAPE_FIELDS) float32. textures: (T, TEXTURE_FIELDS) float64; the first six are
     those of the walls -x, +x, -y, +y, the floor and the ceiling. size: x, y, z extent in metres.
     lights: (2, 4) position and strength of the lamp and of the window.
     """

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 import torch
@@ -112,46 +112,44 @@ class RoomScene(Scene):
         for frame, image in zip(missing, self._cast_colors(missing), strict=True):
             self._cache.put((self.name, frame), image)
             known[frame] = image
-        stacked = np.stack([known[frame] for frame in frames])  # type: ignore[misc]
-        return torch.from_numpy(stacked).permute(0, 3, 1, 2).float().div_(255).contiguous()
+        out = np.empty((len(frames), 3, *self._config.image_size), np.float32)
+        for place, frame in enumerate(frames):
+            image = known[frame]
+            assert image is not None
+            np.multiply(image.transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
+        return torch.from_numpy(out)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre."""
-        from qgs.data.rooms.raycast import cast_depths
+        from qgs.data.rooms.casting import cast_depths
 
-        out = np.empty((len(frames), *self._config.image_size), np.float32)
-
-        def cast(i: int, rows: tuple[int, int], room: Any, view: Any) -> None:
-            cast_depths(out[i], rows, room, self._c2w[frames[i]], self._intrinsics, view)
-
-        self._cast(frames, cast)
+        room, out = self.room, np.empty((len(frames), *self._config.image_size), np.float32)
+        self._cast(
+            lambda i, rows: cast_depths(out[i], rows, room, self._c2w[frames[i]], self._intrinsics),
+            len(frames),
+        )
         return torch.from_numpy(out)[:, None]
 
     def _cast_colors(self, frames: Sequence[int]) -> np.ndarray:
-        from qgs.data.rooms.raycast import cast_colors
+        from qgs.data.rooms.casting import cast_colors
 
         out = np.empty((len(frames), *self._config.image_size, 3), np.uint8)
         if not frames:
             return out
-        floor = self._floor
-        samples = self._config.samples
-
-        def cast(i: int, rows: tuple[int, int], room: Any, view: Any) -> None:
-            c2w = self._c2w[frames[i]]
-            cast_colors(out[i], rows, samples, room, floor, c2w, self._intrinsics, view)
-
-        self._cast(frames, cast)
+        room, floor, samples = self.room, self._floor, self._config.samples
+        self._cast(
+            lambda i, rows: cast_colors(
+                out[i], rows, samples, room, floor, self._c2w[frames[i]], self._intrinsics
+            ),
+            len(frames),
+        )
         return out
 
-    def _cast(self, frames: Sequence[int], cast: Callable[..., None]) -> None:
-        """Call `cast` for bands of rows of every frame, on torch's number of threads."""
-        from qgs.data.rooms.raycast import visible
-
-        room = (self.room.shapes, self.room.textures, self.size, self.room.lights)
+    def _cast(self, cast: Callable[[int, tuple[int, int]], None], frames: int) -> None:
+        """Call `cast(i, rows)` for bands of rows of every frame, on torch's number of threads."""
         height = self._config.image_size[0]
-        views = [visible(self.room.shapes, self._c2w[f], self._intrinsics) for f in frames]
         bands = [(top, min(top + _BAND, height)) for top in range(0, height, _BAND)]
-        work = [(i, rows, room, views[i]) for i in range(len(frames)) for rows in bands]
+        work = [(i, rows) for i in range(frames) for rows in bands]
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             list(pool.map(lambda unit: cast(*unit), work))
 
