@@ -15,7 +15,8 @@ _NAMES = {"type": "array", "items": {"type": "string"}}
 def recipe_schema(registry: Registry) -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of recipes that use the plugins of `registry`.
 
-    Nothing is required: an overlay may leave everything to what it extends.
+    Nothing is required: an overlay may leave everything to what it extends. A component without a
+    `type` may have the options of any component of its slot.
     """
     definitions = {slot.name: _slot(slot, registry) for slot in SLOTS.values()}
     layer = _object({name: _ref(name) for name in LAYER_SLOTS})
@@ -50,14 +51,12 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 def _slot(slot: Slot, registry: Registry) -> dict[str, Any]:
     components = registry.components(slot.name)
-    return {"oneOf": [_component(name, component, slot) for name, component in components.items()]}
+    return {"anyOf": [_component(name, component) for name, component in components.items()]}
 
 
-def _component(name: str, component: type[Component], slot: Slot) -> dict[str, Any]:
+def _component(name: str, component: type[Component]) -> dict[str, Any]:
     schema = _settings(component.Config)
     schema["properties"] = {"type": {"const": name}, **schema["properties"]}
-    if name != slot.default:
-        schema["required"] = ["type"]
     if component.__doc__:
         schema["description"] = component.__doc__.splitlines()[0]
     return schema
