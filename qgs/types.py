@@ -9,7 +9,7 @@ Every container is frozen. A component returns a new one and never writes into t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
@@ -30,7 +30,7 @@ class _TensorContainer:
                 return {key: move(item) for key, item in value.items()}
             return value
 
-        moved = {f.name: move(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
+        moved = {f.name: move(getattr(self, f.name)) for f in fields(self) if f.init}
         return replace(self, **moved)  # type: ignore[type-var]
 
 
@@ -124,6 +124,13 @@ class ImageMemory(_TensorContainer):
     features: Tensor
     patch_rays: Tensor
     grid: tuple[int, int, int]
+    _derived: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+        """What `compute` makes of this memory, computed by the first layer that asks for `name`."""
+        if name not in self._derived:
+            self._derived[name] = compute()
+        return self._derived[name]
 
 
 @dataclass(frozen=True)

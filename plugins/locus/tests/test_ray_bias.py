@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from qgs_locus.ray_bias import ray_bias, ray_bias_direct
+from qgs_locus.ray_bias import ray_bias, ray_bias_direct, ray_features
 from torch import Tensor
 
 from qgs.geometry.rays import normalised_rays
@@ -26,7 +26,7 @@ def _seed() -> None:
 def test_factored_equals_direct(bandwidth: str) -> None:
     center, rays, gamma = torch.randn(2, 50, 3), _rays(200), torch.tensor(0.1)
     sigma_sq = 0.01 if bandwidth == "fixed" else torch.rand(2, 50, 1) * 0.05 + 1e-3
-    fast = ray_bias(center, sigma_sq, rays, -20.0, gamma)
+    fast = ray_bias(center, sigma_sq, ray_features(rays), -20.0, gamma)
     direct = ray_bias_direct(center, sigma_sq, rays, -20.0, gamma)
     assert fast.shape == (2, 50, 200)
     torch.testing.assert_close(fast, direct, rtol=0, atol=1e-3 * float(gamma))
@@ -43,13 +43,16 @@ def test_gradients_of_factored_equal_those_of_direct() -> None:
     ]
     weight = torch.randn(2, 6, 9, dtype=torch.float64)
 
+    def factored(center, sigma_sq, rays, bias_min, gamma) -> Tensor:
+        return ray_bias(center, sigma_sq, ray_features(rays), bias_min, gamma)
+
     def gradients(function) -> tuple[Tensor, ...]:
         leaves = [x.clone().requires_grad_() for x in inputs]
         center, sigma_sq, rays, gamma = leaves
         (function(center, sigma_sq, rays, -2.0, gamma) * weight).sum().backward()
         return tuple(leaf.grad for leaf in leaves)
 
-    for fast, direct in zip(gradients(ray_bias), gradients(ray_bias_direct), strict=True):
+    for fast, direct in zip(gradients(factored), gradients(ray_bias_direct), strict=True):
         torch.testing.assert_close(fast, direct)
 
 
@@ -57,14 +60,15 @@ def test_a_point_on_the_ray_has_no_penalty() -> None:
     rays = _rays(5, torch.float64)
     moments, directions = normalised_rays(rays)
     on_ray = torch.linalg.cross(directions, moments) + 1.7 * directions
-    bias = ray_bias(on_ray, 1e-3, rays, -20.0, torch.ones((), dtype=torch.float64))
+    bias = ray_bias(on_ray, 1e-3, ray_features(rays), -20.0, torch.ones((), dtype=torch.float64))
     torch.testing.assert_close(bias.diagonal(dim1=1, dim2=2), torch.zeros(2, 5).double())
 
 
 def test_autocast_leaves_the_bias_in_float32() -> None:
     center, rays = torch.randn(2, 8, 3), _rays(16)
-    plain = ray_bias(center, 0.01, rays, -20.0, torch.tensor(0.1))
+    features = ray_features(rays)
+    plain = ray_bias(center, 0.01, features, -20.0, torch.tensor(0.1))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        mixed = ray_bias(center, 0.01, rays, -20.0, torch.tensor(0.1))
+        mixed = ray_bias(center, 0.01, ray_features(rays), -20.0, torch.tensor(0.1))
     assert mixed.dtype == torch.float32
     torch.testing.assert_close(mixed, plain, rtol=0, atol=0)

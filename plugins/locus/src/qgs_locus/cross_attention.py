@@ -20,7 +20,7 @@ from qgs_locus.fields import (
     radius_field,
     support_radius,
 )
-from qgs_locus.ray_bias import ray_bias
+from qgs_locus.ray_bias import ray_bias, ray_features
 
 
 class RayBiasedCrossAttention(CrossAttention):
@@ -75,7 +75,7 @@ class RayBiasedCrossAttention(CrossAttention):
         return ray_bias(
             state[CENTER],
             self.sigma_sq(state),
-            memory.patch_rays,
+            memory.once("locus.ray_features", lambda: ray_features(memory.patch_rays)),
             self.config.bias_min,
             self.gamma,
         )

@@ -7,6 +7,8 @@ formula out and is what the tests hold the fast one against.
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import torch
 from torch import Tensor
 
@@ -39,23 +41,57 @@ def center_features(center: Tensor) -> Tensor:
 
 @full_precision
 def ray_bias(
-    center: Tensor, sigma_sq: Tensor | float, patch_rays: Tensor, bias_min: float, gamma: Tensor
+    center: Tensor, sigma_sq: Tensor | float, features: Tensor, bias_min: float, gamma: Tensor
 ) -> Tensor:
     """gamma * clamp(-D^2 / (2 sigma^2), bias_min, 0), (B, N, M).
 
-    center (B, N, 3); sigma_sq (B, N, 1) or a number; patch_rays (B, M, 6), not normalised;
-    gamma 0-d, positive: it is folded into the centre's features and into the clamp.
+    center (B, N, 3); sigma_sq (B, N, 1) or a number; features (B, 10, M) of `ray_features`, which
+    all layers share; gamma 0-d, positive: folded into the centre's features and into the clamp.
     """
     scaled = center_features(center) * (-0.5 * gamma / sigma_sq)
-    bias = scaled @ ray_features(patch_rays)
-    return bias.clamp_(bias_min * gamma, torch.zeros_like(gamma))
+    return _clamped_product(scaled, features, bias_min * gamma)
+
+
+class _ClampedProduct(torch.autograd.Function):
+    """min(max(left @ right, lower), 0), which keeps its result alone for the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, left: Tensor, right: Tensor, lower: Tensor) -> Tensor:
+        product = left @ right
+        # Number bounds are twice as fast as tensor ones, but reading them would stall a GPU.
+        if lower.is_cuda:
+            product.clamp_(lower, torch.zeros_like(lower))
+        else:
+            product.clamp_(lower.item(), 0.0)
+        ctx.save_for_backward(left, right, lower, product)
+        return product
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        left, right, lower, product = ctx.saved_tensors
+        (gradient,) = gradients
+        needs_left, needs_right, needs_lower = ctx.needs_input_grad
+        at_lower = product <= lower
+        inside = gradient.masked_fill(at_lower | (product >= 0), 0)
+        return (
+            inside @ right.transpose(-1, -2) if needs_left else None,
+            left.transpose(-1, -2) @ inside if needs_right else None,
+            gradient.masked_fill(~at_lower, 0).sum() if needs_lower else None,
+        )
+
+
+def _clamped_product(left: Tensor, right: Tensor, lower: Tensor) -> Tensor:
+    return cast(Tensor, _ClampedProduct.apply(left, right, lower))
 
 
 @full_precision
 def ray_bias_direct(
     center: Tensor, sigma_sq: Tensor | float, patch_rays: Tensor, bias_min: float, gamma: Tensor
 ) -> Tensor:
-    """`ray_bias` as it is written in the paper, through the (B, N, M, 3) cross product."""
+    """`ray_bias` as the paper writes it, through a (B, N, M, 3) cross product.
+
+    patch_rays (B, M, 6), not normalised.
+    """
     moments, directions = normalised_rays(patch_rays)
     residual = torch.linalg.cross(center[:, :, None], directions[:, None], dim=-1)
     distance_sq = (residual - moments[:, None]).square().sum(-1)
