@@ -13,7 +13,7 @@ from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.images import CropResize, open_rgb, to_tensor
 from qgs.data.transforms_json import PhotoFrame, read_transforms
 from qgs.data.undistortion import undistorted
@@ -24,7 +24,7 @@ _CACHE_BYTES = 512 * 2**20
 _SAME_ASPECT = 0.01  # relative difference between the file's and the JSON's aspect ratio
 
 
-class PhotosConfig(SceneSourceConfig):
+class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`.
 
     path: folder that holds transforms.json, absolute or relative to the working directory.

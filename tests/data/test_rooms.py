@@ -7,7 +7,6 @@ from pydantic import ValidationError
 pytest.importorskip("numba")
 
 from qgs.data.rooms import RoomsSource
-from qgs.data.rooms.layout import CLEARANCE
 from qgs.data.sampling import mirrored_views
 from qgs.geometry.rays import pixel_directions
 from qgs.types import Cameras, Views
@@ -87,16 +86,20 @@ def test_poses_are_rigid_and_level_and_inside_the_room():
         assert reach.min() > 0.2
 
 
-def test_no_camera_stands_in_furniture():
-    for index in range(20):
+def distances(shapes: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+    """Metres (F, S) from points to the boxes around shapes, 0 inside."""
+    offset = eyes[:, None] - shapes[None, :, 1:4]
+    cos, sin = shapes[:, 7], shapes[:, 8]
+    along = cos * offset[..., 0] + sin * offset[..., 1]
+    across = cos * offset[..., 1] - sin * offset[..., 0]
+    local = np.stack([along, across, offset[..., 2]], -1)
+    return np.linalg.norm(np.maximum(np.abs(local) - shapes[:, 4:7], 0), axis=-1)
+
+
+def test_cameras_keep_clear_of_every_surface():
+    for index in range(60):
         scene = source().scenes("train")[index]
-        depths = scene.depths(range(len(scene)))
-        assert depths.min() > 0.15
-        shapes = scene.room.shapes
-        eyes = scene.cameras.c2w[:, None, :3, 3].numpy()
-        distance = np.linalg.norm(eyes - shapes[None, :, 1:4], axis=-1)
-        assert (distance > 0.3).all()
-    assert CLEARANCE > 0.3
+        assert distances(scene.room.shapes, scene.cameras.c2w[:, :3, 3].numpy()).min() > 0.2
 
 
 def test_more_samples_change_edges_only():

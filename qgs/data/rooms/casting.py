@@ -15,7 +15,7 @@ from qgs.data.rooms.textures import OPTIONS
 @njit(**OPTIONS)
 def _traced(rows, columns, top, samples, shapes, size, c2w, intrinsics):
     t = np.empty((rows * samples, columns * samples), np.float32)
-    code = np.empty_like(t)
+    code = np.empty((rows * samples, columns * samples), np.float32)
     rays = ray_basis(c2w, intrinsics)
     trace(t, code, top, samples, shapes, size, screen_bounds(shapes, c2w, intrinsics), c2w, rays)
     return t, code, rays

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from qgs.data.rooms import shapes as s
-from qgs.data.rooms.textures import OPTIONS
+from qgs.data.rooms.textures import INNER, OPTIONS
 
 NEAR = np.float32(0.02)
 NONE = np.float32(np.inf)
@@ -20,20 +20,20 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _BOX, _SPHERE = s.BOX, s.SPHERE
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def reciprocal(x):
     """1 / x, large where x is 0."""
     return _ONE / (x if abs(x) > _TINY else _TINY)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def slab(o, inverse, h):
     """Where a ray is between -h and h along one axis: entry and exit; inverse is 1 / d."""
     a, b = (-h - o) * inverse, (h - o) * inverse
     return min(a, b), max(a, b)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def hit_sphere(o, d, radius):
     """Entry into the sphere of `radius` around the origin."""
     inverse = _ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -44,7 +44,7 @@ def hit_sphere(o, d, radius):
     return t if (inside > _ZERO) & (t > NEAR) else NONE
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def hit_cylinder(o, d, radius, half):
     """Entry into an upright cylinder around the origin, and where it would enter between caps."""
     low, high = slab(o[2], reciprocal(d[2]), half)
@@ -57,7 +57,7 @@ def hit_cylinder(o, d, radius, half):
     return near if (inside > _ZERO) & (near > NEAR) & (near <= far) else NONE, low
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def hit_box(o, d, h):
     """Entry into a box around the origin, and where it would enter between x and y sides."""
     near_x, far_x = slab(o[0], reciprocal(d[0]), h[0])
@@ -67,14 +67,14 @@ def hit_box(o, d, h):
     return near if (near > NEAR) & (near <= far) else NONE, near_x, near_y
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def local(shapes, i, x, y, z):
     """A direction turned into the frame of shape i."""
     cos, sin = shapes[i, 7], shapes[i, 8]
     return cos * x + sin * y, cos * y - sin * x, z
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def local_point(shapes, i, x, y, z):
     """A point in the frame of shape i."""
     return local(shapes, i, x - shapes[i, 1], y - shapes[i, 2], z - shapes[i, 3])

@@ -6,35 +6,43 @@ import math
 
 import numpy as np
 
+from qgs.data.rooms.draws import Draws
 from qgs.data.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
 from qgs.data.rooms.materials import Materials
 from qgs.data.rooms.shapes import Room, Shape, box, cylinder
 
-CLEARANCE = 0.5  # metres between a camera and the nearest shape
+CLEARANCE = 0.4  # metres between a camera and the nearest shape
 _GAP = 0.05  # metres between pieces
+
+Point = tuple[float, float, float]
+# Corners of a piece that fits wherever any does.
+_SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 class Furnisher:
     """Places pieces one by one where they hit neither each other nor the cameras."""
 
     def __init__(self, size: tuple[float, float, float], eyes: np.ndarray) -> None:
-        self.size, self.eyes = size, eyes
+        self.size, self.eyes = size, eyes.tolist()
         self.shapes: list[Shape] = []
         self._taken: list[tuple[float, float, float, float]] = []
 
     def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
         """Put `piece` at (x, y), turned; False, and nothing is placed, where it does not fit."""
-        shapes = [shape.moved(x, y, turn) for shape in piece]
-        low, high = bounds(shapes)
-        inside = abs(low[0]) <= self.size[0] / 2 and abs(high[0]) <= self.size[0] / 2
-        inside = inside and abs(low[1]) <= self.size[1] / 2 and abs(high[1]) <= self.size[1] / 2
-        if not inside or self._blocked(low, high) or not clear_of(low, high, self.eyes):
+        low, high = turned(*bounds(piece), x, y, turn)
+        if not self.free(low, high):
             return False
         self._taken.append((low[0], low[1], high[0], high[1]))
-        self.shapes += shapes
+        self.shapes += [shape.moved(x, y, turn) for shape in piece]
         return True
 
-    def _blocked(self, low: np.ndarray, high: np.ndarray) -> bool:
+    def free(self, low: Point, high: Point) -> bool:
+        """Whether the box between two corners is in the room, off other pieces and the cameras."""
+        half_x, half_y = self.size[0] / 2, self.size[1] / 2
+        inside = -half_x <= low[0] and high[0] <= half_x and -half_y <= low[1] and high[1] <= half_y
+        return inside and not self._blocked(low, high) and clear_of(low, high, self.eyes)
+
+    def _blocked(self, low: Point, high: Point) -> bool:
         return any(
             low[0] < x1 + _GAP
             and high[0] > x0 - _GAP
@@ -44,27 +52,37 @@ class Furnisher:
         )
 
 
-def bounds(shapes: list[Shape]) -> tuple[np.ndarray, np.ndarray]:
+def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     """Lowest and highest corner of the box around `shapes`."""
-    rows = np.array([shape.row() for shape in shapes])
-    cos, sin = np.abs(rows[:, 7]), np.abs(rows[:, 8])
-    reach = rows[:, 4:7].copy()
-    reach[:, 0] = cos * rows[:, 4] + sin * rows[:, 5]
-    reach[:, 1] = sin * rows[:, 4] + cos * rows[:, 5]
-    return (rows[:, 1:4] - reach).min(0), (rows[:, 1:4] + reach).max(0)
+    corners = [shape.bounds() for shape in shapes]
+    x0, y0, z0, x1, y1, z1 = zip(*corners, strict=True)
+    return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
 
 
-def clear_of(low: np.ndarray, high: np.ndarray, eyes: np.ndarray) -> bool:
+def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
+    """Corners of a box that holds the given one after it was turned about z and moved."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
+    ys = [y + sin * a + cos * b for a in (low[0], high[0]) for b in (low[1], high[1])]
+    return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
+
+
+def clear_of(low: Point, high: Point, eyes: list[list[float]]) -> bool:
     """Whether every eye keeps its clearance from the box between `low` and `high`."""
-    outside = np.maximum(np.maximum(low - eyes, eyes - high), 0)
-    return bool(((outside**2).sum(-1) > CLEARANCE**2).all())
+    for x, y, z in eyes:
+        dx = max(low[0] - x, x - high[0], 0.0)
+        dy = max(low[1] - y, y - high[1], 0.0)
+        dz = max(low[2] - z, z - high[2], 0.0)
+        if dx * dx + dy * dy + dz * dz <= CLEARANCE**2:
+            return False
+    return True
 
 
-def furnish(rng: np.random.Generator, size: tuple[float, float, float], eyes: np.ndarray) -> Room:
+def furnish(rng: Draws, size: tuple[float, float, float], eyes: np.ndarray) -> Room:
     """A room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
     m = Materials(rng)
     wall = m.wall()
-    walls = [wall] + [m.wall() if rng.random() < 0.3 else wall for _ in range(3)]
+    walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
     surfaces = [*walls, m.floor(), m.pale()]
     furnisher = Furnisher(size, eyes)
     _centre(rng, m, furnisher)
@@ -72,38 +90,42 @@ def furnish(rng: np.random.Generator, size: tuple[float, float, float], eyes: np
         _against_wall(rng, m, furnisher, side)
     for _ in range(3):
         maker = LOOSE[rng.integers(len(LOOSE))]
-        x, y = (float(rng.uniform(-0.4, 0.4)) * extent for extent in size[:2])
-        furnisher.place(maker(rng, m), x, y, float(rng.uniform(0, 2 * math.pi)))
-    window_side = int(rng.integers(4))
+        x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
+        furnisher.place(maker(rng, m), x, y, rng.uniform(0, 2 * math.pi))
+    window_side = rng.integers(4)
     shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
     head = [m.rows[i] for i in surfaces]
     rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes], np.float32)
     return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
 
 
-def _centre(rng: np.random.Generator, m: Materials, furnisher: Furnisher) -> None:
+def _centre(rng: Draws, m: Materials, furnisher: Furnisher) -> None:
     maker = CENTRAL[rng.integers(len(CENTRAL))]
-    turn = float(rng.integers(4)) * math.pi / 2 + float(rng.normal(0, 0.12))
+    turn = float(rng.integers(4)) * math.pi / 2 + rng.gauss(0, 0.12)
     piece = maker(rng, m)
     for _ in range(4):
-        x, y = (float(rng.uniform(-0.18, 0.18)) * extent for extent in furnisher.size[:2])
+        x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
         if furnisher.place(piece, x, y, turn):
             return
 
 
-def _against_wall(rng: np.random.Generator, m: Materials, furnisher: Furnisher, side: int) -> None:
+def _against_wall(rng: Draws, m: Materials, furnisher: Furnisher, side: int) -> None:
     """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
     across, along = furnisher.size[side % 2], furnisher.size[1 - side % 2]
     turn = math.pi / 2 + side * math.pi / 2
-    position = -along / 2 + float(rng.uniform(0.1, 0.6))
+    position = -along / 2 + rng.uniform(0.1, 0.6)
     while position < along / 2 - 0.4:
+        spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
+        if not furnisher.free(*spot):
+            position += rng.uniform(0.1, 0.5)
+            continue
         piece = AGAINST_WALLS[rng.integers(len(AGAINST_WALLS))](rng, m)
         low, high = bounds(piece)
         away = across / 2 - float(high[1]) - 0.02
         middle = position - float(low[0])
         if furnisher.place(piece, *_from_wall(side, away, middle), turn):
             position += float(high[0] - low[0])
-        position += float(rng.uniform(0.1, 0.5))
+        position += rng.uniform(0.1, 0.5)
 
 
 def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
@@ -114,7 +136,7 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
 
 
 def _on_walls(
-    rng: np.random.Generator, m: Materials, size: tuple[float, float, float], window_side: int
+    rng: Draws, m: Materials, size: tuple[float, float, float], window_side: int
 ) -> list[Shape]:
     """A window on one wall, pictures on the others."""
     shapes: list[Shape] = []
@@ -122,16 +144,15 @@ def _on_walls(
         across, along = size[side % 2], size[1 - side % 2]
         turn = math.pi / 2 + side * math.pi / 2
         if side == window_side:
-            hung = _framed(m.pale(), m.window(), float(rng.uniform(1.2, 2.0)), 1.25, 0.95, 0.07)
-            places = [float(rng.uniform(-0.15, 0.15)) * along]
+            hung = _framed(m.pale(), m.window(), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)
+            places = [rng.uniform(-0.15, 0.15) * along]
         else:
-            places = [along * (float(rng.uniform(-0.06, 0.06)) + k) for k in (-0.27, 0.0, 0.27)]
+            places = [along * (rng.uniform(-0.06, 0.06) + k) for k in (-0.27, 0.0, 0.27)]
             places = [place for place in places if rng.random() < 0.65]
             hung = []
         for place in places:
-            item = hung or _framed(
-                m.timber(), m.picture(), *map(float, rng.uniform(0.4, 0.75, 2)), 1.45, 0.05
-            )
+            width, height = rng.several(0.4, 0.75, 2)
+            item = hung or _framed(m.timber(), m.picture(), width, height, 1.45, 0.05)
             x, y = _from_wall(side, across / 2, place)
             shapes += [shape.moved(x, y, turn) for shape in item]
     return shapes
@@ -146,7 +167,7 @@ def _framed(
     ]
 
 
-def _fixed(rng: np.random.Generator, m: Materials, size: tuple[float, float, float]) -> list[Shape]:
+def _fixed(rng: Draws, m: Materials, size: tuple[float, float, float]) -> list[Shape]:
     """The rug, the skirting boards and the ceiling lamp."""
     board = m.pale()
     w, d, h = size
@@ -155,14 +176,13 @@ def _fixed(rng: np.random.Generator, m: Materials, size: tuple[float, float, flo
     ]
     shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, m.glow()))
     if rng.random() < 0.75:
-        rug = box(0, 0, 0, (*map(float, rng.uniform(0.35, 0.6, 2) * size[:2]), 0.012), m.rug())
-        shapes.append(rug.moved(*map(float, rng.uniform(-0.3, 0.3, 2)), float(rng.normal(0, 0.1))))
+        rug = box(0, 0, 0, (rng.uniform(0.35, 0.6) * w, rng.uniform(0.35, 0.6) * d, 0.012), m.rug())
+        x, y = rng.several(-0.3, 0.3, 2)
+        shapes.append(rug.moved(x, y, rng.gauss(0, 0.1)))
     return shapes
 
 
-def _lights(
-    rng: np.random.Generator, size: tuple[float, float, float], window_side: int
-) -> np.ndarray:
+def _lights(rng: Draws, size: tuple[float, float, float], window_side: int) -> np.ndarray:
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
-    lamp = (0.0, 0.0, size[2] - 0.2, float(rng.uniform(0.35, 0.55)))
-    return np.array([lamp, (x, y, 1.6, float(rng.uniform(0.4, 0.8)))])
+    lamp = (0.0, 0.0, size[2] - 0.2, rng.uniform(0.5, 0.85))
+    return np.array([lamp, (x, y, 1.6, rng.uniform(0.4, 1.0))])

@@ -14,17 +14,16 @@ from numba import njit
 
 from qgs.data.rooms import shapes as s
 from qgs.data.rooms.intersections import hit_box, hit_cylinder, hit_sphere, local, local_point
-from qgs.data.rooms.textures import OPTIONS
+from qgs.data.rooms.textures import INNER
 
-WALLS = 6  # codes 0 to 5 are walls; part p of shape i is code WALLS + PARTS * i + p
-PARTS = 3
+WALLS = 6  # codes 0 to 5 are walls; part p of shape i is code WALLS + 4 i + p
 _BOX, _SPHERE = s.BOX, s.SPHERE
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _HALF = np.float32(0.5)
 _X, _Y, _Z = np.float32(0), np.float32(2), np.float32(4)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _walls(t, code, steps, o, base, step, size):
     """Where the rays of a row leave the room, and by which face."""
     for k in range(t.shape[0]):
@@ -40,7 +39,7 @@ def _walls(t, code, steps, o, base, step, size):
         code[k] = face + (_ONE if along > _ZERO else _ZERO)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _box_row(t, code, steps, o, base, step, h, own):
     for k in range(t.shape[0]):
         x, y = base[0] + steps[k] * step[0], base[1] + steps[k] * step[1]
@@ -51,7 +50,7 @@ def _box_row(t, code, steps, o, base, step, h, own):
         code[k] = part if closer else code[k]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _sphere_row(t, code, steps, o, base, step, radius, own):
     for k in range(t.shape[0]):
         x, y = base[0] + steps[k] * step[0], base[1] + steps[k] * step[1]
@@ -61,7 +60,7 @@ def _sphere_row(t, code, steps, o, base, step, radius, own):
         code[k] = own if closer else code[k]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _cylinder_row(t, code, steps, o, base, step, radius, half, own):
     for k in range(t.shape[0]):
         x, y = base[0] + steps[k] * step[0], base[1] + steps[k] * step[1]
@@ -72,14 +71,14 @@ def _cylinder_row(t, code, steps, o, base, step, radius, half, own):
         code[k] = (own + _ONE if hit == cap else own) if closer else code[k]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _span(low, high, samples, first, count):
     """Indices of the samples between two screen coordinates, among `count` from pixel `first`."""
     low, high = (low - first) * samples - 0.5, (high - first) * samples + 0.5
     return int(min(max(low, 0.0), count)), int(min(max(high + 1, 0.0), count))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _row_base(rays, v):
     """Direction of the ray at u = 0 of row v."""
     return (
@@ -89,7 +88,7 @@ def _row_base(rays, v):
     )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def ray_basis(c2w, intrinsics):
     """(3, 3) B with d = B (1, u, v) in the world frame."""
     rays = np.empty((3, 3))
@@ -99,14 +98,16 @@ def ray_basis(c2w, intrinsics):
     return rays
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def trace(t, code, top, samples, shapes, size, bounds, c2w, rays):
     """Write t and code (R, C) float32 of a band of rays whose first pixel row is `top`.
 
     Sample (i, j) is at v = top + (i + 0.5) / samples, u = (j + 0.5) / samples.
     """
     rows, columns = t.shape
-    steps = ((np.arange(columns) + 0.5) / samples).astype(np.float32)
+    steps = np.empty(columns, np.float32)
+    for j in range(columns):
+        steps[j] = (j + 0.5) / samples
     step = (np.float32(rays[0, 1]), np.float32(rays[1, 1]), np.float32(rays[2, 1]))
     o = (np.float32(c2w[0, 3]), np.float32(c2w[1, 3]), np.float32(c2w[2, 3]))
     extent = (np.float32(size[0]), np.float32(size[1]), np.float32(size[2]))
@@ -120,7 +121,7 @@ def trace(t, code, top, samples, shapes, size, bounds, c2w, rays):
         lo = local_point(shapes, k, o[0], o[1], o[2])
         ls = local(shapes, k, step[0], step[1], step[2])
         h = (shapes[k, 4], shapes[k, 5], shapes[k, 6])
-        own = np.float32(WALLS + PARTS * k)
+        own = np.float32(WALLS + 4 * k)
         along = steps[first:last]
         for i in range(above, below):
             base = _row_base(rays, top + (i + 0.5) / samples)

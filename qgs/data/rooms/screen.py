@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from qgs.data.rooms.textures import OPTIONS
+from qgs.data.rooms.textures import INNER
 
 _PLANE = 0.02  # shapes are clipped where they come nearer to the camera's plane than this
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _corners(shapes, i, c2w, corners):
     """Write the camera-frame positions (8, 3) of the corners of the box around shape i."""
     for k in range(8):
@@ -23,14 +23,14 @@ def _corners(shapes, i, c2w, corners):
             corners[k, a] = c2w[0, a] * x + c2w[1, a] * y + c2w[2, a] * z
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _clipped(corners, points):
     """Write the corners in front of the camera, and where edges cross its plane; their number."""
     n = 0
     for k in range(8):
         z = corners[k, 2]
         if z > _PLANE:
-            points[n] = corners[k]
+            points[n, 0], points[n, 1], points[n, 2] = corners[k, 0], corners[k, 1], z
             n += 1
         for axis in range(3):
             other = k | (1 << axis)
@@ -42,7 +42,7 @@ def _clipped(corners, points):
     return n
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def screen_bounds(shapes, c2w, intrinsics):
     """(S, 4) u0, u1, v0, v1 in pixels of every shape; u0 > u1 for one behind the camera."""
     bounds = np.empty((shapes.shape[0], 4))

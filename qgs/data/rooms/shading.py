@@ -9,8 +9,8 @@ from numba import njit
 
 from qgs.data.rooms import shapes as s
 from qgs.data.rooms.intersections import local_point
-from qgs.data.rooms.raycast import PARTS, WALLS
-from qgs.data.rooms.textures import OPTIONS, SMOOTH, mixture
+from qgs.data.rooms.raycast import WALLS
+from qgs.data.rooms.textures import INNER, mixture, smooth
 
 _BOX, _SPHERE = s.BOX, s.SPHERE
 _FLOOR = 4
@@ -18,7 +18,7 @@ _FLAT = 0.03  # what lies on the floor and is lower than this shows the floor's 
 _TAKEN = np.float32(-1)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _on_wall(x, y, z, size, face):
     """Inward normal, position in metres and position in [-1, 1] on a wall, floor or ceiling."""
     if face < 2:
@@ -28,7 +28,7 @@ def _on_wall(x, y, z, size, face):
     return (0.0, 0.0, 9.0 - 2.0 * face), x, y, 2 * x / size[0], 2 * y / size[1]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _on_box(x, y, z, h, part):
     """As `_on_wall`, in the box's own frame; part is the axis of the side."""
     if part == 0:
@@ -38,7 +38,7 @@ def _on_box(x, y, z, h, part):
     return (0.0, 0.0, math.copysign(1.0, z)), x, y, x / h[0], y / h[1]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _on_round(x, y, z, h, kind, part):
     """As `_on_box`, for spheres and cylinders; part 1 is a cap."""
     if part == 1:
@@ -48,13 +48,13 @@ def _on_round(x, y, z, h, kind, part):
     return normal, angle * h[0], z, angle / math.pi, z / h[2]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _surface(shapes, size, code, x, y, z):
     """Index of the texture, world normal and the four texture coordinates of a point."""
     if code < WALLS:
         normal, u, v, p, q = _on_wall(x, y, z, size, code)
         return code, normal, u, v, p, q
-    i, part = (code - WALLS) // PARTS, (code - WALLS) % PARTS
+    i, part = (code - WALLS) >> 2, (code - WALLS) & 3
     lx, ly, lz = local_point(shapes, i, x, y, z)
     h = (float(shapes[i, 4]), float(shapes[i, 5]), float(shapes[i, 6]))
     if shapes[i, 0] == _BOX:
@@ -65,21 +65,21 @@ def _surface(shapes, size, code, x, y, z):
     return int(shapes[i, 9]), (cos * n[0] - sin * n[1], sin * n[0] + cos * n[1], n[2]), u, v, p, q
 
 
-@njit(**OPTIONS)
-def _lambert(x, y, z, normal, light):
-    """Light from a point light that falls off gently with the square of the distance."""
-    x, y, z = light[0] - x, light[1] - y, light[2] - z
+@njit(**INNER)
+def _lambert(x, y, z, normal, lights, k):
+    """Light from point light k, which falls off gently with the square of the distance."""
+    x, y, z = lights[k, 0] - x, lights[k, 1] - y, lights[k, 2] - z
     square = x * x + y * y + z * z
     cosine = (normal[0] * x + normal[1] * y + normal[2] * z) / math.sqrt(square)
-    return light[3] * max(cosine, 0.0) / (1 + 0.12 * square)
+    return lights[k, 3] * max(cosine, 0.0) / (1 + 0.12 * square)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _edge(distance):
     return 1 - 0.30 / (1 + 6 * distance) ** 2
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _wall_shadow(x, y, z, size, face):
     """Darkening of walls towards the room's edges."""
     a = 1.0 if face < 2 else _edge(0.5 * size[0] - abs(x))
@@ -88,7 +88,7 @@ def _wall_shadow(x, y, z, size, face):
     return a * b * c
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _floor_shadow(floor, x, y, size):
     """Bilinear look-up in the floor's map of shadows, (L, L) over the whole floor."""
     last = floor.shape[0] - 1
@@ -101,7 +101,7 @@ def _floor_shadow(floor, x, y, size):
     return low * (1 - a) + high * a
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _shadow(floor, size, code, x, y, z, normal):
     if code < WALLS:
         shadow = _wall_shadow(x, y, z, size, code)
@@ -111,14 +111,13 @@ def _shadow(floor, size, code, x, y, z, normal):
     return 1 - 0.4 / (1 + 3 * z) ** 2
 
 
-@njit(**OPTIONS)
-def _light(room, floor, code, x, y, z, normal):
+@njit(**INNER)
+def _light(lights, floor, size, code, x, y, z, normal):
     """RGB of the light at a point: a bright ceiling above, a warm lamp, a cool window."""
-    _, _, size, lights = room
     shadow = _shadow(floor, size, code, x, y, z, normal)
-    even = (0.40 + 0.16 * normal[2]) * shadow
-    lamp = _lambert(x, y, z, normal, lights[0]) * shadow
-    window = _lambert(x, y, z, normal, lights[1]) * shadow
+    even = (0.46 + 0.02 * normal[2]) * shadow
+    lamp = _lambert(x, y, z, normal, lights, 0) * shadow
+    window = _lambert(x, y, z, normal, lights, 1) * shadow
     return (
         even + 1.06 * lamp + 0.96 * window,
         even + lamp + window,
@@ -126,80 +125,94 @@ def _light(room, floor, code, x, y, z, normal):
     )
 
 
-@njit(**OPTIONS)
-def _mean_texture(room, texture, code, points, members, footprint):
-    """Mean weights of a texture's second and third colour over `points` (members, 3)."""
-    shapes, _, size, _ = room
-    kind, period, seed = int(texture[0]), texture[1], int(texture[2])
-    second = third = 0.0
-    for k in range(members):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        _, _, u, v, p, q = _surface(shapes, size, code, x, y, z)
-        m, n = mixture(kind, period, seed, u, v, p, q, footprint)
-        second += m * (1 - n)
-        third += n
-    return second / members, third / members
+@njit(forceinline=True, **INNER)
+def _gather(t, code, i, j, own, samples, step, top, o, rays, points):
+    """Write where those rays of the pixel that begins at ray (i, j) hit that meet surface `own`.
 
-
-@njit(**OPTIONS)
-def _gather(t, code, i, j, samples, v, u, origin, rays, points):
-    """Write where those rays of a pixel hit that meet its ray (i, j)'s surface; their number.
-
-    The last row of `points` gets the mean. The rays are marked as taken.
+    Row 0 of `points` gets the mean, the next rows the points themselves, whose number is returned.
+    The rays are marked as taken.
     """
-    own, n = code[i, j], 0
+    n = 0
+    x = y = z = 0.0
     for a in range(samples):
         for b in range(samples):
-            ia, jb = i - i % samples + a, j - j % samples + b
-            if code[ia, jb] == own:
-                code[ia, jb] = _TAKEN
-                du, dv = u + (b + 0.5) / samples, v + (a + 0.5) / samples
-                for c in range(3):
-                    d = rays[c, 0] + du * rays[c, 1] + dv * rays[c, 2]
-                    points[n, c] = origin[c] + t[ia, jb] * d
+            if code[i + a, j + b] == own:
+                code[i + a, j + b] = _TAKEN
                 n += 1
-    for c in range(3):
-        points[-1, c] = points[:n, c].sum() / n
+                u, v = (j + b + 0.5) * step, top + (i + a + 0.5) * step
+                distance = t[i + a, j + b]
+                points[n, 0] = o[0] + distance * (rays[0, 0] + u * rays[0, 1] + v * rays[0, 2])
+                points[n, 1] = o[1] + distance * (rays[1, 0] + u * rays[1, 1] + v * rays[1, 2])
+                points[n, 2] = o[2] + distance * (rays[2, 0] + u * rays[2, 1] + v * rays[2, 2])
+                x, y, z = x + points[n, 0], y + points[n, 1], z + points[n, 2]
+    points[0, 0], points[0, 1], points[0, 2] = x * (1 / n), y * (1 / n), z * (1 / n)
     return n
 
 
-@njit(**OPTIONS)
+@njit(forceinline=True, **INNER)
+def _mixed(shapes, size, textures, row, code, points, n, footprint):
+    """Mean weights of a texture's second and third colour over rows 1 to n of `points`.
+
+    A smooth texture is looked up in row 0, their mean, alone.
+    """
+    kind, period, seed = int(textures[row, 0]), textures[row, 1], int(textures[row, 2])
+    first, last = (0, 1) if smooth(kind) else (1, n + 1)
+    second = third = 0.0
+    for k in range(first, last):
+        _, _, u, v, p, q = _surface(shapes, size, code, points[k, 0], points[k, 1], points[k, 2])
+        b, c = mixture(kind, period, seed, u, v, p, q, footprint)
+        second += b * (1 - c)
+        third += c
+    return second / (last - first), third / (last - first)
+
+
+@njit(**INNER)
+def _channel(textures, row, c, weights, light):
+    """Channel c in [0, 1] of a lit texture."""
+    a = textures[row, 4 + c]
+    value = a + weights[0] * (textures[row, 7 + c] - a) + weights[1] * (textures[row, 10 + c] - a)
+    return min(value * (light + (1 - light) * textures[row, 3]), 1.0)
+
+
+@njit(forceinline=True, **INNER)
+def _shade(room, floor, code, points, n, footprint):
+    """n times the RGB in [0, 1] of a surface seen at rows 1 to n of `points`."""
+    shapes, textures, size, lights = room
+    x, y, z = points[0, 0], points[0, 1], points[0, 2]
+    row, normal, _, _, _, _ = _surface(shapes, size, code, x, y, z)
+    weights = _mixed(shapes, size, textures, row, code, points, n, footprint)
+    light = _light(lights, floor, size, code, x, y, z, normal)
+    return (
+        n * _channel(textures, row, 0, weights, light[0]),
+        n * _channel(textures, row, 1, weights, light[1]),
+        n * _channel(textures, row, 2, weights, light[2]),
+    )
+
+
+@njit(**INNER)
 def paint(image, t, code, top, samples, room, floor, c2w, rays):
     """Write image (rows, W, 3) uint8, a band that begins at row `top`, and use `code` up.
 
     Rays of a pixel that meet one surface share their light, and their texture if it is smooth.
     """
-    shapes, textures, size, _ = room
+    o = (c2w[0, 3], c2w[1, 3], c2w[2, 3])
     points = np.empty((samples * samples + 1, 3))
-    total = np.empty(3)
-    spread = math.sqrt(rays[0, 1] ** 2 + rays[1, 1] ** 2 + rays[2, 1] ** 2) / samples
+    step = 1.0 / samples
+    gain = 255.0 * step * step
+    spread = step * math.sqrt(rays[0, 1] ** 2 + rays[1, 1] ** 2 + rays[2, 1] ** 2)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
-            total[:] = 0.5
-            for k in range(samples * samples):
-                i, j = row * samples + k // samples, column * samples + k % samples
-                own = int(code[i, j])
-                if own < 0:
-                    continue
-                n = _gather(t, code, i, j, samples, top + row, column, c2w[:3, 3], rays, points)
-                x, y, z = points[-1, 0], points[-1, 1], points[-1, 2]
-                index, normal, _, _, _, _ = _surface(shapes, size, own, x, y, z)
-                texture = textures[index]
-                smooth = SMOOTH[int(texture[0])]
-                m = _mean_texture(
-                    room,
-                    texture,
-                    own,
-                    points[-1:] if smooth else points,
-                    1 if smooth else n,
-                    t[i, j] * spread,
-                )
-                light = _light(room, floor, own, x, y, z, normal)
-                gain = 255.0 * n / (samples * samples)
-                for c in range(3):
-                    a, b, e = texture[4 + c], texture[7 + c], texture[10 + c]
-                    value = a + m[0] * (b - a) + m[1] * (e - a)
-                    lit = light[c] + (1 - light[c]) * texture[3]
-                    total[c] += gain * min(lit * value, 1.0)
-            for c in range(3):
-                image[row, column, c] = int(total[c])
+            red = green = blue = 0.0
+            i, j = row * samples, column * samples
+            for a in range(samples):
+                for b in range(samples):
+                    own = code[i + a, j + b]
+                    if own == _TAKEN:
+                        continue
+                    n = _gather(t, code, i, j, own, samples, step, top, o, rays, points)
+                    footprint = spread * t[i + a, j + b]
+                    color = _shade(room, floor, int(own), points, n, footprint)
+                    red, green, blue = red + color[0], green + color[1], blue + color[2]
+            image[row, column, 0] = int(gain * red + 0.5)
+            image[row, column, 1] = int(gain * green + 0.5)
+            image[row, column, 2] = int(gain * blue + 0.5)

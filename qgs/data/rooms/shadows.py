@@ -8,17 +8,21 @@ import numpy as np
 from numba import njit
 
 from qgs.data.rooms.intersections import hit
-from qgs.data.rooms.textures import OPTIONS
+from qgs.data.rooms.textures import INNER, OPTIONS
+
+_SHADOW = 0.36  # how much of the light the lamp's shadow takes
+_UNDER = np.float32(-1)
+_UP = (np.float32(0), np.float32(0), np.float32(10))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _extent(shapes, i):
     """Half extents of shape i's bounding box along the world's x and y."""
     cos, sin = abs(shapes[i, 7]), abs(shapes[i, 8])
     return cos * shapes[i, 4] + sin * shapes[i, 5], sin * shapes[i, 4] + cos * shapes[i, 5]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _range(low, high, extent, cells):
     """Indices of the map's cells between two world coordinates."""
     first = math.floor((low / extent + 0.5) * (cells - 1))
@@ -26,7 +30,7 @@ def _range(low, high, extent, cells):
     return max(first, 0), min(last, cells)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _darken(darkness, shapes, s, size, lamp):
     """Add the shadow that shape s throws from the lamp, and the dimness right below it."""
     cells = darkness.shape[0]
@@ -41,27 +45,27 @@ def _darken(darkness, shapes, s, size, lamp):
     y1 = max(shapes[s, 2] + ey, lamp[1] + (shapes[s, 2] + ey - lamp[1]) * reach)
     i0, i1 = _range(x0, x1, size[0], cells)
     j0, j1 = _range(y0, y1, size[1], cells)
+    source = (np.float32(lamp[0]), np.float32(lamp[1]), np.float32(lamp[2]))
     below = 0.55 * math.exp(-3 * bottom)
     for i in range(i0, i1):
         x = (i / (cells - 1) - 0.5) * size[0]
         for j in range(j0, j1):
             y = (j / (cells - 1) - 0.5) * size[1]
             dark = 0.0
-            if hit(shapes, s, (x, y, -1.0), (0.0, 0.0, 10.0)) < 1.0:
+            under = (np.float32(x), np.float32(y), _UNDER)
+            if hit(shapes, s, under, _UP) < 1:
                 dark = below
-            if (
-                hit(shapes, s, (lamp[0], lamp[1], lamp[2]), (x - lamp[0], y - lamp[1], -lamp[2]))
-                < 1
-            ):
-                dark = max(dark, 0.32)
+            ray = (np.float32(x - lamp[0]), np.float32(y - lamp[1]), np.float32(-lamp[2]))
+            if hit(shapes, s, source, ray) < 1:
+                dark = max(dark, _SHADOW)
             darkness[i, j] = max(darkness[i, j], dark)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _blurred(values):
     """Mean over 3 x 3 cells."""
     last = values.shape[0] - 1
-    result = np.empty_like(values)
+    result = np.empty(values.shape)
     for i in range(values.shape[0]):
         for j in range(values.shape[0]):
             total = 0.0

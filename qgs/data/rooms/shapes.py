@@ -39,6 +39,14 @@ class Shape(NamedTuple):
         center = (x + cos * cx - sin * cy, y + sin * cx + cos * cy, cz)
         return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
 
+    def bounds(self) -> tuple[float, float, float, float, float, float]:
+        """Lowest x, y, z and highest x, y, z."""
+        (x, y, z), (a, b, c) = self.center, self.half
+        if self.turn:
+            cos, sin = abs(math.cos(self.turn)), abs(math.sin(self.turn))
+            a, b = cos * a + sin * b, sin * a + cos * b
+        return x - a, y - b, z - c, x + a, y + b, z + c
+
     def row(self) -> tuple[float, ...]:
         """The `SHAPE_FIELDS` numbers of the ray caster."""
         turned = (math.cos(self.turn), math.sin(self.turn))

@@ -14,7 +14,8 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from qgs.contracts import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.contracts import Scene, SceneSource, Split
+from qgs.data.rooms.draws import Draws
 from qgs.data.rooms.layout import furnish
 from qgs.data.rooms.path import camera_path
 from qgs.data.rooms.shapes import Room
@@ -24,7 +25,7 @@ _BAND = 64  # rows of an image that one thread casts at a time
 _SHADOW_CELLS = 80
 
 
-class RoomsConfig(SceneSourceConfig):
+class RoomsConfig(SceneSource.Config):
     """Options of `qgs/rooms`.
 
     scenes, test_scenes: rooms of the two splits; no room is in both. views_per_scene: cameras on
@@ -76,7 +77,7 @@ class RoomScene(Scene):
         self.name = f"{split}/{index:06d}"
         self._config, self._cache = config, cache
         rng = np.random.default_rng([config.seed, 0 if split == "train" else 1, index])
-        self._layout_rng, camera_rng = rng.spawn(2)
+        self._layout_seed, camera_rng = int(rng.integers(1 << 62)), rng
         sizes = camera_rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
         self._c2w = camera_path(camera_rng, self.size, config.views_per_scene)
@@ -97,7 +98,7 @@ class RoomScene(Scene):
     @cached_property
     def room(self) -> Room:
         """The furnished room."""
-        return furnish(self._layout_rng, self.size, self._c2w[:, :3, 3])
+        return furnish(Draws(self._layout_seed), self.size, self._c2w[:, :3, 3])
 
     @cached_property
     def _floor(self) -> np.ndarray:
@@ -158,7 +159,8 @@ class RoomScenes(Sequence[Scene]):
     """The rooms of a split, made when they are asked for."""
 
     def __init__(self, config: RoomsConfig, split: Split, count: int, cache: ImageCache) -> None:
-        self._config, self._split, self._count, self._cache = config, split, count, cache
+        self._config, self._count, self._cache = config, count, cache
+        self._split: Split = split
 
     def __len__(self) -> int:
         return self._count
@@ -169,7 +171,7 @@ class RoomScenes(Sequence[Scene]):
     def __getitem__(self, index: slice) -> Sequence[Scene]: ...
     def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
         if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(self._count))]
+            return [self[i] for i in range(self._count)[index]]
         if not -self._count <= index < self._count:
             raise IndexError(f"room {index} of {self._count}")
         return RoomScene(self._config, self._split, index % self._count, self._cache)
@@ -189,10 +191,9 @@ class RoomsSource(SceneSource):
                 "`pip install qgs[cpu]`"
             )
         cache = ImageCache(config.cache_mb * 2**20)
-        self._scenes: dict[Split, RoomScenes] = {
-            "train": RoomScenes(config, "train", config.scenes, cache),
-            "test": RoomScenes(config, "test", config.test_scenes, cache),
-        }
+        train = RoomScenes(config, "train", config.scenes, cache)
+        test = RoomScenes(config, "test", config.test_scenes, cache)
+        self._scenes: dict[Split, RoomScenes] = {"train": train, "test": test}
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`."""

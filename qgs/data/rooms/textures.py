@@ -14,14 +14,14 @@ OPTIONS = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "arcp", "nsz"},
 }
+INNER = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # called by kernels alone
 
 PLAIN, CHECKER, STRIPES, PLANKS, TILES = s.PLAIN, s.CHECKER, s.STRIPES, s.PLANKS, s.TILES
 BRICKS, CLOUDS, GRADIENT, PICTURE = s.BRICKS, s.CLOUDS, s.GRADIENT, s.PICTURE
 RUG, WINDOW, DOTS, BOOKS = s.RUG, s.WINDOW, s.DOTS, s.BOOKS
-SMOOTH = tuple(kind in (PLAIN, CLOUDS, GRADIENT) for kind in range(13))  # without edges inside
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _hash(i, j, seed):
     """A number in [0, 1) for each lattice point."""
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
@@ -29,7 +29,7 @@ def _hash(i, j, seed):
     return (h ^ (h >> 16)) / 4294967296.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _noise(x, y, seed):
     """Value noise in [0, 1] with unit period."""
     i, j = math.floor(x), math.floor(y)
@@ -40,14 +40,14 @@ def _noise(x, y, seed):
     return low * (1 - b) + high * b
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _seam(x, width):
     """1 within `width` of an integer, 0 elsewhere."""
     f = x - math.floor(x)
     return 1.0 if f < width or f > 1 - width else 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _grid(x, y, shift, seed, softness):
     """Tiles of unit size: a tone for each, and the joints between them."""
     row = math.floor(y)
@@ -56,7 +56,7 @@ def _grid(x, y, shift, seed, softness):
     return tone, softness * max(_seam(x, 0.03), _seam(y, 0.03 * (1 + 2 * shift)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _planks(x, y, seed, fade):
     board = math.floor(x)
     along = y * 0.16 + 7.0 * _hash(board, 3, seed)
@@ -65,7 +65,7 @@ def _planks(x, y, seed, fade):
     return tone, fade * max(_seam(x, 0.03), _seam(along, 0.005))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _picture(p, q, seed):
     """A landscape: hills under a sky with a sun."""
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
@@ -80,7 +80,7 @@ def _picture(p, q, seed):
     return 0.25 - 0.25 * q, 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _rug(p, q, u, v, period, seed):
     edge = min(1 - abs(p), 1 - abs(q))
     if edge < 0.06 or 0.14 < edge < 0.18:
@@ -97,7 +97,7 @@ def _rug(p, q, u, v, period, seed):
     return (0.7 if diamond < 0.28 else 0.0) + 0.15 * _noise(6 * x, 6 * y, seed), 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _window(p, q, seed):
     if abs(p) < 0.03 or abs(q - 0.25) < 0.025 or abs(p) > 0.94 or abs(q) > 0.95:
         return 0.0, 1.0
@@ -107,7 +107,13 @@ def _window(p, q, seed):
     return 0.3 * _noise(2 * p, 3 * q, seed), 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
+def smooth(kind):
+    """Whether a texture has no edges inside."""
+    return kind in (PLAIN, CLOUDS, GRADIENT)
+
+
+@njit(**INNER)
 def mixture(kind, period, seed, u, v, p, q, footprint):
     """Weights (m, n): the colour is lerp(lerp(a, b, m), c, n).
 
