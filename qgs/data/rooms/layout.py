@@ -184,5 +184,5 @@ def _fixed(rng: Draws, m: Materials, size: tuple[float, float, float]) -> list[S
 
 def _lights(rng: Draws, size: tuple[float, float, float], window_side: int) -> np.ndarray:
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
-    lamp = (0.0, 0.0, size[2] - 0.2, rng.uniform(0.5, 0.85))
-    return np.array([lamp, (x, y, 1.6, rng.uniform(0.4, 1.0))])
+    lamp = (0.0, 0.0, size[2] - 0.2, rng.uniform(0.55, 0.95))
+    return np.array([lamp, (x, y, 1.6, rng.uniform(0.45, 1.2))])

@@ -109,7 +109,7 @@ class Materials:
     def wall(self) -> int:
         """Paint, wallpaper or brick."""
         rng = self.rng
-        color = self.color((0.04, 0.5), (0.45, 0.95))
+        color = self.color((0.04, 0.5), (0.5, 1.0))
         pick = rng.random()
         if pick < 0.12:
             brick = (rng.uniform(0.5, 0.7), 0.35, 0.27)

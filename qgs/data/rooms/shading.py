@@ -115,7 +115,7 @@ def _shadow(floor, size, code, x, y, z, normal):
 def _light(lights, floor, size, code, x, y, z, normal):
     """RGB of the light at a point: a bright ceiling above, a warm lamp, a cool window."""
     shadow = _shadow(floor, size, code, x, y, z, normal)
-    even = (0.46 + 0.02 * normal[2]) * shadow
+    even = (0.56 - 0.12 * normal[2]) * shadow
     lamp = _lambert(x, y, z, normal, lights, 0) * shadow
     window = _lambert(x, y, z, normal, lights, 1) * shadow
     return (
