@@ -2,6 +2,7 @@
 
 Sources: TokenGS release (gap, targets from the span of the inputs, pose normalisation, mirroring).
 Everything here is a pure function of its arguments and of the random generator it is given.
+Images are moved by NumPy, on one thread: torch's would wait for cores that training holds.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def make_sample(
     frames = (*input_frames, *target_frames)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
-    images = scene.images(wanted)[[place[frame] for frame in frames]]
+    images = torch.from_numpy(scene.images(wanted).numpy()[[place[frame] for frame in frames]])
     cameras = scene.cameras[list(frames)]
     c2w = normalised(cameras.c2w, len(input_frames), views, scene.name)
     both = Views(images[None], Cameras(c2w[None], cameras.intrinsics[None], cameras.size))
@@ -154,7 +155,8 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    return Views(views.images.flip(-1), flipped)
+    images = np.ascontiguousarray(views.images.numpy()[..., ::-1])
+    return Views(torch.from_numpy(images), flipped)
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
@@ -172,4 +174,5 @@ def _stack(views: Sequence[Views]) -> Views:
         torch.cat([v.cameras.intrinsics for v in views]),
         views[0].cameras.size,
     )
-    return Views(torch.cat([v.images for v in views]), cameras)
+    images = np.concatenate([v.images.numpy() for v in views])
+    return Views(torch.from_numpy(images), cameras)

@@ -8,7 +8,7 @@ import numpy as np
 
 EYE = (1.25, 1.65)  # metres above the floor
 WALL = 0.45  # least distance from a camera to a wall
-TRAVEL = (0.7, 1.3)  # metres from the first to the last camera
+TRAVEL = (0.65, 1.2)  # metres from the first to the last camera
 
 
 def camera_path(
