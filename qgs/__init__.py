@@ -8,6 +8,7 @@ qgs.save(model, path); model = qgs.load(path)
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
 
 __version__ = "0.1.0"
+
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+"""PyTorch then asks for huge pages for large CPU tensors, if it has not allocated any yet: with 4 KiB
+pages, address translation takes a tenth of a forward pass. Set the variable to 0 to refuse."""
 
 _PUBLIC = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
