@@ -13,10 +13,11 @@ import statistics
 import time
 from pathlib import Path
 
+import qgs  # first: it asks for huge pages before torch allocates
+
+# isort: split
 import torch
 from torch.profiler import ProfilerActivity, profile
-
-import qgs
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SIZE = [
