@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
-"""PyTorch's CPU allocator then asks for huge pages for large tensors, if `qgs` is imported before it
+"""PyTorch's CPU allocator then asks for huge pages for large tensors, if qgs is imported before it
 has allocated any; with 4 KiB pages a forward pass takes some 5 % longer. Set it to 0 to refuse."""
 
 _PUBLIC = {
