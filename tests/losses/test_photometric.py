@@ -100,11 +100,21 @@ def test_a_term_of_weight_zero_is_left_out(golden: dict[str, Tensor]) -> None:
     assert set(terms_of(rgb, truth, mse_weight=0.0)) == {"ssim"}
 
 
-@pytest.mark.parametrize(("padding", "size"), [("same", 5), ("valid", 10)])
-def test_images_smaller_than_the_window_are_refused(padding: str, size: int) -> None:
-    images = torch.rand(1, 1, 3, size, 16)
-    with pytest.raises(ValueError, match=rf"padding '{padding}' .*got {size}x16"):
-        terms_of(images, images, padding=padding)
+def test_the_ssim_term_of_the_golden_file(golden: dict[str, Tensor], truth: Tensor) -> None:
+    rgb = golden["images_pred"]
+    ssim_term = terms_of(rgb, truth, ssim_weight=1.0)["ssim"]
+    torch.testing.assert_close(ssim_term, golden["expected.locusgs.refssim.loss_ssim"], **TOLERANCE)
+    torch.testing.assert_close(ssim_term, golden["expected.tokengs.refssim.loss_ssim"], **TOLERANCE)
+    for scene in range(2):
+        alone = terms_of(rgb[scene : scene + 1], truth[scene : scene + 1], ssim_weight=1.0)["ssim"]
+        expected = golden["expected.locusgs.refssim.loss_ssim_per_scene"][scene]
+        torch.testing.assert_close(alone, expected, **TOLERANCE)
+
+
+def test_images_smaller_than_a_valid_window_are_refused() -> None:
+    images = torch.rand(1, 1, 3, 10, 16)
+    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 16"):
+        terms_of(images, images, padding="valid")
 
 
 def test_published_psnr_is_the_mean_over_views(golden: dict[str, Tensor], truth: Tensor) -> None:
