@@ -1,6 +1,6 @@
 """SSIM for training: the two passes of its Gaussian window as matrix products.
 
-Faster on a CPU than depthwise convolutions, and padded as the releases pad. Scores are reported with
+Faster on a CPU than depthwise convolutions, and padded as the releases pad. What is reported is
 `qgs.metrics.ssim`.
 """
 
