@@ -1,31 +1,34 @@
-"""`qgs/cpu`: tiles of 16 x 16 pixels in numba, projection in autograd."""
+"""`qgs/cpu`: projection and tiles of 16 x 16 pixels in numba, fused in one autograd function."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from qgs.contracts import Renderer, RendererConfig
 from qgs.renderers.inputs import background_of, check_inputs, raise_precision
-from qgs.renderers.projection import Splats, project
+from qgs.renderers.projection import CLAMP_MARGIN
 from qgs.renderers.reference import resolve
 from qgs.types import Cameras, Gaussians, Rendering
 
 _TILE = 16
+_CHUNK = 512  # Gaussians per unit of the projection
 _MIN_UNITS = 8  # units of work per call, so that a few large images still fill a few cores
 
 
 class CpuRenderer(Renderer):
     """Fast on a CPU; the same bits on every run, whatever the number of threads.
 
-    Rasterises in float32 on `torch.get_num_threads()` threads. float64 inputs are projected in
-    float64 and come back in float64, at float32 accuracy.
+    Computes in float32 on `torch.get_num_threads()` threads; float64 inputs come back in float64,
+    at float32 accuracy. Gradients cannot be differentiated again.
     """
 
     name = "cpu"
@@ -51,82 +54,102 @@ class CpuRenderer(Renderer):
         config = self.config
         with torch.autocast("cpu", enabled=False):
             gaussians, cameras = raise_precision(gaussians, cameras)
-            splats = project(gaussians, cameras, config.near, config.far, config.dilation)
-            sums = _Rasterise.apply(
-                _packed(splats, gaussians.opacities.detach(), config.alpha_min),
-                gaussians.opacities.float(),
-                gaussians.colors.float(),
-                cameras.size,
-                (config.alpha_min, config.alpha_cap, config.transmittance_min),
-            )
+            inputs = (
+                gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities,
+                gaussians.colors, cameras.c2w, cameras.intrinsics,
+            )  # fmt: skip
+            sums = _Splat.apply(*(tensor.float() for tensor in inputs), cameras.size, config)
             backdrop = background_of(background, config.background, gaussians.means)
             return resolve(sums.to(gaussians.means.dtype), backdrop)
 
 
-def _packed(splats: Splats, opacities: Tensor, alpha_min: float) -> Tensor:
-    """Rows (B, V, G, 8) of the kernels: u, v, conic, depth, half extents.
-
-    A contribution reaches alpha_min where the Mahalanobis distance is sqrt(2 ln(opacity /
-    alpha_min)); half a pixel is added against rounding.
-    """
-    reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt()[:, None, :, None]
-    extents = reach * splats.deviations + 0.5
-    seen = splats.visible & (opacities >= alpha_min)[:, None]
-    extents = torch.where(seen[..., None], extents, 0.0)
-    fields = [splats.means, splats.conics, splats.depths[..., None], extents]
-    return torch.cat([field.float() for field in fields], -1)
-
-
-class _Rasterise(torch.autograd.Function):
-    """Rows (B, V, G, 8), opacities (B, G), colors (B, G, 3) -> sums (B, V, 5, H, W)."""
+class _Splat(torch.autograd.Function):
+    """means, scales, quats, opacities, colors, c2w, intrinsics -> sums (B, V, 5, H, W)."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        splats: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        size: tuple[int, int],
-        options: tuple[float, float, float],
-    ) -> Tensor:
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
         from qgs.renderers import cpu_kernels as kernels
+        from qgs.renderers.cpu_projection import project_unit
 
-        splats, opacities, colors = splats.contiguous(), opacities.contiguous(), colors.contiguous()
-        sums = splats.new_empty((*splats.shape[:2], kernels.SUMS, *size))
-        scene, out = _arrays(splats, opacities, colors), sums.detach().numpy()
-        limits = _float32(options)
+        *tensors, size, config = inputs
+        tensors = [tensor.contiguous() for tensor in tensors]
+        means, scales, quats, opacities, colors, c2w, lenses = _arrays(*tensors)
+        (batch, views), count = c2w.shape[:2], means.shape[1]
+        splats = tensors[0].new_empty((batch, views, count, kernels.SPLAT_FIELDS))
+        sums = splats.new_empty((batch, views, kernels.SUMS, *size))
+        rows, out = _arrays(splats, sums)
+        projection, blending = _limits(config)
 
-        def unit(image: tuple[int, int], rows: tuple[int, int], part: int) -> None:
-            kernels.forward_unit(*_of(scene, image), rows, limits, out[image])
+        def project(scene: int, bounds: tuple[int, int], part: int) -> None:
+            project_unit(
+                means[scene], scales[scene], quats[scene], opacities[scene],
+                c2w[scene], lenses[scene], bounds, _float32(size), projection, rows[scene],
+            )  # fmt: skip
 
-        _run(unit, splats.shape[:2], size)
-        ctx.save_for_backward(splats, opacities, colors, sums)
-        ctx.options = options
+        def blend(image: tuple[int, int], stripe: tuple[int, int], part: int) -> None:
+            scene = opacities[image[0]], colors[image[0]]
+            kernels.forward_unit(rows[image], *scene, stripe, blending, out[image])
+
+        with _workers() as run:
+            run(project, _scene_units(batch, count))
+            run(blend, _image_units(batch, views, size[0]))
+        ctx.save_for_backward(*tensors, splats, sums)
+        ctx.config = config
         return sums
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         from qgs.renderers import cpu_kernels as kernels
+        from qgs.renderers.cpu_projection import CAMERA_GRADIENTS, project_backward_unit
 
-        splats, opacities, colors, sums = ctx.saved_tensors
-        batch, views, count = splats.shape[:3]
-        size = sums.shape[-2:]
-        parts = len(_stripes(batch * views, size[0]))
-        grads = splats.new_zeros((batch, views, parts, count, kernels.GRADIENTS))
-        scene, out = _arrays(splats, opacities, colors), grads.numpy()
-        values, given = sums.detach().numpy(), slopes[0].contiguous().numpy()
-        limits = _float32(ctx.options)
+        saved = ctx.saved_tensors
+        means, scales, quats, opacities, colors, c2w, lenses, rows, sums = _arrays(*saved)
+        (batch, views, count), size = rows.shape[:3], sums.shape[-2:]
+        stripes, units = _image_units(batch, views, size[0]), _scene_units(batch, count)
+        parts = 1 + max((part for *_, part in stripes), default=0)
+        chunks = 1 + max((part for *_, part in units), default=0)
+        grads = saved[0].new_zeros((batch, views, parts, count, kernels.GRADIENTS)).numpy()
+        given = slopes[0].contiguous().numpy()
+        of_inputs = [torch.empty_like(tensor) for tensor in saved[:5]]
+        of_means, of_scales, of_quats, of_opacities, of_colors = _arrays(*of_inputs)
+        of_cameras = torch.zeros((batch, chunks, views, CAMERA_GRADIENTS), dtype=torch.float64)
+        camera_parts, wants_cameras = of_cameras.numpy(), any(ctx.needs_input_grad[5:7])
+        projection, blending = _limits(ctx.config)
 
-        def unit(image: tuple[int, int], rows: tuple[int, int], part: int) -> None:
+        def blend(image: tuple[int, int], stripe: tuple[int, int], part: int) -> None:
+            scene = opacities[image[0]], colors[image[0]]
             kernels.backward_unit(
-                *_of(scene, image), rows, limits, values[image], given[image], out[image][part]
+                rows[image], *scene, stripe, blending, sums[image], given[image], grads[image][part]
             )
 
-        _run(unit, (batch, views), size)
-        grads = grads.sum(2) if parts > 1 else grads[:, :, 0]
-        no_extent = torch.nn.functional.pad(grads[..., :6], (0, 2))
-        shared = grads[..., 6:].sum(1)
-        return no_extent, shared[..., 0], shared[..., 1:], None, None
+        def project(scene: int, bounds: tuple[int, int], part: int) -> None:
+            project_backward_unit(
+                means[scene], scales[scene], quats[scene], c2w[scene], lenses[scene], bounds,
+                _float32(size), projection, rows[scene], grads[scene], wants_cameras,
+                of_means[scene], of_scales[scene], of_quats[scene], of_opacities[scene],
+                of_colors[scene], camera_parts[scene, part],
+            )  # fmt: skip
+
+        with _workers() as run:
+            run(blend, stripes)
+            run(project, units)
+        cameras = _camera_gradients(of_cameras.sum(1)) if wants_cameras else (None, None)
+        return *of_inputs, *cameras, None, None
+
+
+def _camera_gradients(found: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of c2w (B, V, 4, 4) and intrinsics (B, V, 4) from the kernels' (B, V, 16)."""
+    rotation, position, lens = found.float().split([9, 3, 4], -1)
+    pose = torch.cat([rotation.unflatten(-1, (3, 3)), position[..., None]], -1)
+    return torch.nn.functional.pad(pose, (0, 0, 0, 1)), lens
+
+
+def _limits(config: RendererConfig) -> tuple[Any, Any]:
+    """The kernels' options: those of the projection and those of the blending."""
+    projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN)
+    blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
+    return _float32(projection), _float32(blending)
 
 
 def _float32(options: tuple[float, ...]) -> tuple[Any, ...]:
@@ -139,9 +162,27 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
     return tuple(tensor.detach().numpy() for tensor in tensors)
 
 
-def _of(scene: tuple[Any, ...], image: tuple[int, int]) -> tuple[Any, Any, Any]:
-    splats, opacities, colors = scene
-    return splats[image], opacities[image[0]], colors[image[0]]
+def _scene_units(batch: int, count: int) -> list[tuple[int, tuple[int, int], int]]:
+    """Scene, range of Gaussians, number of the range."""
+    starts = range(0, count, _CHUNK)
+    return [
+        (b, (start, min(start + _CHUNK, count)), part)
+        for b in range(batch)
+        for part, start in enumerate(starts)
+    ]
+
+
+def _image_units(
+    batch: int, views: int, height: int
+) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
+    """Scene and view, range of tile rows, number of the range."""
+    stripes = _stripes(batch * views, height)
+    return [
+        ((b, v), rows, part)
+        for b in range(batch)
+        for v in range(views)
+        for part, rows in enumerate(stripes)
+    ]
 
 
 def _stripes(images: int, height: int) -> list[tuple[int, int]]:
@@ -152,23 +193,15 @@ def _stripes(images: int, height: int) -> list[tuple[int, int]]:
     return list(pairwise(edges))
 
 
-def _run(
-    unit: Callable[[tuple[int, int], tuple[int, int], int], None],
-    images: tuple[int, ...],
-    size: tuple[int, ...],
-) -> None:
-    """Run every unit of work; each writes to memory of its own, so their order does not matter."""
-    batch, views = images
-    work = [
-        ((b, v), rows, part)
-        for b in range(batch)
-        for v in range(views)
-        for part, rows in enumerate(_stripes(batch * views, size[0]))
-    ]
-    threads = min(torch.get_num_threads(), len(work))
-    if threads <= 1:
-        for item in work:
-            unit(*item)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda item: unit(*item), work))
+@contextmanager
+def _workers() -> Iterator[Callable[[Callable[..., None], Sequence[tuple[Any, ...]]], None]]:
+    """`run(unit, work)` calls `unit(*item)` for every item, on as many threads as torch uses.
+
+    Every unit of work writes to memory of its own, so their order does not matter.
+    """
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+
+        def run(unit: Callable[..., None], work: Sequence[tuple[Any, ...]]) -> None:
+            list(pool.map(lambda item: unit(*item), work))
+
+        yield run

@@ -17,31 +17,14 @@ dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numba import njit
+
+from qgs.renderers.jit import kernel
 
 TILE = 16
 SPLAT_FIELDS = 8
 SUMS = 5
 GRADIENTS = 10  # of u, v, xx, xy, yy, depth, opacity, r, g, b
-
-_OPTIONS = {
-    "nogil": True,
-    "error_model": "numpy",  # no branch on a division by zero
-    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-}
-
-
-def _kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` on first use, kept on disk where there is a place that can be written."""
-    try:
-        return njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # numba found none
-        return njit(**_OPTIONS)(function)
-
 
 _LANES = np.uint64(TILE)
 _ROW = 9 * TILE  # floats per row of a tile
@@ -57,7 +40,7 @@ _C0, _C1, _C2, _C3, _C4, _C5 = (
 )
 
 
-@_kernel
+@kernel
 def _exp2(x):
     """2^x for float32 x in [-126, 0]."""
     whole = np.floor(x)
@@ -67,7 +50,7 @@ def _exp2(x):
     return mantissa * exponent.view(np.float32)
 
 
-@_kernel
+@kernel
 def _by_depth(splats, top, bottom, width):
     """Indices of the splats that touch rows [top, bottom) of the image, by ascending depth.
 
@@ -102,7 +85,7 @@ def _by_depth(splats, top, bottom, width):
     return order[:n]
 
 
-@_kernel
+@kernel
 def _touching_rows(order, splats, top, bottom, out):
     """Copy to `out` the splats of `order` that touch rows [top, bottom); return how many."""
     n = 0
@@ -114,7 +97,7 @@ def _touching_rows(order, splats, top, bottom, out):
     return n
 
 
-@_kernel
+@kernel
 def _open(state, live, rows, columns):
     """Start a tile: transmittance 1 in lane block 0, 1 in block 1 for pixels inside the image."""
     state[:] = _ZERO
@@ -126,7 +109,7 @@ def _open(state, live, rows, columns):
             state[base + TILE + lane] = _ONE if row < rows and lane < columns else _ZERO
 
 
-@_kernel
+@kernel
 def _close_rows(state, live):
     """Mark rows in which every pixel has stopped; return whether any row is still open."""
     any_live = False
@@ -140,7 +123,7 @@ def _close_rows(state, live):
     return any_live
 
 
-@_kernel
+@kernel
 def _blend_row(state, base, dx0, linear, quadratic, constant, opacity, r, g, b, z, options):
     """Blend a splat into one row. power(dx) = (quadratic dx + linear) dx + constant, in base 2."""
     alpha_min, alpha_cap, transmittance_min = options
@@ -162,7 +145,7 @@ def _blend_row(state, base, dx0, linear, quadratic, constant, opacity, r, g, b, 
         state[i + np.uint64(6) * _LANES] += weight
 
 
-@_kernel
+@kernel
 def _row_span(v, ey, top):
     """The rows of the tile at `top` whose pixel centres lie within `ey` of `v`."""
     first = max(0, int(np.ceil(v - ey - top - _HALF)))
@@ -170,7 +153,7 @@ def _row_span(v, ey, top):
     return first, last
 
 
-@_kernel
+@kernel
 def forward_unit(splats, opacities, colors, tile_rows, options, sums):
     """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 8)."""
     height, width = sums.shape[1:]
@@ -216,7 +199,7 @@ def forward_unit(splats, opacities, colors, tile_rows, options, sums):
                         sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
 
 
-@_kernel
+@kernel
 def _backward_row(
     state, base, totals, dx0, dy, linear, quadratic, constant, opacity, r, g, b, z, options
 ):
@@ -259,7 +242,7 @@ def _backward_row(
         totals[lane + np.uint64(9) * _LANES] += weight * g_b
 
 
-@_kernel
+@kernel
 def _add_gradients(totals, xx, xy, yy, opacity, out):
     """Reduce the lanes of `totals` and add one splat's gradients to `out` (10,)."""
     t = np.empty(GRADIENTS, np.float32)
@@ -279,7 +262,7 @@ def _add_gradients(totals, xx, xy, yy, opacity, out):
         out[7 + channel] += t[7 + channel]
 
 
-@_kernel
+@kernel
 def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
     """Put sum_j w_j v_j of a tile in block 2, dL/dsums in blocks 3 to 7, depth in block 8.
 
@@ -302,7 +285,7 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
             state[base + 8 * TILE] = depth
 
 
-@_kernel
+@kernel
 def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out):
     """Add the gradients of the unit that `forward_unit` rendered to `out` (G, 10).
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from qgs.geometry.rotations import quat_to_matrix
 from qgs.types import Cameras, Gaussians
 
-_CLAMP_MARGIN = 0.15  # of the image's width or height: beyond it the Jacobian is held constant
+CLAMP_MARGIN = 0.15  # of the image's width or height: beyond it the Jacobian is held constant
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,6 @@ def project(
 
 
 def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tensor:
-    margin = _CLAMP_MARGIN * size
+    margin = CLAMP_MARGIN * size
     low, high = (-margin - principal) / focal, (size + margin - principal) / focal
     return torch.minimum(torch.maximum(slope, low), high)

@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,7 @@ import qgs.renderers
 import qgs.renderers.cpu
 from qgs.contracts import RendererConfig
 from qgs.renderers import COMPONENTS, CpuRenderer
+from qgs.types import Gaussians
 
 
 @pytest.fixture
@@ -38,6 +39,63 @@ def test_the_number_of_threads_changes_no_bit(make_scene, differentiate, threads
         assert torch.equal(rendering.depth, results[0][0].depth)
         for name, grad in gradients.items():
             assert torch.equal(grad, results[0][1][name]), name
+
+
+def _spread_beyond_the_borders(gaussians):
+    wide = torch.tensor([3.0, 3.0, 1.0])
+    return replace(gaussians, means=gaussians.means * wide, scales=gaussians.scales * 3)
+
+
+def _not_normalised(gaussians):
+    return replace(gaussians, quats=gaussians.quats * torch.linspace(0.1, 5, 40)[:, None])
+
+
+@pytest.mark.parametrize("change", [_spread_beyond_the_borders, _not_normalised])
+def test_the_projection_has_the_gradients_of_autograd(make_scene, differentiate, change):
+    gaussians, cameras = make_scene(batch=2, views=3)
+    gaussians = change(gaussians)
+    _, found = differentiate(CpuRenderer(RendererConfig()), gaussians, cameras)
+    exact = gaussians.to(torch.float64), cameras.to(torch.float64)
+    _, expected = differentiate(qgs.renderers.TorchRenderer(RendererConfig()), *exact)
+    for name, grad in found.items():
+        error = (grad - expected[name]).abs().max() / expected[name].abs().max()
+        assert error < 2e-5, name
+
+
+def test_more_gaussians_than_a_unit_of_work_takes(make_scene, differentiate):
+    """Repeating a scene with opacity 0 changes neither its images nor its gradients."""
+    gaussians, cameras = make_scene(batch=2, views=2, count=300)
+    fillers = replace(gaussians, opacities=gaussians.opacities * 0)
+    both = (
+        (getattr(fillers, f.name) for f in fields(fillers)),
+        (getattr(gaussians, f.name) for f in fields(gaussians)),
+    )
+    padded = Gaussians(*(torch.cat(pair, 1) for pair in zip(*both, strict=True)))
+    renderer = CpuRenderer(RendererConfig())
+    rendering, gradients = differentiate(renderer, gaussians, cameras)
+    padded_rendering, padded_gradients = differentiate(renderer, padded, cameras)
+    assert torch.equal(padded_rendering.rgb, rendering.rgb)
+    for f in fields(gaussians):
+        assert torch.equal(padded_gradients[f.name][:, 300:], gradients[f.name]), f.name
+        assert padded_gradients[f.name][:, :300].eq(0).all(), f.name
+    for name in ("c2w", "intrinsics"):
+        torch.testing.assert_close(padded_gradients[name], gradients[name])
+
+
+def test_gaussians_have_the_same_gradients_without_those_of_the_cameras(make_scene, differentiate):
+    gaussians, cameras = make_scene(views=2)
+    renderer = CpuRenderer(RendererConfig())
+    means = gaussians.means.clone().requires_grad_()
+    (alone,) = torch.autograd.grad(
+        renderer(replace(gaussians, means=means), cameras).rgb.sum(), [means]
+    )
+    poses = cameras.c2w.clone().requires_grad_()
+    together = torch.autograd.grad(
+        renderer(replace(gaussians, means=means), replace(cameras, c2w=poses)).rgb.sum(),
+        [means, poses],
+    )
+    assert torch.equal(alone, together[0])
+    assert together[1].abs().max() > 0
 
 
 def test_float64_comes_back_as_float64(make_scene):

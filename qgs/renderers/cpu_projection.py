@@ -1,0 +1,298 @@
+"""Numba kernels of `qgs/cpu`: Gaussians to splats, and the way back.
+
+The formulas are those of `projection.project`, whose autograd these kernels are tested against.
+A unit of work is a range of one scene's Gaussians in all of its views, so that gradients add up
+over the views in a fixed order. Vectors are tuples; a matrix is the tuple of its rows.
+
+With C the rotation and p the position of c2w, F = R S the factor of the covariance and m the mean,
+the camera sees C^T (m - p) and the factor C^T F.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qgs.renderers.jit import kernel
+
+CAMERA_GRADIENTS = 16  # of C by rows, p, fx, fy, cx, cy
+
+_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_SHORTEST = np.float32(1e-12)  # a quaternion's norm is at least this, as in F.normalize
+_LARGEST = np.float32(1e9)  # half extent in pixels that still converts to an integer
+
+
+@kernel
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@kernel
+def _plus(a, s, b):
+    """a + s b."""
+    return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
+
+
+@kernel
+def _times(s, a):
+    return (s * a[0], s * a[1], s * a[2])
+
+
+@kernel
+def _combine(a, rows):
+    """sum_i a_i rows_i."""
+    return _plus(_plus(_times(a[0], rows[0]), a[1], rows[1]), a[2], rows[2])
+
+
+@kernel
+def _columns(m):
+    return (
+        (m[0][0], m[1][0], m[2][0]), (m[0][1], m[1][1], m[2][1]), (m[0][2], m[1][2], m[2][2]),
+    )  # fmt: skip
+
+
+@kernel
+def _vector(array):
+    return (array[0], array[1], array[2])
+
+
+@kernel
+def _rotation(quat):
+    """Rows of the rotation matrix, the unit quaternion and the norm it was divided by."""
+    w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+    norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    rows = (
+        (_ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y)),
+        (_TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x)),
+        (_TWO * (x * z - w * y), _TWO * (y * z + w * x), _ONE - _TWO * (x * x + y * y)),
+    )
+    return rows, (w, x, y, z), norm
+
+
+@kernel
+def _scaled_columns(rows, scale):
+    """The columns of R S."""
+    columns = _columns(rows)
+    return (
+        _times(scale[0], columns[0]), _times(scale[1], columns[1]), _times(scale[2], columns[2]),
+    )  # fmt: skip
+
+
+@kernel
+def _clamp(slope, focal, principal, size, margin):
+    """`slope` held within `margin` of the image, and whether it was held."""
+    low = (-margin * size - principal) / focal
+    high = (size + margin * size - principal) / focal
+    held = min(max(slope, low), high)
+    return held, held != slope
+
+
+@kernel
+def _image_factor(turned, axis, slope, focal, z):
+    """Row `axis` of the 2 x 3 factor J W R S, from the rows of W R S."""
+    return _times(focal / z, _plus(turned[axis], -slope, turned[2]))
+
+
+@kernel
+def _turn(pose, factor_columns):
+    """Rows of C^T F."""
+    axes = _columns(pose)
+    f0, f1, f2 = factor_columns
+    return (
+        (_dot(axes[0], f0), _dot(axes[0], f1), _dot(axes[0], f2)),
+        (_dot(axes[1], f0), _dot(axes[1], f1), _dot(axes[1], f2)),
+        (_dot(axes[2], f0), _dot(axes[2], f1), _dot(axes[2], f2)),
+    )
+
+
+@kernel
+def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, limits, splats):
+    """Fill splats (V, G, 8) for the Gaussians [first, last) of one scene.
+
+    means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4).
+    size: height and width. limits: near, far, dilation, alpha_min, margin of the clamped Jacobian.
+    A contribution reaches alpha_min where the Mahalanobis distance is sqrt(2 ln(opacity /
+    alpha_min)); half a pixel is added against rounding.
+    """
+    near, far, dilation, alpha_min, margin = limits
+    for g in range(bounds[0], bounds[1]):
+        rows, _, _ = _rotation(quats[g])
+        factor = _scaled_columns(rows, _vector(scales[g]))
+        opacity = opacities[g]
+        reach = np.sqrt(max(_TWO * np.log(opacity / alpha_min), _ZERO))
+        for v in range(c2w.shape[0]):
+            pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
+            position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
+            fx, fy, cx, cy = lenses[v, 0], lenses[v, 1], lenses[v, 2], lenses[v, 3]
+            seen = _combine(_plus(_vector(means[g]), -_ONE, position), pose)
+            z = seen[2]
+            out = splats[v, g]
+            out[6] = _ZERO
+            out[7] = _ZERO
+            if not (opacity >= alpha_min and z >= near and z <= far):
+                out[5] = _ONE
+                continue
+            x, y = seen[0] / z, seen[1] / z
+            turned = _turn(pose, factor)
+            held_x, _ = _clamp(x, fx, cx, size[1], margin)
+            held_y, _ = _clamp(y, fy, cy, size[0], margin)
+            row_x = _image_factor(turned, 0, held_x, fx, z)
+            row_y = _image_factor(turned, 1, held_y, fy, z)
+            xx, xy, yy = _dot(row_x, row_x), _dot(row_x, row_y), _dot(row_y, row_y)
+            minors = _cross(row_x, row_y)
+            determinant = _dot(minors, minors) + dilation * (xx + yy) + dilation * dilation
+            out[0] = cx + fx * x
+            out[1] = cy + fy * y
+            out[5] = z
+            if not (determinant > _ZERO and determinant < np.float32(np.inf)):
+                continue
+            out[2] = (yy + dilation) / determinant
+            out[3] = -xy / determinant
+            out[4] = (xx + dilation) / determinant
+            out[6] = min(reach * np.sqrt(xx + dilation) + _HALF, _LARGEST)
+            out[7] = min(reach * np.sqrt(yy + dilation) + _HALF, _LARGEST)
+
+
+@kernel
+def _covariance_slopes(row_x, row_y, splat, given, dilation):
+    """dL/drow_x and dL/drow_y from dL/dconic = given[2:5]."""
+    xx, yy = _dot(row_x, row_x), _dot(row_y, row_y)
+    minors = _cross(row_x, row_y)
+    inverse = _ONE / (_dot(minors, minors) + dilation * (xx + yy) + dilation * dilation)
+    of_determinant = -inverse * (given[2] * splat[2] + given[3] * splat[3] + given[4] * splat[4])
+    of_xx = _TWO * (given[4] * inverse + dilation * of_determinant)
+    of_xy = -given[3] * inverse
+    of_yy = _TWO * (given[2] * inverse + dilation * of_determinant)
+    of_minors = _times(_TWO * of_determinant, minors)
+    of_row_x = _plus(_plus(_cross(row_y, of_minors), of_xx, row_x), of_xy, row_y)
+    of_row_y = _plus(_plus(_cross(of_minors, row_x), of_yy, row_y), of_xy, row_x)
+    return of_row_x, of_row_y
+
+
+@kernel
+def _axis_slopes(slope, held, is_held, focal, z, row, of_row, turned_z, of_pixel):
+    """Slopes of (camera-frame coordinate, z, focal, principal, row of W R S, its row z).
+
+    One image axis: pixel = principal + focal slope, row = focal / z (turned - held turned_z).
+    """
+    gain = focal / z
+    of_turned = _times(gain, of_row)
+    of_turned_z = _times(-held, of_turned)
+    of_held = -_dot(of_turned, turned_z)
+    of_gain = _dot(of_row, row)
+    of_focal = of_gain / focal + of_pixel * slope
+    of_principal = of_pixel
+    of_slope = focal * of_pixel
+    if is_held:  # at (border - principal) / focal
+        of_focal -= of_held * held / focal
+        of_principal -= of_held / focal
+    else:
+        of_slope += of_held
+    of_position = of_slope / z
+    of_z = -of_gain / z - of_position * slope
+    return of_position, of_z, of_focal, of_principal, of_turned, of_turned_z
+
+
+@kernel
+def _quat_slopes(quat, norm, m, out):
+    """Write dL/dquat of the raw quaternion, with m = dL/dR."""
+    w, x, y, z = quat
+    yz, zx, xy = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    s_yz, s_zx, s_xy = m[2][1] + m[1][2], m[0][2] + m[2][0], m[1][0] + m[0][1]
+    of_w = _TWO * (x * yz + y * zx + z * xy)
+    of_x = _TWO * (w * yz + y * s_xy + z * s_zx - _TWO * x * (m[1][1] + m[2][2]))
+    of_y = _TWO * (w * zx + x * s_xy + z * s_yz - _TWO * y * (m[0][0] + m[2][2]))
+    of_z = _TWO * (w * xy + x * s_zx + y * s_yz - _TWO * z * (m[0][0] + m[1][1]))
+    along = w * of_w + x * of_x + y * of_y + z * of_z if norm > _SHORTEST else _ZERO
+    out[0] = (of_w - along * w) / norm
+    out[1] = (of_x - along * x) / norm
+    out[2] = (of_y - along * y) / norm
+    out[3] = (of_z - along * z) / norm
+
+
+@kernel
+def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
+    """Add one splat's gradients to `out` (16,)."""
+    for i in range(3):
+        for j in range(3):
+            out[3 * i + j] += offset[i] * of_seen[j] + _dot(factor_rows[i], of_turned[j])
+        out[9 + i] -= of_mean[i]
+    for i in range(4):
+        out[12 + i] += of_lens[i]
+
+
+@kernel
+def project_backward_unit(
+    means, scales, quats, c2w, lenses, bounds, size, limits, splats, given, wants_cameras,
+    of_means, of_scales, of_quats, of_opacities, of_colors, of_cameras,
+):  # fmt: skip
+    """Gradients of what `project_unit` projected, from those of the rasteriser, (V, P, G, 10).
+
+    P partial gradients per view are added first. Writes of_means (G, 3), of_scales (G, 3),
+    of_quats (G, 4), of_opacities (G,) and of_colors (G, 3), and adds to of_cameras (V, 16) if
+    `wants_cameras`.
+    """
+    _, _, dilation, _, margin = limits
+    zeros = (_ZERO, _ZERO, _ZERO)
+    slopes = np.empty(given.shape[3], np.float32)
+    for g in range(bounds[0], bounds[1]):
+        rows, quat, norm = _rotation(quats[g])
+        scale = _vector(scales[g])
+        factor = _scaled_columns(rows, scale)
+        of_mean, of_color, of_opacity = zeros, zeros, _ZERO
+        of_factor = (zeros, zeros, zeros)
+        for v in range(c2w.shape[0]):
+            splat = splats[v, g]
+            if not splat[6] > _ZERO:
+                continue
+            slopes[:] = given[v, 0, g]
+            for part in range(1, given.shape[1]):
+                for i in range(slopes.shape[0]):
+                    slopes[i] += given[v, part, g, i]
+            of_opacity += slopes[6]
+            of_color = _plus(of_color, _ONE, _vector(slopes[7:]))
+            pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
+            position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
+            fx, fy, cx, cy = lenses[v, 0], lenses[v, 1], lenses[v, 2], lenses[v, 3]
+            offset = _plus(_vector(means[g]), -_ONE, position)
+            seen = _combine(offset, pose)
+            z = seen[2]
+            x, y = seen[0] / z, seen[1] / z
+            turned = _turn(pose, factor)
+            held_x, is_held_x = _clamp(x, fx, cx, size[1], margin)
+            held_y, is_held_y = _clamp(y, fy, cy, size[0], margin)
+            row_x = _image_factor(turned, 0, held_x, fx, z)
+            row_y = _image_factor(turned, 1, held_y, fy, z)
+            of_row_x, of_row_y = _covariance_slopes(row_x, row_y, splat, slopes, dilation)
+            of_x, z_x, of_fx, of_cx, of_turned_x, turned_z_x = _axis_slopes(
+                x, held_x, is_held_x, fx, z, row_x, of_row_x, turned[2], slopes[0]
+            )
+            of_y, z_y, of_fy, of_cy, of_turned_y, turned_z_y = _axis_slopes(
+                y, held_y, is_held_y, fy, z, row_y, of_row_y, turned[2], slopes[1]
+            )
+            of_seen = (of_x, of_y, z_x + z_y + slopes[5])
+            of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, _ONE, turned_z_y))
+            of_offset = (_dot(pose[0], of_seen), _dot(pose[1], of_seen), _dot(pose[2], of_seen))
+            of_mean = _plus(of_mean, _ONE, of_offset)
+            of_factor = (
+                _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
+                _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
+                _plus(of_factor[2], _ONE, _combine(pose[2], of_turned)),
+            )
+            if wants_cameras:
+                _add_camera(
+                    of_cameras[v], offset, _columns(factor), of_seen, of_turned, of_offset,
+                    (of_fx, of_fy, of_cx, of_cy),
+                )  # fmt: skip
+        of_opacities[g] = of_opacity
+        of_columns, axes = _columns(of_factor), _columns(rows)
+        for i in range(3):
+            of_means[g, i] = of_mean[i]
+            of_colors[g, i] = of_color[i]
+            of_scales[g, i] = _dot(of_columns[i], axes[i])
+        _quat_slopes(quat, norm, _columns(_scaled_columns(of_factor, scale)), of_quats[g])
