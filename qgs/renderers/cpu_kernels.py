@@ -4,8 +4,9 @@ A unit of work is a stripe of tile rows of one image. It sorts the splats that t
 then walks its tiles of 16 x 16 pixels, front to back. A row of a tile is 16 lanes without branches
 in one flat float32 buffer at constant offsets, which is what lets LLVM vectorise the lanes.
 
-Splats are rows of 8 float32: u, v, conic xx, xy, yy, depth, half extents in x and y (pixels; not
-positive for what is not visible). Sums are 5 planes: w r, w g, w b, w z, w.
+Splats are rows of 9 float32: u, v, conic xx, xy, yy, depth, half extents in x and y (pixels; not
+positive for what is not visible), and the power of 2 below which alpha cannot reach alpha_min.
+Sums are 5 planes: w r, w g, w b, w z, w.
 
 For each row of a tile, the buffer holds blocks of 16 lanes: transmittance, 1 until the
 pixel stops, then the sums (forward) or what `_load_gradients` puts there (backward).
@@ -22,13 +23,14 @@ import numpy as np
 from qgs.renderers.jit import kernel
 
 TILE = 16
-SPLAT_FIELDS = 8
+SPLAT_FIELDS = 9
 SUMS = 5
 GRADIENTS = 10  # of u, v, xx, xy, yy, depth, opacity, r, g, b
 
 _LANES = np.uint64(TILE)
 _ROW = 9 * TILE  # floats per row of a tile
 _STATE = np.uint64(_ROW)
+_LAST_LANE = np.float32(TILE - 1)
 _CHECK_EVERY = 16  # splats between two looks at which rows are still open
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
@@ -154,8 +156,15 @@ def _row_span(v, ey, top):
 
 
 @kernel
+def _misses_row(dx0, vertex, linear, quadratic, constant, lowest):
+    """Whether power stays below `lowest` over all 16 lanes, by its peak on their real interval."""
+    peak = min(max(vertex, dx0), dx0 + _LAST_LANE)
+    return (quadratic * peak + linear) * peak + constant < lowest
+
+
+@kernel
 def forward_unit(splats, opacities, colors, tile_rows, options, sums):
-    """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 8)."""
+    """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 9)."""
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
@@ -178,13 +187,17 @@ def forward_unit(splats, opacities, colors, tile_rows, options, sums):
                 first, last = _row_span(v, splats[g, 7], np.float32(y0))
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
+                lean, lowest = -xy / xx, splats[g, 8]
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue
                     dy = np.float32(y0 + row) + _HALF - v
+                    linear, constant = -_LOG2_E * xy * dy, -_HALF * _LOG2_E * yy * dy * dy
+                    if _misses_row(dx0, lean * dy, linear, quadratic, constant, lowest):
+                        continue
                     _blend_row(
-                        state, np.uint64(row) * _STATE, dx0, -_LOG2_E * xy * dy, quadratic,
-                        -_HALF * _LOG2_E * yy * dy * dy, opacities[g],
+                        state, np.uint64(row) * _STATE, dx0, linear, quadratic, constant,
+                        opacities[g],
                         colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5], options,
                     )  # fmt: skip
                 since_check += 1
@@ -315,17 +328,25 @@ def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, o
                 first, last = _row_span(v, splats[g, 7], np.float32(y0))
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
-                totals[:] = _ZERO
+                lean, lowest = -xy / xx, splats[g, 8]
+                touched = False
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue
                     dy = np.float32(y0 + row) + _HALF - v
+                    linear, constant = -_LOG2_E * xy * dy, -_HALF * _LOG2_E * yy * dy * dy
+                    if _misses_row(dx0, lean * dy, linear, quadratic, constant, lowest):
+                        continue
+                    if not touched:
+                        totals[:] = _ZERO
+                        touched = True
                     _backward_row(
-                        state, np.uint64(row) * _STATE, totals, dx0, dy, -_LOG2_E * xy * dy,
-                        quadratic, -_HALF * _LOG2_E * yy * dy * dy, opacities[g],
+                        state, np.uint64(row) * _STATE, totals, dx0, dy, linear, quadratic,
+                        constant, opacities[g],
                         colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5], options,
                     )  # fmt: skip
-                _add_gradients(totals, xx, xy, yy, opacities[g], out[g])
+                if touched:
+                    _add_gradients(totals, xx, xy, yy, opacities[g], out[g])
                 since_check += 1
                 if since_check == _CHECK_EVERY:
                     since_check = 0

@@ -18,6 +18,8 @@ CAMERA_GRADIENTS = 16  # of C by rows, p, fx, fy, cx, cy
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _SHORTEST = np.float32(1e-12)  # a quaternion's norm is at least this, as in F.normalize
+_LOG2_E = np.float32(1.4426950408889634)
+_SLACK = np.float32(0.05)  # of a power of 2
 _LARGEST = np.float32(1e9)  # half extent in pixels that still converts to an integer
 
 
@@ -112,19 +114,20 @@ def _turn(pose, factor_columns):
 
 @kernel
 def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, limits, splats):
-    """Fill splats (V, G, 8) for the Gaussians [first, last) of one scene.
+    """Fill splats (V, G, 9) for the Gaussians [first, last) of one scene.
 
     means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4).
     size: height and width. limits: near, far, dilation, alpha_min, margin of the clamped Jacobian.
     A contribution reaches alpha_min where the Mahalanobis distance is sqrt(2 ln(opacity /
-    alpha_min)); half a pixel is added against rounding.
+    alpha_min)); half a pixel, and a little in the power, are added against rounding.
     """
     near, far, dilation, alpha_min, margin = limits
     for g in range(bounds[0], bounds[1]):
         rows, _, _ = _rotation(quats[g])
         factor = _scaled_columns(rows, _vector(scales[g]))
         opacity = opacities[g]
-        reach = np.sqrt(max(_TWO * np.log(opacity / alpha_min), _ZERO))
+        fall = max(np.log(opacity / alpha_min), _ZERO)
+        reach, lowest = np.sqrt(_TWO * fall), -_LOG2_E * fall - _SLACK
         for v in range(c2w.shape[0]):
             pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
             position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
@@ -154,6 +157,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
             out[2] = (yy + dilation) / determinant
             out[3] = -xy / determinant
             out[4] = (xx + dilation) / determinant
+            out[8] = lowest
             out[6] = min(reach * np.sqrt(xx + dilation) + _HALF, _LARGEST)
             out[7] = min(reach * np.sqrt(yy + dilation) + _HALF, _LARGEST)
 

@@ -50,8 +50,19 @@ def _not_normalised(gaussians):
     return replace(gaussians, quats=gaussians.quats * torch.linspace(0.1, 5, 40)[:, None])
 
 
-@pytest.mark.parametrize("change", [_spread_beyond_the_borders, _not_normalised])
-def test_the_projection_has_the_gradients_of_autograd(make_scene, differentiate, change):
+def _thin_and_tilted(gaussians):
+    return replace(gaussians, scales=gaussians.scales * torch.tensor([6.0, 0.1, 0.1]))
+
+
+@pytest.mark.parametrize(
+    ("change", "tolerance"),
+    [
+        (_spread_beyond_the_borders, 2e-5),
+        (_not_normalised, 2e-5),
+        (_thin_and_tilted, 1e-4),  # the oracle in float32 is 2e-5 off
+    ],
+)
+def test_the_projection_has_the_gradients_of_autograd(make_scene, differentiate, change, tolerance):
     gaussians, cameras = make_scene(batch=2, views=3)
     gaussians = change(gaussians)
     _, found = differentiate(CpuRenderer(RendererConfig()), gaussians, cameras)
@@ -59,7 +70,7 @@ def test_the_projection_has_the_gradients_of_autograd(make_scene, differentiate,
     _, expected = differentiate(qgs.renderers.TorchRenderer(RendererConfig()), *exact)
     for name, grad in found.items():
         error = (grad - expected[name]).abs().max() / expected[name].abs().max()
-        assert error < 2e-5, name
+        assert error < tolerance, name
 
 
 def test_more_gaussians_than_a_unit_of_work_takes(make_scene, differentiate):
