@@ -24,14 +24,27 @@ find_python() {
         "On Debian or Ubuntu: sudo apt install python3.11 python3.11-venv"
 }
 
+has_stamp() {
+    compgen -G "$1/.qgs-*" >/dev/null
+}
+
+# A folder that this script did not make is never touched; the stamp is there from the first moment,
+# so that an interrupted attempt can be repeated.
 make_environment() {
     local directory=$1 python
+    if [[ -e $directory ]] && ! has_stamp "$directory"; then
+        die "$directory is in the way: it has no working Python 3.11 with pip, and qgs did not make it." \
+            "Activate the environment that you want to use, or move $directory away."
+    fi
     python=$(find_python)
     "$python" -c 'import ensurepip, venv' 2>/dev/null ||
         die "$python cannot make virtual environments: its venv module is missing." \
             "On Debian or Ubuntu: sudo apt install python3-venv"
     echo "qgs: making the virtual environment $directory" >&2
-    "$python" -m venv --clear "$directory" || die "$directory could not be made (see above)."
+    rm -rf "$directory"
+    mkdir -p "$directory"
+    touch "$directory/.qgs-made"
+    "$python" -m venv "$directory" || die "$directory could not be made (see above)."
 }
 
 # What an installation depends on; any change of it installs again.
