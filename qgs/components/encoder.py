@@ -61,7 +61,7 @@ class MultiViewViT(Encoder):
         patch_size: int = Field(default=8, ge=1)
         depth: int = Field(default=3, ge=0)
         mlp_ratio: int = Field(default=4, ge=1)
-        layer_scale: float = 0.01
+        layer_scale: float = Field(default=0.01, gt=0)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

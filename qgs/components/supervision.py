@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from pydantic import Field, field_validator
 
-from qgs.contracts import ComponentConfig, Problem, RecipeContext, Supervision
+from qgs.contracts import ComponentConfig, OptionError, Problem, RecipeContext, Supervision
 
 
 class LayerSupervision(Supervision):
@@ -24,7 +24,11 @@ class LayerSupervision(Supervision):
         @classmethod
         def _ascending(cls, layers: tuple[int, ...]) -> tuple[int, ...]:
             if list(layers) != sorted(set(layers)) or layers[0] < 1:
-                raise ValueError(f"layers must ascend from 1 without repeats, got {list(layers)}")
+                ascending = sorted({max(number, 1) for number in layers})
+                raise OptionError(
+                    f"layers must ascend from 1 without repeats, got {list(layers)}",
+                    f"write {ascending}",
+                )
             return layers
 
     config: Config

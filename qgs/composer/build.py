@@ -83,6 +83,10 @@ def _assemble(
 def _shared_refinement(
     chosen: Chosen, dims: ModelDims, shared: dict[tuple[str, str], Refinement]
 ) -> Refinement:
+    refinement = chosen.component
+    assert issubclass(refinement, Refinement)
+    if not refinement.shared_by_layers:
+        return build(chosen, dims)
     key = (chosen.type, chosen.config.model_dump_json())
     if key not in shared:
         shared[key] = build(chosen, dims)

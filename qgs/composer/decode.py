@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from qgs.composer.errors import Problems
 from qgs.composer.explain import explain, place_of
 from qgs.composer.nodes import (
+    ListNode,
     MapNode,
     Node,
     Origin,
@@ -23,7 +24,7 @@ from qgs.composer.nodes import (
     to_plain,
 )
 from qgs.composer.places import Place
-from qgs.composer.registry import Registry, available_plugins
+from qgs.composer.registry import Registry, available_plugins, component_failure
 from qgs.composer.slots import SLOTS, type_at
 from qgs.composer.suggest import did_you_mean, nearest
 from qgs.contracts import Component, ComponentConfig
@@ -82,7 +83,12 @@ def _decode_place(place: Place, registry: Registry, problems: Problems) -> Chose
     component = _find(name, place, registry, origin, problems)
     if component is None:
         return None
-    config = decode_config(component.Config, node.without("type"), place.source, problems)
+    try:
+        config = decode_config(component.Config, node.without("type"), place.source, problems)
+    except Exception as error:
+        failure = component_failure(name, "Config", error, registry)
+        problems.add(origin, ".".join(place.source), failure.reason, failure.fix)
+        return None
     return None if config is None else Chosen(place, name, component, config)
 
 
@@ -106,8 +112,9 @@ def _why_not(name: object, place: Place, registry: Registry) -> tuple[str, str]:
         reason = f"the slot `{slot}` has no default component"
         return reason, f"add `type:`, one of {', '.join(sorted(installed))}"
     if not isinstance(name, str):
-        given = kind_of(name) if isinstance(name, MapNode) else repr(name)
-        return f"`type` names a component, got {given}", f"choose {', '.join(sorted(installed))}"
+        given = name if isinstance(name, MapNode | ListNode) else ScalarNode(Origin(""), name)
+        reason = f"`type` names a component, got {kind_of(given)}"
+        return reason, f"choose {', '.join(sorted(installed))}"
     plugin, slash, _ = name.partition("/")
     if not slash:
         return _no_plugin_named(name, installed)

@@ -9,6 +9,7 @@ from pydantic_core import ErrorDetails
 
 from qgs.composer.nodes import ListNode, MapNode, Node, kind_of
 from qgs.composer.suggest import did_you_mean, nearest
+from qgs.contracts import OptionError
 
 _BOUNDS = {
     "greater_than": ("gt", "more than"),
@@ -44,7 +45,7 @@ def place_of(error: ErrorDetails, node: Node) -> tuple[str | int, ...]:
             node = node.items[str(step)]
         elif isinstance(node, ListNode) and isinstance(step, int) and step < len(node.items):
             node = node.items[step]
-        elif not (last and error["type"] == "missing"):
+        elif not (last and error["type"] == "missing" and isinstance(step, str)):
             continue
         steps.append(step)
     return tuple(steps)
@@ -59,6 +60,9 @@ def explain(error: ErrorDetails, given: Node | None, config: type[BaseModel]) ->
     if kind == "extra_forbidden":
         siblings = _options_beside(config, error["loc"])
         return f"there is no option `{option}`", did_you_mean(option, siblings, "options")
+    if kind == "missing" and isinstance(given, ListNode):
+        count = _items_expected(config, error["loc"])
+        return f"needs {count} items, got {len(given.items)}", f"give {count} items{default}"
     if kind == "missing":
         return f"the option `{option}` is missing and has no default", f"add `{option}: ...`"
     if kind in _BOUNDS:
@@ -76,6 +80,8 @@ def explain(error: ErrorDetails, given: Node | None, config: type[BaseModel]) ->
         return f"must be {expected}, got {what}", _literal_fix(given, expected, default)
     if kind == "finite_number":
         return f"must be a finite number, got {what}", f"give a finite number{default}"
+    if kind == "value_error" and isinstance(context["error"], OptionError):
+        return context["error"].reason, f"{context['error'].fix}{default}"
     if kind == "value_error":
         return str(context["error"]), f"change the value so that this holds{default}"
     message = error["msg"][:1].lower() + error["msg"][1:]
@@ -118,12 +124,26 @@ def _yaml_word(value: object) -> str:
 
 def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[str]:
     """Options of the (nested) config that the last step of `loc` was looked for in."""
+    return {name for model in _models_at(config, loc[:-1]) for name in model.model_fields}
+
+
+def _models_at(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[type[BaseModel]]:
+    """The (nested) configs that `loc` leads to."""
     models = {config}
-    for step in loc[:-1]:
+    for step in loc:
         fields = [m.model_fields[str(step)] for m in models if str(step) in m.model_fields]
         if fields:
             models = {model for field in fields for model in _models_in(field.annotation)}
-    return {name for model in models for name in model.model_fields}
+    return models
+
+
+def _items_expected(config: type[BaseModel], loc: tuple[str | int, ...]) -> int:
+    """Length of the tuple that the last step of `loc` counts in."""
+    name = str(next(step for step in reversed(loc) if isinstance(step, str)))
+    depth = loc.index(name)
+    models = _models_at(config, loc[:depth])
+    annotations = [m.model_fields[name].annotation for m in models if name in m.model_fields]
+    return max(len(get_args(annotation)) for annotation in annotations)
 
 
 def _models_in(annotation: Any) -> set[type[BaseModel]]:

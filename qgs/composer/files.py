@@ -17,17 +17,25 @@ from qgs.composer.suggest import nearest
 def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
     """The merged tree of `recipe`, without its `extends`."""
     if isinstance(recipe, Mapping):
-        node = from_plain(recipe, Origin("<mapping>"))
+        try:
+            node = from_plain(recipe, Origin("<mapping>"))
+        except RecursionError:
+            reason = "the mapping is nested too deep, or contains itself"
+            problems.stop(Origin("<mapping>"), "", reason, "write the recipe flatter")
+            node = MapNode(Origin("<mapping>"))
         assert isinstance(node, MapNode)
         return _with_bases(node, Path(), (), problems)
-    return _read_file(Path(recipe), (), Origin(str(recipe)), problems)
+    return _read_file(Path(recipe), (), None, problems)
 
 
-def _read_file(file: Path, chain: tuple[Path, ...], asked: Origin, problems: Problems) -> MapNode:
+def _read_file(
+    file: Path, chain: tuple[Path, ...], extended_at: Origin | None, problems: Problems
+) -> MapNode:
+    asked = extended_at or Origin(str(file))
     try:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
-        _report_unreadable(file, error, asked, bool(chain), problems)
+        _report_unreadable(file, error, chain, extended_at, problems)
         return MapNode(asked)
     except UnicodeDecodeError:
         problems.stop(Origin(str(file)), "", "the file is no UTF-8 text", "save it as UTF-8")
@@ -80,15 +88,20 @@ def _extended(node: MapNode, problems: Problems) -> list[tuple[str, Origin]]:
 
 
 def _report_unreadable(
-    file: Path, error: OSError, asked: Origin, extended: bool, problems: Problems
+    file: Path,
+    error: OSError,
+    chain: tuple[Path, ...],
+    extended_at: Origin | None,
+    problems: Problems,
 ) -> None:
     reason = f"{file} cannot be read: {error.strerror}"
     fix = "give the path of a recipe file"
     if isinstance(error, FileNotFoundError):
         reason = f"{file} does not exist"
-        names = [path.name for path in file.parent.glob("*.yaml")]
-        near = nearest(file.name, names)
-        fix = f"did you mean `{file.parent / near}`?" if near else "check the path"
-        if extended:
-            fix += " (`extends` is relative to the file it stands in)"
-    problems.stop(asked, "extends" if extended else "", reason, fix)
+        near = nearest(file.stem, [p.stem for p in file.parent.glob("*.yaml") if p not in chain])
+        fix = f"did you mean `{file.parent / near}.yaml`?" if near else "check the path"
+        if extended_at:
+            home = "the file it stands in" if chain else "the working directory"
+            fix += f" (`extends` is relative to {home})"
+    origin = extended_at or Origin(str(file))
+    problems.stop(origin, "extends" if extended_at else "", reason, fix)

@@ -83,18 +83,16 @@ def _check_step(
 ) -> None:
     chosen = steps[position].chosen
     assert chosen is not None
+    missing = {n: spec for n, spec in _requires(chosen).items() if n not in fields}
+    if missing and not uncertain:
+        before = [step.chosen for step in steps[:position] if step.chosen]
+        after = [step.chosen for step in steps[position + 1 :] if step.chosen]
+        fix = fix_unmet(missing, chosen, before, registry)
+        problems.add(
+            chosen.place.origin, chosen.written_at, _why_unmet(missing, chosen, after), fix
+        )
     for name, spec in _requires(chosen).items():
-        if name not in fields:
-            if not uncertain:
-                before = [step.chosen for step in steps[:position] if step.chosen]
-                after = [step.chosen for step in steps[position + 1 :] if step.chosen]
-                reason = f"`{chosen.type}` needs {name} ({spec}), which nothing before it provides"
-                later = next((c for c in after if _originates(c, name)), None)
-                if later:
-                    reason += f"; `{later.type}` at {later.written_at} provides it too late"
-                fix = fix_unmet(name, chosen, before, registry)
-                problems.add(chosen.place.origin, chosen.written_at, reason, fix)
-        elif fields[name][0] != spec:
+        if name in fields and fields[name][0] != spec:
             found, writer = fields[name]
             reason = (
                 f"`{chosen.type}` reads {name} as {spec}, "
@@ -103,6 +101,17 @@ def _check_step(
             problems.add(
                 chosen.place.origin, chosen.written_at, reason, fix_mismatch(chosen, writer)
             )
+
+
+def _why_unmet(missing: Fields, chosen: Chosen, after: Sequence[Chosen]) -> str:
+    named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
+    reason = f"`{chosen.type}` needs {named}, which nothing before it provides"
+    for name in missing:
+        later = next((c for c in after if _originates(c, name)), None)
+        if later:
+            what = "it" if len(missing) == 1 else name
+            reason += f"; `{later.type}` at {later.written_at} provides {what} too late"
+    return reason
 
 
 def _requires(chosen: Chosen) -> Fields:

@@ -6,7 +6,7 @@ import yaml
 
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Node, Origin, Path, ScalarNode, is_null, kind_of
-from qgs.composer.yaml12 import Yaml12Loader, scalar_value
+from qgs.composer.yaml12 import NestingError, Yaml12Loader, scalar_value
 
 _STANDARD = "tag:yaml.org,2002:"
 _TAGS = frozenset(
@@ -34,19 +34,21 @@ def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
     return MapNode(node.origin)
 
 
-def load_text(text: str, file: str, problems: Problems, line: int | None = None) -> Node | None:
+def load_text(
+    text: str, file: str, problems: Problems, line: int | None = None, path: Path = ()
+) -> Node | None:
     """The tree of `text`, a null for an empty text; None, and a problem, for what is no YAML.
 
-    line: given to every node in place of its own line.
+    line: given to every node in place of its own line. path: where the text belongs.
     """
     try:
         root = yaml.compose(text, Loader=Yaml12Loader)
     except yaml.YAMLError as error:
-        _stop_at_syntax(error, text, file, problems, line)
+        _stop_at_syntax(error, text, file, path, problems, line)
         return None
     if root is None:
         return ScalarNode(Origin(file, 1 if line is None else line), None)
-    return _Reader(file, problems, line).read(root, ())
+    return _Reader(file, problems, line).read(root, path)
 
 
 class _Reader:
@@ -119,6 +121,8 @@ class _Reader:
     def read_scalar(self, node: yaml.Node, path: Path) -> ScalarNode:
         try:
             return ScalarNode(self.origin(node), scalar_value(node.tag, node.value))
+        except OverflowError as error:
+            return self.refuse(node, path, str(error), "write a smaller number")
         except ValueError:
             kind = node.tag.removeprefix(_STANDARD)
             return self.refuse(node, path, f"{node.value!r} is no {kind}", "remove the tag")
@@ -132,15 +136,18 @@ class _Reader:
 
 
 def _stop_at_syntax(
-    error: yaml.YAMLError, text: str, file: str, problems: Problems, line: int | None
+    error: yaml.YAMLError, text: str, file: str, path: Path, problems: Problems, line: int | None
 ) -> None:
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     number = mark.line + 1 if mark else 1
     lines = text.splitlines()
     written = lines[number - 1] if number <= len(lines) else ""
-    if "\t" in written[: len(written) - len(written.lstrip())] or "'\\t'" in str(error):
+    if isinstance(error, NestingError):
+        reason, fix = str(error.problem), "write the recipe flatter"
+    elif "\t" in written[: len(written) - len(written.lstrip())] or "'\\t'" in str(error):
         reason, fix = "a tab stands where YAML wants spaces", "indent with spaces"
     else:
         reason = f"this is no valid YAML: {getattr(error, 'problem', None) or error}"
         fix = "correct the line; check indentation, brackets, quotes and `: ` before it"
-    problems.stop(Origin(file, number if line is None else line), "", reason, fix)
+    origin = Origin(file, number if line is None else line)
+    problems.stop(origin, ".".join(path), reason, fix)

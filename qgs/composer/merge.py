@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from qgs.composer.nodes import MapNode, Node, Path, ScalarNode
+from qgs.composer.nodes import MapNode, Node, Path, ScalarNode, is_null
 from qgs.composer.slots import type_at
 
 TAGS = ("type", "kind")
@@ -13,7 +13,7 @@ def merge(base: Node, over: Node, path: Path = ()) -> Node:
     """`over` laid over `base`, both at `path`.
 
     `null` replaces what it lies over: in place of an option it is a value, in place of a component
-    or a section it leaves the default.
+    or a section it leaves the default, in place of a swap it drops the swap.
     """
     if not (isinstance(base, MapNode) and isinstance(over, MapNode)):
         return over
@@ -22,6 +22,9 @@ def merge(base: Node, over: Node, path: Path = ()) -> Node:
     items, keys = dict(base.items), dict(base.keys)
     for key, node in over.items.items():
         below = (*path, key)
+        if path == ("swap",) and is_null(node) and not is_null(base.items.get(key)):
+            del items[key], keys[key]
+            continue
         items[key] = merge(items[key], node, below) if key in items else node
         keys[key] = over.keys[key]
     return MapNode(over.origin, items, keys)

@@ -12,6 +12,14 @@ from qgs.composer.nodes import MapNode, Node, Origin
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
     """`tree` with every override laid over it in order; the n-th has the origin `--set #n`."""
+    if isinstance(overrides, str):
+        problems.stop(
+            Origin("overrides"),
+            "",
+            f"overrides are a list of strings, got the string {overrides!r}",
+            f"write `overrides=[{overrides!r}]`",
+        )
+        return tree
     for number, text in enumerate(overrides, start=1):
         over = _read_override(text, Origin(f"--set #{number}"), problems)
         if over is not None:
@@ -33,14 +41,12 @@ def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode | N
         )
         return None
     if path[0] == "extends" or (path[0] == "swap" and len(path) > 1):
-        problems.add(
-            origin,
-            name.strip(),
-            f"an override cannot set `{name.strip()}`",
-            "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`",
-        )
+        fix = "write a recipe that extends both, or set single options"
+        if path[0] == "swap":
+            fix = "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`"
+        problems.add(origin, name.strip(), f"an override cannot set `{name.strip()}`", fix)
         return None
-    node = load_text(value, origin.file, problems, line=0)
+    node = load_text(value, origin.file, problems, line=0, path=tuple(path))
     return None if node is None else _nest(path, node, origin)
 
 

@@ -5,27 +5,43 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args, get_origin
 
+from qgs.composer.declared import needs, offers
 from qgs.composer.decode import Chosen
 from qgs.composer.registry import Registry, default_config
-from qgs.composer.slots import SLOTS
+from qgs.composer.slots import LAYER_SLOTS
 from qgs.composer.yaml12 import dump
-from qgs.contracts import Component, ComponentConfig
+from qgs.contracts import Component, ComponentConfig, Fields
+
+_FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses")
+"""Slots that read or write fields, in the order in which a layer's prediction is made."""
 
 
-def fix_unmet(name: str, chosen: Chosen, before: Sequence[Chosen], registry: Registry) -> str:
-    """What to do when `chosen` needs a field `name` that nothing `before` it provides."""
+def fix_unmet(missing: Fields, chosen: Chosen, before: Sequence[Chosen], registry: Registry) -> str:
+    """What to do when `chosen` needs fields that nothing `before` it provides.
+
+    One change that meets them all, or changes for each of them.
+    """
     fixes = dict.fromkeys(
         f"set `{earlier.written_at}.{option}: {value}` on `{earlier.type}`"
         for earlier in before
         for option, value, config in _variants(earlier.config)
-        if name in earlier.component.provides(config)
+        if missing.keys() <= offers(earlier.component, config).keys()
     )
     if not fixes:
-        fixes = dict.fromkeys(_installed_providers(name, registry))
+        fixes = dict.fromkeys(_installed_providers(missing, chosen.place.slot.name, registry))
     for option, value, config in _variants(chosen.config):
-        if name not in chosen.component.requires(config):
-            fixes[f"set `{chosen.written_at}.{option}: {value}`, which needs no {name}"] = None
-    return ", or ".join(fixes) or f"install a plugin with a component that provides {name}"
+        needed = needs(chosen.component, config)
+        if needed is not None and not missing.keys() & needed.keys():
+            names = " and no ".join(missing)
+            fixes[f"set `{chosen.written_at}.{option}: {value}`, which needs no {names}"] = None
+    if fixes:
+        return ", or ".join(fixes)
+    if len(missing) == 1:
+        return f"install a plugin with a component that provides {next(iter(missing))}"
+    return "; ".join(
+        f"for {name}: {fix_unmet({name: spec}, chosen, before, registry)}"
+        for name, spec in missing.items()
+    )
 
 
 def fix_mismatch(reader: Chosen, writer: Chosen) -> str:
@@ -42,11 +58,12 @@ def fix_mismatch(reader: Chosen, writer: Chosen) -> str:
     return f"set `{', '.join(words)}` on `{reader.type}`, as on `{writer.type}`"
 
 
-def _installed_providers(name: str, registry: Registry) -> Iterator[str]:
-    for slot in SLOTS:
+def _installed_providers(missing: Fields, reader: str, registry: Registry) -> Iterator[str]:
+    """Components that provide the fields by themselves, in slots that run before `reader`."""
+    for slot in _FLOW[: _FLOW.index(reader)]:
         for kind, component in registry.components(slot).items():
             for note, config in _default_configs(component):
-                if name in component.provides(config):
+                if missing.keys() <= offers(component, config).keys():
                     yield f"use `{kind}`{note} in the slot `{slot}`"
                     break
 

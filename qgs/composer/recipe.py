@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from qgs.composer.build import build_model, build_plain
+from qgs.composer.declared import check_declarations
 from qgs.composer.decode import Chosen, decode_places
 from qgs.composer.errors import Problems
 from qgs.composer.files import read_recipe
@@ -17,7 +18,7 @@ from qgs.composer.flow import check_flow, decoded_layers, execution_order
 from qgs.composer.nodes import MapNode, Origin, Path, from_plain, locate
 from qgs.composer.overrides import apply_overrides
 from qgs.composer.places import expand
-from qgs.composer.registry import Registry
+from qgs.composer.registry import PluginError, Registry
 from qgs.composer.resolved import Resolution
 from qgs.composer.sections import Settings, check_tree, decode_settings, load_plugins
 from qgs.composer.slots import DEFAULT_LOSSES
@@ -61,7 +62,10 @@ class Recipe:
         return build_model(self.parts, self.dims, self.layer_scale, self.seed, self.tree, device)
 
     def build_losses(self) -> dict[str, Loss]:
-        """Losses by the names that the recipe gives them."""
+        """Losses by the names that the recipe gives them.
+
+        `losses: {}` gives none: fine for everything but training, which refuses it.
+        """
         return {
             path[1]: build_plain(chosen)
             for path, chosen in self.parts.items()
@@ -84,8 +88,9 @@ def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str]
     """
     problems = Problems()
     tree = apply_overrides(read_recipe(recipe, problems), overrides, problems)
+    tree = check_tree(tree, problems)
     problems.raise_if_stopped()
-    tree = _with_default_losses(check_tree(tree, problems))
+    tree = _with_default_losses(tree)
     settings = decode_settings(tree, problems)
     registry = load_plugins(tree, problems)
     places = expand(tree, settings.decoder.depth, problems)
@@ -116,15 +121,24 @@ def _check_components(
     source = data.config if data else None
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
     context = RecipeContext(dims, size)
-    for chosen in parts.values():
-        if chosen is not None:
-            _check_options(chosen, context, problems)
+    parts = {
+        path: chosen if chosen and _check_options(chosen, context, registry, problems) else None
+        for path, chosen in parts.items()
+    }
     decoded = decoded_layers(parts["model", "supervision"], depth)
     check_flow(list(execution_order(parts, depth, decoded)), registry, problems)
 
 
-def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> None:
-    for problem in chosen.component.problems(chosen.config, context):
+def _check_options(
+    chosen: Chosen, context: RecipeContext, registry: Registry, problems: Problems
+) -> bool:
+    """Report what is wrong with a component's options; whether the component could be asked."""
+    try:
+        found = check_declarations(chosen, context, registry)
+    except PluginError as error:
+        problems.add(chosen.place.origin, chosen.written_at, error.reason, error.fix)
+        return False
+    for problem in found:
         steps = problem.option.split(".") if problem.option else []
         node = chosen.place.node
         origin = chosen.place.origin
@@ -132,6 +146,7 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
             origin = locate(node, steps)
         path = ".".join([chosen.written_at, *steps])
         problems.add(origin, path, problem.reason, problem.fix)
+    return True
 
 
 def _finish(

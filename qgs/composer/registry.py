@@ -63,6 +63,18 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
     return None if any(field.is_required() for field in fields) else component.Config()
 
 
+def component_failure(kind: str, what: str, error: Exception, registry: Registry) -> PluginError:
+    """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
+    plugin = kind.partition("/")[0]
+    installed = registry.plugins[plugin]
+    distribution = f"{installed.distribution} {installed.version}"
+    return PluginError(
+        f"the plugin `{plugin}` of {distribution} fails: `{what}` of `{kind}` raises "
+        f"{type(error).__name__}: {error}",
+        f"update {distribution}, or choose another component",
+    )
+
+
 def builtin() -> InstalledPlugin:
     """The plugin `qgs`."""
     return InstalledPlugin(BUILTIN, "qgs", qgs.__version__)

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from qgs.composer.decode import ConfigT, decode_config
 from qgs.composer.errors import Problems
-from qgs.composer.nodes import ListNode, MapNode, Path, ScalarNode, is_null, kind_of
+from qgs.composer.nodes import ListNode, MapNode, Origin, Path, ScalarNode, is_null, kind_of
 from qgs.composer.registry import PluginError, Registry, builtin, load_plugin
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS
 from qgs.composer.suggest import did_you_mean
@@ -27,7 +27,7 @@ class DecoderSettings(ComponentConfig):
     """depth: L. layer_scale: initial LayerScale of every sublayer (TokenGS release)."""
 
     depth: int = Field(default=12, ge=1, le=1024)
-    layer_scale: float = 5e-5
+    layer_scale: float = Field(default=5e-5, gt=0)
 
 
 class RecipeSettings(ComponentConfig):
@@ -170,6 +170,7 @@ def _check_heads(node: MapNode, model: ModelSettings, problems: Problems) -> Non
 def load_plugins(tree: MapNode, problems: Problems) -> Registry:
     """The components of the recipe's `plugins`; a problem for each that cannot be used."""
     plugins, unusable = {"qgs": builtin()}, set()
+    seen: dict[str, Origin] = {}
     written = tree.items.get("plugins")
     if written is not None and not isinstance(written, ListNode) and not is_null(written):
         reason = f"`plugins` is a list, this is {kind_of(written)}"
@@ -180,6 +181,11 @@ def load_plugins(tree: MapNode, problems: Problems) -> Registry:
             reason = f"a plugin is a name, this is {kind_of(item)}"
             problems.add(item.origin, path, reason, "write `plugins: [NAME]`")
             continue
+        if item.value in seen:
+            reason = f"the plugin `{item.value}` is already listed at {seen[item.value]}"
+            problems.add(item.origin, path, reason, "list it once")
+            continue
+        seen[item.value] = item.origin
         try:
             plugins[item.value] = load_plugin(item.value)
         except PluginError as error:

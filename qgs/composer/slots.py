@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from qgs.composer.nodes import MapNode, Node, Path, ScalarNode
+from qgs.composer.nodes import MapNode, Node, Path, ScalarNode, is_null
 from qgs.contracts import (
     Centers,
     Component,
@@ -78,8 +78,11 @@ def slot_at(path: Path) -> Slot | None:
 
 
 def type_at(node: Node | None, path: Path) -> Any:
-    """The `type` of the component written as `node` at `path`: its own, or the slot's default."""
-    if isinstance(node, MapNode) and "type" in node.items:
+    """The `type` of the component written as `node` at `path`: its own, or the slot's default.
+
+    `type: null` leaves the default, as `null` does in place of a component.
+    """
+    if isinstance(node, MapNode) and not is_null(node.items.get("type")):
         written = node.items["type"]
         return written.value if isinstance(written, ScalarNode) else written
     slot = slot_at(path)

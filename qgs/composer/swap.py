@@ -25,26 +25,37 @@ def apply_swaps(
     result = dict(places)
     for pattern, node in swaps.items.items():
         origin, path = swaps.keys[pattern], f"swap.{pattern}"
-        if is_null(node) or not _names_component(node, origin, path, problems):
+        if is_null(node):
+            reason = f"there is no inherited swap `{pattern}` that null could drop"
+            problems.add(origin, path, reason, "remove this line, or name the pattern as inherited")
+            continue
+        if not _names_component(node, origin, path, problems):
             continue
         hits = [place for place in places if _matches(pattern, place)]
         if not hits:
             fix = _near_pattern(pattern, places)
             problems.add(origin, path, f"the pattern `{pattern}` matches no place", fix)
         for place in hits:
-            if place in swapped:
-                other = swapped[place]
-                problems.add(
-                    origin,
-                    path,
-                    f"`{'.'.join(place)}` is already swapped by `{other}` ({swaps.keys[other]})",
-                    "narrow one of the two patterns, or remove one",
-                )
+            conflict = _conflict(places[place], swapped.get(place), swaps)
+            if conflict:
+                problems.add(origin, path, *conflict)
                 break
             swapped[place] = pattern
             source = ("swap", pattern)
             result[place] = replace(places[place], source=source, node=node, origin=origin)
     return result
+
+
+def _conflict(place: Place, other: str | None, swaps: MapNode) -> tuple[str, str] | None:
+    """What speaks against a swap at `place`, which the pattern `other` may have swapped before."""
+    name = ".".join(place.path)
+    if other is not None:
+        reason = f"`{name}` is already swapped by `{other}` ({swaps.keys[other]})"
+        return reason, "narrow one of the two patterns, or remove one"
+    if "layers" in place.source:
+        reason = f"`{name}` is already set for this layer at {place.origin}"
+        return reason, f"narrow the pattern, or remove `{name}` (null removes an inherited one)"
+    return None
 
 
 def _is_swappable(place: Path) -> bool:
@@ -58,7 +69,7 @@ def _matches(pattern: str, place: Path) -> bool:
 
 
 def _names_component(node: Node, origin: Origin, path: str, problems: Problems) -> bool:
-    if isinstance(node, MapNode) and "type" in node.items:
+    if isinstance(node, MapNode) and not is_null(node.items.get("type")):
         return True
     problems.add(
         origin,

@@ -20,10 +20,31 @@ _RESOLVERS = (
 )
 
 
+MAX_NESTING = 64
+_LARGEST = 2**63 - 1
+
+
+class NestingError(yaml.MarkedYAMLError):
+    """Mappings and lists inside each other, beyond what any recipe needs."""
+
+
 class Yaml12Loader(yaml.SafeLoader):
     """Composes nodes with YAML 1.2 tags; `qgs.composer.loader` reads their values."""
 
     yaml_implicit_resolvers: dict = {}  # noqa: RUF012
+    _nesting = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """PyYAML's, refusing what would overflow the stack of whoever walks the tree."""
+        self._nesting += 1
+        if self._nesting > MAX_NESTING:
+            raise NestingError(
+                problem=f"mappings and lists stand more than {MAX_NESTING} deep in each other",
+                problem_mark=self.peek_event().start_mark,
+            )
+        node = super().compose_node(parent, index)
+        self._nesting -= 1
+        return node
 
 
 class Yaml12Dumper(yaml.SafeDumper):
@@ -46,14 +67,20 @@ for _kind, _pattern, _first in _RESOLVERS:
 
 
 def scalar_value(tag: str, text: str) -> Any:
-    """The value of a scalar of a resolved `tag`; raises ValueError for a text that has none."""
+    """The value of a scalar of a resolved `tag`; raises ValueError for a text that has none.
+
+    Raises OverflowError for an integer beyond 64 bits.
+    """
     kind = tag.removeprefix("tag:yaml.org,2002:")
     if kind == "null":
         return None
     if kind == "bool":
         return text.lower() == "true"
     if kind == "int":
-        return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
+        base = {"0o": 8, "0x": 16}.get(text[:2], 10)
+        if len(text) > 100 or abs(value := int(text, base)) > _LARGEST:
+            raise OverflowError(f"an integer of {len(text)} digits does not fit into 64 bits")
+        return value
     if kind == "float":
         return float(re.sub(r"\.(inf|nan)$", r"\1", text, flags=re.IGNORECASE))
     return text

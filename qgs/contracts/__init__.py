@@ -9,8 +9,10 @@ from qgs.contracts.component import (
     FieldSpec,
     ModelComponent,
     ModelDims,
+    OptionError,
     Problem,
     RecipeContext,
+    without_effect,
 )
 from qgs.contracts.cross_attention import CrossAttention
 from qgs.contracts.data import Scene, SceneSource, SceneSourceConfig, Split
@@ -44,6 +46,7 @@ __all__ = [
     "Loss",
     "ModelComponent",
     "ModelDims",
+    "OptionError",
     "Plugin",
     "Problem",
     "Queries",
@@ -59,4 +62,5 @@ __all__ = [
     "Supervision",
     "TrainingConfig",
     "ViewsConfig",
+    "without_effect",
 ]

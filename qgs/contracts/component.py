@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias
 
 import torch
 from pydantic import BaseModel, ConfigDict
+
+
+class OptionError(ValueError):
+    """Raised by the validators of a Config: `reason` says what is wrong, `fix` what to write."""
+
+    def __init__(self, reason: str, fix: str) -> None:
+        super().__init__(f"{reason}; {fix}")
+        self.reason = reason
+        self.fix = fix
 
 
 class ComponentConfig(BaseModel):
@@ -74,6 +83,21 @@ class Problem:
     option: str
     reason: str
     fix: str
+
+
+def without_effect(
+    config: ComponentConfig, options: Iterable[str], because: str
+) -> Iterator[Problem]:
+    """A problem for each of `options` that is not at its default although nothing reads it.
+
+    because: what else in `config` makes them idle. Defaults pass: resolved recipes spell them out.
+    """
+    for option in options:
+        default = type(config).model_fields[option].get_default()
+        if getattr(config, option) != default:
+            word = "null" if default is None else default
+            fix = f"leave it at its default, {word}, or change what makes it idle"
+            yield Problem(option, f"`{option}` has no effect: {because}", fix)
 
 
 class Component(ABC):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 from torch import Tensor
@@ -13,6 +13,7 @@ from qgs.contracts.component import Component, ComponentConfig
 from qgs.types import Cameras
 
 Split = Literal["train", "test"]
+Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 
 class Scene(ABC):
@@ -44,7 +45,7 @@ class Scene(ABC):
 class SceneSourceConfig(ComponentConfig):
     """image_size: (H, W) of every delivered image, in pixels."""
 
-    image_size: tuple[int, int] = Field(default=(64, 64))
+    image_size: tuple[Side, Side] = (64, 64)
 
 
 class SceneSource(Component):

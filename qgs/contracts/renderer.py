@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Annotated, ClassVar, TypeAlias
 
 import torch
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
-from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
+from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, OptionError
 from qgs.types import Cameras, Gaussians, Rendering
+
+Channel: TypeAlias = Annotated[float, Field(ge=0, le=1)]
 
 
 class RendererConfig(ComponentConfig):
@@ -19,16 +21,27 @@ class RendererConfig(ComponentConfig):
     near, far: camera-frame z outside which a Gaussian is dropped. dilation: pixel^2 added to the
     diagonal of the projected covariance. alpha_min: contributions below it are skipped. alpha_cap:
     upper bound of one contribution. transmittance_min: a pixel stops before its transmittance would
-    fall to this. background: RGB behind everything.
+    fall to this. background: RGB in [0, 1] behind everything.
     """
 
     near: float = Field(default=0.025, gt=0)
-    far: float = Field(default=125.0, gt=0)
+    far: float = Field(default=125.0, gt=0, validate_default=True)
     dilation: float = Field(default=0.3, ge=0)
     alpha_min: float = Field(default=1 / 255, gt=0, lt=1)
     alpha_cap: float = Field(default=0.999, gt=0, lt=1)
     transmittance_min: float = Field(default=1e-4, ge=0, lt=1)
-    background: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    background: tuple[Channel, Channel, Channel] = (0.5, 0.5, 0.5)
+
+    @field_validator("far")
+    @classmethod
+    def _far_is_behind_near(cls, far: float, info: ValidationInfo) -> float:
+        near = info.data.get("near")
+        if near is not None and far <= near:
+            raise OptionError(
+                f"far must be more than near, got near {near:g} and far {far:g}",
+                f"set far above {near:g}, or near below {far:g}",
+            )
+        return far
 
 
 class Renderer(Component, torch.nn.Module):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator
 
-from qgs.contracts.component import ComponentConfig
+from qgs.contracts.component import ComponentConfig, OptionError
+
+Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
 class ViewsConfig(ComponentConfig):
@@ -28,12 +30,16 @@ class ViewsConfig(ComponentConfig):
     scale_factor: float = Field(default=0.15, gt=0)
     mirror: float = Field(default=0.5, ge=0, le=1)
 
-    @model_validator(mode="after")
-    def _gap_is_ordered(self) -> ViewsConfig:
-        low, high = self.gap
+    @field_validator("gap")
+    @classmethod
+    def _gap_is_ordered(cls, gap: tuple[int, int]) -> tuple[int, int]:
+        low, high = gap
         if not 1 <= low <= high:
-            raise ValueError(f"gap must be [min, max] with 1 <= min <= max, got [{low}, {high}]")
-        return self
+            raise OptionError(
+                f"must be [min, max] with 1 <= min <= max, got [{low}, {high}]",
+                f"write [{max(min(gap), 1)}, {max(*gap, 1)}], in frames",
+            )
+        return gap
 
 
 class TrainingConfig(ComponentConfig):
@@ -56,7 +62,7 @@ class TrainingConfig(ComponentConfig):
     warmup: int = Field(default=2000, ge=0)
     initial_divisor: float = Field(default=25.0, ge=1)
     final_divisor: float = Field(default=1000.0, ge=1)
-    betas: tuple[float, float] = (0.9, 0.95)
+    betas: tuple[Decay, Decay] = (0.9, 0.95)
     weight_decay: float = Field(default=0.05, ge=0)
     clip: float = Field(default=1.0, gt=0)
     precision: Literal["float32", "bf16"] = "bf16"

@@ -170,6 +170,87 @@ BROKEN = {
         "recipe: 1\nlosses:\n  mine: {weight: 0.1}\n",
         3, "losses.mine.type", "no default component", "add `type:`",
     ),
+    "too few items": (
+        "recipe: 1\nviews: {gap: [5]}\n",
+        2, "views.gap", "needs 2 items, got 1", "give 2 items (default: [10, 40])",
+    ),
+    "no items": (
+        "recipe: 1\ndata: {image_size: []}\n",
+        2, "data.image_size", "needs 2 items, got 0", "give 2 items",
+    ),
+    "too many items": (
+        "recipe: 1\nviews: {gap: [5, 6, 7]}\n",
+        2, "views.gap", "must have at most 2 items, got 3", "give at most 2 items",
+    ),
+    "gap in the wrong order": (
+        "recipe: 1\nviews:\n  gap: [9, 4]\n",
+        3, "views.gap", "1 <= min <= max, got [9, 4]", "write [4, 9]",
+    ),
+    "image without height": (
+        "recipe: 1\ndata:\n  image_size: [0, 64]\n",
+        3, "data.image_size.0", "must be at least 1", "at least 1",
+    ),
+    "far before near": (
+        "recipe: 1\nmodel:\n  renderer:\n    near: 3\n    far: 2\n",
+        5, "model.renderer.far", "far must be more than near", "set far above 3",
+    ),
+    "near behind the default of far": (
+        "recipe: 1\nmodel:\n  renderer: {near: 500}\n",
+        3, "model.renderer", "got near 500 and far 125", "near below 125",
+    ),
+    "decay of 1": (
+        "recipe: 1\ntraining: {betas: [0.9, 1.0]}\n",
+        2, "training.betas.1", "must be less than 1", "less than 1",
+    ),
+    "background out of range": (
+        "recipe: 1\nmodel: {renderer: {background: [0, 0, 255]}}\n",
+        2, "model.renderer.background.2", "must be at most 1", "at most 1",
+    ),
+    "LayerScale of nothing": (
+        "recipe: 1\nmodel: {decoder: {layer_scale: 0}}\n",
+        2, "model.decoder.layer_scale", "must be more than 0", "more than 0",
+    ),
+    "supervised layers in the wrong order": (
+        "recipe: 1\nmodel: {supervision: {layers: [4, 2, 2]}}\n",
+        2, "model.supervision.layers", "must ascend from 1", "write [2, 4]",
+    ),
+    "nested too deep": (
+        "recipe: 1\nseed:\n  " + "[" * 5000 + "]" * 5000 + "\n",
+        3, "", "more than 64 deep", "flatter",
+    ),
+    "huge integer": (
+        "recipe: 1\nmodel:\n  queries: {count: " + "9" * 5000 + "}\n",
+        3, "model.queries.count", "an integer of 5000 digits does not fit", "a smaller number",
+    ),
+    "type that is a list": (
+        "recipe: 1\nmodel:\n  queries: {type: [qgs/latent]}\n",
+        3, "model.queries.type", "`type` names a component, got a list", "qgs/latent",
+    ),
+    "loss whose type is null": (
+        "recipe: 1\nlosses:\n  mine: {type: null}\n",
+        3, "losses.mine.type", "no default component", "add `type:`",
+    ),
+    "swap of a layer that has its own": (
+        "recipe: 1\nmodel:\n  decoder:\n    layers:\n      3:\n        feed_forward: {ratio: 2}\n"
+        "swap:\n  decoder.layers.*.feed_forward: {type: qgs/mlp}\n",
+        8, "swap.decoder.layers.*.feed_forward",
+        "`model.decoder.layers.3.feed_forward` is already set for this layer at recipe.yaml:6",
+        "narrow the pattern, or remove",
+    ),
+    "swap dropped that nobody made": (
+        "recipe: 1\nswap:\n  decoder.layers.*.feed_forward: null\n",
+        3, "swap.decoder.layers.*.feed_forward", "no inherited swap", "remove this line",
+    ),
+    "plugin listed twice": (
+        "recipe: 1\nplugins: [spatial, spatial]\n",
+        2, "plugins.1", "already listed at recipe.yaml:2", "once",
+    ),
+    "two unmet requirements": (
+        HEAD + "model:\n  decoder:\n    cross_attention: {type: spatial/near}\n",
+        5, "model.decoder.cross_attention",
+        "needs place.center (3 float32, world frame) and place.radius (1 float32, world frame)",
+        "use `spatial/placed` in the slot `queries`",
+    ),
     "missing base": (
         "recipe: 1\nextends: bases.yaml\n",
         2, "extends", "bases.yaml does not exist", "relative to the file it stands in",
@@ -215,121 +296,3 @@ def test_all_errors_come_together_sorted_by_line(write, spatial):
         ("recipe.yaml", 8, "training.stesp"),
     ]
     assert str(caught.value).startswith("8 problems")
-
-
-def test_a_component_that_refines_a_field_is_no_provider_of_it(write, install):
-    install(
-        "qgs-chain",
-        "chain",
-        """
-        from qgs.contracts import FieldSpec, Plugin, Refinement
-        class Refine(Refinement):
-            name = "refine"
-            @classmethod
-            def requires(cls, config):
-                return {"place": FieldSpec((3,))}
-            provides = requires
-            def forward(self, state):
-                return state
-        plugin = Plugin("chain", 1, (Refine,))
-        """,
-    )
-    text = "recipe: 1\nplugins: [chain]\nmodel: {decoder: {refinement: {type: chain/refine}}}\n"
-    with pytest.raises(RecipeError) as caught:
-        resolve(write(text))
-    (problem,) = caught.value.problems
-    assert "needs place" in problem.reason
-    assert "too late" not in problem.reason
-
-
-def test_cycle_is_named_with_its_whole_chain(write):
-    write("recipe: 1\nextends: b.yaml\n", "a.yaml")
-    write("recipe: 1\nextends: c.yaml\n", "b.yaml")
-    write("recipe: 1\nextends: a.yaml\n", "c.yaml")
-    with pytest.raises(RecipeError) as caught:
-        resolve("a.yaml")
-    (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("c.yaml", 2, "extends")
-    assert "a.yaml -> b.yaml -> c.yaml -> a.yaml" in problem.reason
-    assert "remove" in problem.fix
-
-
-def test_mistake_in_an_extended_file_is_found_there(write):
-    write("recipe: 1\nmodel:\n  queries: {count: 0}\n", "base.yaml")
-    recipe = write("recipe: 1\nextends: base.yaml\nmodel:\n  queries: {std: 0.5}\n")
-    with pytest.raises(RecipeError) as caught:
-        resolve(recipe)
-    (problem,) = caught.value.problems
-    assert (problem.file, problem.line) == ("base.yaml", 3)
-
-
-@pytest.mark.parametrize(
-    ("override", "path", "reason"),
-    [
-        ("model.queries.count", "model.queries.count", "is no override"),
-        ("model..count=3", "model..count", "is no override"),
-        ("model.queries.count=[1", "", "no valid YAML"),
-        ("model.queries.count=x", "model.queries.count", "must be an integer"),
-        ("extends=a.yaml", "extends", "cannot set"),
-    ],
-)
-def test_broken_override(override, path, reason, write):
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\n"), ["seed=1", override])
-    (problem,) = caught.value.problems
-    assert (problem.file, problem.path) == ("--set #2", path)
-    assert reason in problem.reason
-
-
-BROKEN_PLUGINS = {
-    "raises at import": ("raise RuntimeError('no luck')", "RuntimeError: no luck"),
-    "is no Plugin": ("plugin = {}", "is no qgs.Plugin but dict"),
-    "wrong contract version": (
-        "from qgs.contracts import Plugin\nplugin = Plugin('bad', 99, ())",
-        "contract version 99",
-    ),
-    "other name": (
-        "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 1, ())",
-        "calls itself `qgs`",
-    ),
-    "taken component name": (
-        "from qgs.components import LatentQueries\nfrom qgs.contracts import Plugin\n"
-        "plugin = Plugin('bad', 1, (LatentQueries, LatentQueries))",
-        "registers `latent` twice",
-    ),
-    "abstract component": (
-        "from qgs.contracts import Plugin, Queries\n"
-        "class Half(Queries):\n    name = 'half'\n"
-        "plugin = Plugin('bad', 1, (Half,))",
-        "leaves count, forward abstract",
-    ),
-    "no component": (
-        "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, (int,))",
-        "is no qgs component",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN_PLUGINS)
-def test_broken_plugin_is_reported_by_distribution(name, write, install):
-    source, reason = BROKEN_PLUGINS[name]
-    install("qgs-bad", "bad", source, version="0.7")
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [bad]\nmodel: {queries: {type: bad/any}}\n"))
-    (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", 2, "plugins.0")
-    assert "qgs-bad 0.7" in problem.reason
-    assert reason in problem.reason
-    assert "qgs-bad 0.7" in problem.fix
-    resolve(write("recipe: 1\n", "other.yaml"))
-
-
-def test_two_distributions_with_one_plugin_name(write, install):
-    source = "from qgs.contracts import Plugin\nplugin = Plugin('twin', 1, ())"
-    install("first-twin", "twin", source)
-    install("second-twin", "twin", source)
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [twin]\n"))
-    (problem,) = caught.value.problems
-    assert "first-twin 1.2, second-twin 1.2" in problem.reason
-    assert "uninstall" in problem.fix

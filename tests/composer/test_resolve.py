@@ -78,7 +78,7 @@ def test_anchors_and_aliases_are_written_out():
 
 WORDS = st.sampled_from(["1e-4", "off", "12:30", "true", "null", "", "0o17", ".5", "- a", "a: b"])
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=6) | WORDS
-SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXTS
+SCALARS = st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | st.floats(allow_nan=False) | TEXTS
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -92,7 +92,7 @@ def test_what_is_dumped_is_read_back(value):
 TREES = st.dictionaries(
     st.sampled_from("abc"),
     st.recursive(
-        st.integers() | st.lists(st.integers(), max_size=2),
+        st.integers(-(2**63) + 1, 2**63 - 1) | st.lists(st.integers(), max_size=2),
         lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
         max_leaves=6,
     ),
@@ -234,6 +234,28 @@ def test_same_recipe_same_parameters_and_the_global_random_state_stays():
 
 def test_layers_with_equal_refinement_share_a_module():
     assert len(compose(SMALL, device="meta").refinements) == 1
+
+
+def test_refinement_that_is_not_shared(install):
+    install(
+        "qgs-apart",
+        "apart",
+        """
+        from qgs.contracts import Plugin, Refinement
+        class Apart(Refinement):
+            name = "apart"
+            shared_by_layers = False
+            def forward(self, state):
+                return state
+        plugin = Plugin("apart", 1, (Apart,))
+        """,
+    )
+    overrides = ["plugins=[apart]", "model.decoder.refinement.type=apart/apart"]
+    assert len(compose(SMALL, overrides, device="meta").refinements) == 3
+
+
+def test_null_type_is_the_default_of_the_slot():
+    assert resolve(SMALL, ["model.queries.type=null"]).tree == resolve(SMALL).tree
 
 
 def test_plugin_versions(spatial):

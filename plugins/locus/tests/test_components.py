@@ -16,6 +16,7 @@ from qgs_locus.self_attention import AnchorAwareSelfAttention, sine_embedding
 
 from qgs import QueryState
 from qgs.components import posact
+from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
@@ -146,3 +147,66 @@ def test_bandwidths_have_their_floor() -> None:
     fixed = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(bandwidth="fixed"), DIMS)
     assert fixed.sigma_sq(state) == pytest.approx(0.01)
     assert "anchor.raw_radius" not in RayBiasedCrossAttention.requires(fixed.config)
+
+
+LOCUS = {"recipe": 1, "plugins": ["locus"]}
+ANCHORED = {"queries": {"type": "locus/anchored"}}
+
+
+@pytest.mark.parametrize(
+    ("model", "path"),
+    [
+        ({"decoder": {"refinement": {"center": False, "radius": False}}}, ""),
+        ({"decoder": {"refinement": {"center_step": "linear", "input_limit": 7.0}}},
+         ".input_limit"),
+        ({"decoder": {"refinement": {"radius": False, "radius_min": 0.5}}}, ".radius_min"),
+        ({"centers": {"type": "locus/anchor_offset", "offset": "linear", "output_limit": None}},
+         ".output_limit"),
+        ({"decoder": {"cross_attention": {"bandwidth": "fixed", "sigma_sq_min": 0.5}}},
+         ".sigma_sq_min"),
+        ({"queries": {"type": "locus/anchored", "radius": False, "init_radius": 2.0}},
+         ".init_radius"),
+    ],
+)  # fmt: skip
+def test_options_without_effect_are_refused(model: dict, path: str) -> None:
+    kinds = {"refinement": "locus/refine", "cross_attention": "locus/ray_biased"}
+    for slot, options in model.get("decoder", {}).items():
+        model["decoder"] = {slot: {"type": kinds[slot], **options}}
+    with pytest.raises(RecipeError) as caught:
+        resolve({**LOCUS, "model": {**ANCHORED, **model}})
+    (problem,) = caught.value.problems
+    assert problem.path.endswith(path)
+    assert "no effect" in problem.reason or "nothing is refined" in problem.reason
+
+
+def test_idle_options_at_their_defaults_compose_again() -> None:
+    centers = {"type": "locus/anchor_offset", "offset": "linear"}
+    decoder = {"cross_attention": {"type": "locus/ray_biased", "bandwidth": "fixed"}}
+    model = {"queries": {"type": "locus/anchored", "radius": False}, "centers": centers}
+    recipe = resolve({**LOCUS, "model": {**model, "decoder": decoder}})
+    assert resolve(recipe.tree).tree == recipe.tree
+
+
+@pytest.mark.parametrize(
+    "decoder",
+    [
+        {"self_attention": {"type": "locus/anchor_aware"}},
+        {"cross_attention": {"type": "locus/ray_biased"}},
+        {"refinement": {"type": "locus/refine"}},
+    ],
+)
+def test_without_anchors_the_fix_is_to_use_anchored_queries(decoder: dict) -> None:
+    with pytest.raises(RecipeError) as caught:
+        resolve({**LOCUS, "model": {"decoder": decoder}})
+    (problem,) = caught.value.problems
+    assert "use `locus/anchored` in the slot `queries`" in problem.fix
+    assert "locus/refine" not in problem.fix
+
+
+@pytest.mark.parametrize("depth", [[0.0, 1.0], [2.0, 1.0], [-1.0, 1.0], [1.0]])
+def test_frustum_needs_ordered_positive_depths(depth: list[float]) -> None:
+    queries = {"type": "locus/anchored", "center_init": {"kind": "frustum", "depth": depth}}
+    with pytest.raises(RecipeError) as caught:
+        resolve({**LOCUS, "model": {"queries": queries}})
+    (problem,) = caught.value.problems
+    assert problem.path == "model.queries.center_init.depth"

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig, Fields, ModelDims, Queries
+from qgs.contracts import (
+    ComponentConfig,
+    Fields,
+    ModelDims,
+    OptionError,
+    Problem,
+    Queries,
+    RecipeContext,
+    without_effect,
+)
 from qgs.types import QueryState, SpatialSupport
 from qgs_locus.fields import (
     CENTER,
@@ -42,6 +52,17 @@ class FrustumCenters(ComponentConfig):
     kind: Literal["frustum"]
     depth: tuple[float, float] = (0.3, 3.0)
     slope: float = Field(default=0.6, gt=0)
+
+    @field_validator("depth")
+    @classmethod
+    def _depth_is_ordered(cls, depth: tuple[float, float]) -> tuple[float, float]:
+        near, far = depth
+        if not 0 < near <= far:
+            raise OptionError(
+                f"must be [near, far] with 0 < near <= far, got [{near:g}, {far:g}]",
+                "give the depths at which the scene begins and ends, such as [0.3, 3.0]",
+            )
+        return depth
 
     def sample(self, count: int) -> Tensor:
         """Centres (count, 3)."""
@@ -83,6 +104,13 @@ class AnchoredQueries(Queries):
     def provides(cls, config: Config) -> Fields:
         """The centre, and the raw radius if there is one."""
         return {**CENTER_FIELD, **(radius_field(config) if config.radius else {})}
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Options of the radius need a radius."""
+        if not config.radius:
+            idle = ("init_radius", "radius_bound", "radius_min")
+            yield from without_effect(config, idle, "`radius` is false")
 
     @property
     def count(self) -> int:

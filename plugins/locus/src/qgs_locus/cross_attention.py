@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 import torch
@@ -10,7 +11,16 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import CrossAttentionCore
-from qgs.contracts import MEMORY_FIELDS, AttentionWeights, CrossAttention, Fields, ModelDims
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    AttentionWeights,
+    CrossAttention,
+    Fields,
+    ModelDims,
+    Problem,
+    RecipeContext,
+    without_effect,
+)
 from qgs.types import ImageMemory, QueryState
 from qgs_locus.fields import (
     CENTER,
@@ -57,6 +67,13 @@ class RayBiasedCrossAttention(CrossAttention):
         memory = ("memory.keys", "memory.values", "memory.patch_rays")
         radius = radius_field(config) if config.bandwidth == "radius" else {}
         return {name: MEMORY_FIELDS[name] for name in memory} | dict(CENTER_FIELD) | dict(radius)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """A fixed bandwidth reads no radius."""
+        if config.bandwidth == "fixed":
+            idle = ("sigma_sq_min", "radius_bound", "radius_min")
+            yield from without_effect(config, idle, "`bandwidth` is fixed")
 
     @property
     def gamma(self) -> Tensor:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import ClassVar, Literal
 
 from pydantic import Field
 from torch import Tensor
 
 from qgs.components import posact
-from qgs.contracts import Centers, ComponentConfig, Fields
+from qgs.contracts import (
+    Centers,
+    ComponentConfig,
+    Fields,
+    Problem,
+    RecipeContext,
+    without_effect,
+)
 from qgs.geometry.precision import at_least_float32
 from qgs.types import QueryState
 from qgs_locus.fields import (
@@ -35,6 +43,11 @@ class OffsetOptions(ComponentConfig):
         return posact(raw, self.input_limit, self.output_limit)
 
 
+def _idle_limits(config: OffsetOptions) -> Iterator[Problem]:
+    if config.offset == "linear":
+        yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
+
+
 class AnchorOffsetCenters(Centers):
     """mean = mu + posact(offset)."""
 
@@ -49,6 +62,11 @@ class AnchorOffsetCenters(Centers):
     def requires(cls, config: Config) -> Fields:
         """Centres."""
         return CENTER_FIELD
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Limits are those of posact."""
+        return _idle_limits(config)
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
@@ -69,6 +87,11 @@ class RadiusScaledCenters(Centers):
     def requires(cls, config: Config) -> Fields:
         """Centres and radii."""
         return {**CENTER_FIELD, **radius_field(config)}
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Limits are those of posact."""
+        return _idle_limits(config)
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import Mlp, posact
-from qgs.contracts import Fields, ModelDims, Refinement
+from qgs.contracts import Fields, ModelDims, Problem, RecipeContext, Refinement, without_effect
 from qgs.geometry.precision import at_least_float32
 from qgs.types import QueryState
 from qgs_locus.fields import CENTER, CENTER_FIELD, RAW_RADIUS, RadiusOptions, radius_field
@@ -60,6 +61,25 @@ class AnchorRefinement(Refinement):
     def provides(cls, config: Config) -> Fields:
         """Whatever is refined."""
         return cls.requires(config)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Something must be refined, and every option must matter."""
+        if not config.center and not config.radius:
+            yield Problem(
+                "",
+                "`center` and `radius` are both false: nothing is refined",
+                "set one of them to true, or use `qgs/none` in the slot `refinement`",
+            )
+        limits = ("input_limit", "output_limit")
+        if not config.center:
+            idle = ("center_step", *limits)
+            yield from without_effect(config, idle, "`center` is false")
+        elif config.center_step == "linear":
+            yield from without_effect(config, limits, "`center_step` is linear")
+        if not config.radius:
+            idle = ("radius_bound", "radius_min")
+            yield from without_effect(config, idle, "`radius` is false")
 
     def forward(self, state: QueryState) -> QueryState:
         """A state with moved centres and changed raw radii."""

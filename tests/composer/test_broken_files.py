@@ -1,0 +1,78 @@
+"""Mistakes in what a recipe extends, in overrides and in mappings."""
+
+from __future__ import annotations
+
+import pytest
+
+from qgs.composer import RecipeError, resolve
+
+
+def test_overrides_given_as_one_string():
+    with pytest.raises(RecipeError, match="overrides are a list of strings"):
+        resolve({"recipe": 1}, "seed=1")
+
+
+def test_mapping_that_contains_itself():
+    recipe: dict = {"recipe": 1}
+    recipe["model"] = recipe
+    with pytest.raises(RecipeError, match="contains itself"):
+        resolve(recipe)
+
+
+def test_missing_base_suggests_neither_its_reader_nor_something_else(write):
+    write("recipe: 1\n", "zebra.yaml")
+    recipe = write("recipe: 1\nextends: recipes.yaml\nmodle: {}\n")
+    with pytest.raises(RecipeError) as caught:
+        resolve(recipe)
+    base, key = caught.value.problems
+    assert base.fix.startswith("check the path")
+    assert key.path == "modle"
+
+
+def test_missing_base_of_a_mapping(write):
+    write("recipe: 1\n", "base.yaml")
+    with pytest.raises(RecipeError) as caught:
+        resolve({"recipe": 1, "extends": "bases.yaml"})
+    (problem,) = caught.value.problems
+    assert problem.path == "extends"
+    assert "did you mean `base.yaml`" in problem.fix
+    assert "working directory" in problem.fix
+
+
+def test_cycle_is_named_with_its_whole_chain(write):
+    write("recipe: 1\nextends: b.yaml\n", "a.yaml")
+    write("recipe: 1\nextends: c.yaml\n", "b.yaml")
+    write("recipe: 1\nextends: a.yaml\n", "c.yaml")
+    with pytest.raises(RecipeError) as caught:
+        resolve("a.yaml")
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line, problem.path) == ("c.yaml", 2, "extends")
+    assert "a.yaml -> b.yaml -> c.yaml -> a.yaml" in problem.reason
+    assert "remove" in problem.fix
+
+
+def test_mistake_in_an_extended_file_is_found_there(write):
+    write("recipe: 1\nmodel:\n  queries: {count: 0}\n", "base.yaml")
+    recipe = write("recipe: 1\nextends: base.yaml\nmodel:\n  queries: {std: 0.5}\n")
+    with pytest.raises(RecipeError) as caught:
+        resolve(recipe)
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line) == ("base.yaml", 3)
+
+
+@pytest.mark.parametrize(
+    ("override", "path", "reason"),
+    [
+        ("model.queries.count", "model.queries.count", "is no override"),
+        ("model..count=3", "model..count", "is no override"),
+        ("model.queries.count=[1", "model.queries.count", "no valid YAML"),
+        ("model.queries.count=x", "model.queries.count", "must be an integer"),
+        ("extends=a.yaml", "extends", "cannot set"),
+    ],
+)
+def test_broken_override(override, path, reason, write):
+    with pytest.raises(RecipeError) as caught:
+        resolve(write("recipe: 1\n"), ["seed=1", override])
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.path) == ("--set #2", path)
+    assert reason in problem.reason
