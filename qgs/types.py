@@ -9,6 +9,7 @@ Every container is frozen. A component returns a new one and never writes into t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
@@ -21,7 +22,11 @@ class _TensorContainer:
     """Moves every tensor of a frozen dataclass, one level of nesting included."""
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Return a copy with every tensor moved as by `Tensor.to`."""
+        """Return a copy with every tensor moved as by `Tensor.to`.
+
+        A dtype converts every tensor, poses, rays and other geometry included, which then is no
+        longer the float32 that components count on.
+        """
 
         def move(value: Any) -> Any:
             if isinstance(value, Tensor | _TensorContainer):
@@ -43,6 +48,11 @@ def _expect(name: str, tensor: Tensor, trailing: tuple[int | None, ...]) -> None
     if not matches:
         wanted = ", ".join("*" if size is None else str(size) for size in trailing)
         raise ValueError(f"{name} must have shape (..., {wanted}), got {tuple(tensor.shape)}")
+
+
+def _expect_shape(name: str, tensor: Tensor, wanted: tuple[int, ...]) -> None:
+    if tuple(tensor.shape) != wanted:
+        raise ValueError(f"{name} must have shape {wanted}, got {tuple(tensor.shape)}")
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,11 @@ class Views(_TensorContainer):
                 "add a leading dimension for a single scene"
             )
         _expect("Views.images", self.images, (3, *self.cameras.size))
+        if not self.images.is_floating_point():
+            raise ValueError(
+                f"Views.images must be floating-point numbers in [0, 1], got {self.images.dtype}; "
+                "divide 8-bit images by 255: `images.float() / 255`"
+            )
         if self.images.shape[:2] != self.cameras.shape:
             raise ValueError(
                 f"Views.images has {tuple(self.images.shape[:2])} scenes and views, "
@@ -124,13 +139,39 @@ class ImageMemory(_TensorContainer):
     features: Tensor
     patch_rays: Tensor
     grid: tuple[int, int, int]
-    _derived: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _derived: dict[tuple[str, bool, bool], Tensor] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def __post_init__(self) -> None:
+        _expect("ImageMemory.patch_rays", self.patch_rays, (6,))
+        if self.features.ndim != 3 or self.keys.ndim != 4:
+            raise ValueError(
+                "ImageMemory.features must have shape (B, M, D) and .keys (B, h, M, D/h), got "
+                f"{tuple(self.features.shape)} and {tuple(self.keys.shape)}"
+            )
+        batch, tokens, _ = self.features.shape
+        _expect_shape("ImageMemory.patch_rays", self.patch_rays, (batch, tokens, 6))
+        _expect_shape("ImageMemory.values", self.values, tuple(self.keys.shape))
+        if (self.keys.shape[0], self.keys.shape[2]) != (batch, tokens):
+            raise ValueError(
+                f"ImageMemory.keys must be of the {batch} scenes and {tokens} tokens of .features, "
+                f"got {tuple(self.keys.shape)}"
+            )
+        if math.prod(self.grid) != tokens:
+            raise ValueError(f"ImageMemory.grid {self.grid} must hold the {tokens} tokens")
 
     def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """What `compute` makes of this memory, computed by the first layer that asks for `name`."""
-        if name not in self._derived:
-            self._derived[name] = compute()
-        return self._derived[name]
+        """What `compute` makes of this memory, computed by the first layer that asks for `name`.
+
+        A memo, and no part of the value: copies start without it. `name` belongs to the caller,
+        who prefixes it with the plugin's name. What was computed without gradients, or in
+        inference mode, is computed again where they are wanted.
+        """
+        key = (name, torch.is_grad_enabled(), torch.is_inference_mode_enabled())
+        if key not in self._derived:
+            self._derived[key] = compute()
+        return self._derived[key]
 
 
 @dataclass(frozen=True)
@@ -139,6 +180,19 @@ class QueryState(_TensorContainer):
 
     features: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.features.ndim != 3:
+            raise ValueError(
+                f"QueryState.features must have shape (B, N, D), got {tuple(self.features.shape)}"
+            )
+        count = tuple(self.features.shape[:2])
+        for name, tensor in self.fields.items():
+            if tuple(tensor.shape[:2]) != count:
+                raise ValueError(
+                    f"the field {name} must have shape {(*count, '...')} as the features have, "
+                    f"got {tuple(tensor.shape)}"
+                )
 
     def __getitem__(self, name: str) -> Tensor:
         return self.fields[name]
@@ -167,6 +221,12 @@ class GaussianAttributes(_TensorContainer):
     opacities: Tensor
     colors: Tensor
 
+    def __post_init__(self) -> None:
+        count = tuple(self.offsets.shape[:-1])
+        _expect_shape("GaussianAttributes.opacities", self.opacities, count)
+        for name, size in (("offsets", 3), ("scales", 3), ("quats", 4), ("colors", 3)):
+            _expect_shape(f"GaussianAttributes.{name}", getattr(self, name), (*count, size))
+
 
 @dataclass(frozen=True)
 class Gaussians(_TensorContainer):
@@ -183,19 +243,10 @@ class Gaussians(_TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        count = self.means.shape[:-1]
-        for name, trailing in (("means", 3), ("scales", 3), ("quats", 4), ("colors", 3)):
-            tensor = getattr(self, name)
-            if tensor.shape != (*count, trailing):
-                raise ValueError(
-                    f"Gaussians.{name} must have shape {(*count, trailing)}, "
-                    f"got {tuple(tensor.shape)}"
-                )
-        if self.opacities.shape != count:
-            raise ValueError(
-                f"Gaussians.opacities must have shape {tuple(count)}, "
-                f"got {tuple(self.opacities.shape)}"
-            )
+        count = tuple(self.means.shape[:-1])
+        for name, size in (("means", 3), ("scales", 3), ("quats", 4), ("colors", 3)):
+            _expect_shape(f"Gaussians.{name}", getattr(self, name), (*count, size))
+        _expect_shape("Gaussians.opacities", self.opacities, count)
 
     @property
     def count(self) -> int:
@@ -218,6 +269,16 @@ class Rendering(_TensorContainer):
     alpha: Tensor
     depth: Tensor
 
+    def __post_init__(self) -> None:
+        if self.rgb.ndim != 5:
+            raise ValueError(
+                f"Rendering.rgb must have shape (B, V, 3, H, W), got {tuple(self.rgb.shape)}"
+            )
+        _expect("Rendering.rgb", self.rgb, (3, *self.rgb.shape[-2:]))
+        single = (*self.rgb.shape[:2], 1, *self.rgb.shape[-2:])
+        _expect_shape("Rendering.alpha", self.alpha, single)
+        _expect_shape("Rendering.depth", self.depth, single)
+
 
 @dataclass(frozen=True)
 class SpatialSupport(_TensorContainer):
@@ -228,6 +289,10 @@ class SpatialSupport(_TensorContainer):
 
     centers: Tensor
     axes: Tensor
+
+    def __post_init__(self) -> None:
+        _expect("SpatialSupport.centers", self.centers, (3,))
+        _expect_shape("SpatialSupport.axes", self.axes, (*self.centers.shape, 3))
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,10 @@ def compose(
     recipe: Annotated[Path, typer.Argument(help="Recipe file.")],
     overrides: Overrides = None,
 ) -> None:
-    """The resolved recipe, where each value comes from, and parameters per component."""
+    """The resolved recipe, where each value comes from, and parameters per component.
+
+    The recipe goes to standard output and is valid YAML; the parameters go to standard error.
+    """
     from rich.console import Console
 
     from qgs.cli.tables import parameter_table
@@ -50,7 +53,7 @@ def compose(
 
     resolved = resolve(recipe, overrides or ())
     typer.echo(annotated(resolved))
-    Console().print(parameter_table(resolved))
+    Console(stderr=True).print(parameter_table(resolved))
 
 
 def diff(

@@ -12,7 +12,7 @@ from torch import nn
 from qgs.composer import Recipe
 from qgs.composer.registry import InstalledPlugin, default_config, load_sound_plugins
 from qgs.composer.show import flat
-from qgs.composer.slots import LAYER_SLOTS, SLOTS
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
 from qgs.composer.suggest import did_you_mean
 from qgs.composer.yaml12 import dump
 from qgs.contracts import Component
@@ -23,14 +23,14 @@ def component_tables(slot: str | None) -> tuple[list[Table], list[str]]:
 
     Raises ValueError for a slot that does not exist.
     """
-    slot = slot.removeprefix("decoder.") if slot else None
+    slot = slot.removeprefix("model.").removeprefix("decoder.") if slot else None
     if slot is not None and slot not in SLOTS:
         raise ValueError(f"there is no slot `{slot}`; {did_you_mean(slot, SLOTS, 'slots')}")
     registry, broken = load_sound_plugins()
     tables = []
     for name in [slot] if slot else SLOTS:
         default = SLOTS[name].default
-        title = f"{name} (default {default})" if default else name
+        title = f"{recipe_path(name)} (default {default})" if default else recipe_path(name)
         table = Table(title=title, title_justify="left")
         for column in ("type", "options", "requires", "provides", "origin"):
             table.add_column(column, overflow="fold")
@@ -39,6 +39,13 @@ def component_tables(slot: str | None) -> tuple[list[Table], list[str]]:
             table.add_row(kind, *map(escape, row))
         tables.append(table)
     return tables, broken
+
+
+def recipe_path(slot: str) -> str:
+    """Where in a recipe the components of `slot` are written."""
+    if slot in MODEL_SLOTS:
+        return f"model.{slot}"
+    return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
 
 
 def parameter_table(recipe: Recipe) -> Table:
@@ -54,21 +61,23 @@ def parameter_table(recipe: Recipe) -> Table:
 
 
 def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Table]:
-    """Values that differ, and parameters that differ, of two recipes called `a` and `b`."""
+    """Slots, then options and settings, then parameters that differ in recipes called `a`, `b`.
+
+    Options are compared where both recipes have the same component.
+    """
     ours, theirs = flat(first.tree), flat(second.tree)
-    values = Table("path", a, b, title="values that differ", title_justify="left")
-    for path in [*ours, *(path for path in theirs if path not in ours)]:
-        if ours.get(path, _MISSING) != theirs.get(path, _MISSING):
-            values.add_row(path, escape(_word(ours, path)), escape(_word(theirs, path)))
-    counts, others = parameter_counts(first), parameter_counts(second)
-    parameters = Table("component", a, b, "difference", title="parameters", title_justify="left")
-    for column in parameters.columns[1:]:
-        column.justify = "right"
-    for name, count in counts.items():
-        _add_difference(parameters, name, count, others[name])
-    parameters.add_section()
-    _add_difference(parameters, "total", sum(counts.values()), sum(others.values()))
-    return [values, parameters]
+    paths = [*ours, *(path for path in theirs if path not in ours)]
+    differing = [p for p in paths if ours.get(p, _MISSING) != theirs.get(p, _MISSING)]
+    kinds = [path for path in differing if path.endswith(".type")]
+    swapped = tuple(path.removesuffix("type") for path in kinds)
+    options = [path for path in differing if not path.startswith(swapped)] if swapped else differing
+    slots, values = _differences("slot", a, b), _differences("option", a, b)
+    for path in kinds:
+        name = path.removesuffix(".type")
+        slots.add_row(name, escape(_word(ours, path)), escape(_word(theirs, path)))
+    for path in options:
+        values.add_row(path, escape(_word(ours, path)), escape(_word(theirs, path)))
+    return [slots, values, _parameter_differences(first, second, a, b)]
 
 
 def parameter_counts(recipe: Recipe) -> dict[str, int]:
@@ -85,6 +94,26 @@ def parameter_counts(recipe: Recipe) -> dict[str, int]:
 
 
 _MISSING = object()
+
+
+def _differences(what: str, a: str, b: str) -> Table:
+    table = Table(title=f"{what}s that differ", title_justify="left")
+    for header in (what, a, b):
+        table.add_column(escape(header), overflow="fold")
+    return table
+
+
+def _parameter_differences(first: Recipe, second: Recipe, a: str, b: str) -> Table:
+    table = Table(title="parameters", title_justify="left")
+    table.add_column("component", overflow="fold")
+    for header in (a, b, "difference"):
+        table.add_column(escape(header), justify="right", overflow="fold")
+    counts, others = parameter_counts(first), parameter_counts(second)
+    for name, count in counts.items():
+        _add_difference(table, name, count, others[name])
+    table.add_section()
+    _add_difference(table, "total", sum(counts.values()), sum(others.values()))
+    return table
 
 
 def _count(module: nn.Module) -> int:

@@ -14,7 +14,9 @@ from qgs.types import QueryState
 class Centers(ModelComponent):
     """(raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
 
-    The state is the one after the last refinement of the decoded layer.
+    The state is the one after the refinement of the decoded layer. Means are finite for finite
+    offsets. Raises KeyError for a field the state lacks, which the composer rules out through
+    `requires`.
     """
 
     slot: ClassVar[str] = "centers"

@@ -16,7 +16,9 @@ class CrossAttention(ModelComponent):
     """(QueryState, ImageMemory) -> update (B, N, D).
 
     Pre-norm and output projection belong to the component; LayerScale and the residual sum belong
-    to the decoder layer. Neither argument is changed.
+    to the decoder layer. Neither argument is changed. Raises KeyError for a field the state lacks,
+    which the composer rules out through `requires`, and RuntimeError (torch's) for a memory of
+    another width or number of heads.
     """
 
     slot: ClassVar[str] = "cross_attention"

@@ -11,7 +11,10 @@ from qgs.contracts.component import ModelComponent
 
 
 class FeedForward(ModelComponent):
-    """Features (B, N, D) -> update (B, N, D); norm inside, LayerScale and residual outside."""
+    """Features (B, N, D) -> update (B, N, D); norm inside, LayerScale and residual outside.
+
+    Sees each query by itself. Raises RuntimeError (torch's) for features of another width.
+    """
 
     slot: ClassVar[str] = "feed_forward"
 

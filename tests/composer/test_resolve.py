@@ -78,7 +78,8 @@ def test_anchors_and_aliases_are_written_out():
 
 WORDS = st.sampled_from(["1e-4", "off", "12:30", "true", "null", "", "0o17", ".5", "- a", "a: b"])
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=6) | WORDS
-SCALARS = st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | st.floats(allow_nan=False) | TEXTS
+INTEGERS = st.integers(-(2**63) + 1, 2**63 - 1)
+SCALARS = st.none() | st.booleans() | INTEGERS | st.floats(allow_nan=False) | TEXTS
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

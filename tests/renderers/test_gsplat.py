@@ -106,7 +106,8 @@ def test_auto_goes_by_where_the_gaussians_are(make_scene, monkeypatch):
     found = AutoRenderer(RendererConfig())(gaussians, cameras)
     assert torch.equal(found.rgb, CpuRenderer(RendererConfig())(gaussians, cameras).rgb)
 
-    answer = Rendering(*torch.zeros(3, 1))
+    flat = torch.zeros(1, 1, 1, 2, 2)
+    answer = Rendering(flat.expand(-1, -1, 3, -1, -1), flat, flat)
     monkeypatch.setattr(
         auto_module, "GsplatRenderer", lambda config: lambda *inputs: (answer, inputs)
     )

@@ -142,7 +142,8 @@ def test_fields_stay_float32_under_autocast() -> None:
 
 def test_bandwidths_have_their_floor() -> None:
     attention = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(), DIMS)
-    state = _state().replace(fields={"anchor.raw_radius": torch.tensor([[[-20.0], [20.0]]])})
+    raw = torch.tensor([[[-20.0], [20.0]]])
+    state = _state(1, 2).replace(fields={"anchor.raw_radius": raw})
     torch.testing.assert_close(attention.sigma_sq(state), torch.tensor([[[1e-3], [4.0]]]))
     fixed = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(bandwidth="fixed"), DIMS)
     assert fixed.sigma_sq(state) == pytest.approx(0.01)
