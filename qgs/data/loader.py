@@ -1,8 +1,8 @@
-"""Endless training batches that can be resumed at any step."""
+"""Endless training batches, which may start at any number."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
@@ -17,12 +17,12 @@ __all__ = ["evaluation_samples", "training_batches"]
 
 def training_batches(
     source: SceneSource, views: ViewsConfig, batch_size: int, seed: int, start: int = 0
-) -> Iterator[Batch]:
+) -> Generator[Batch, None, None]:
     """Batches start, start + 1, ... of an endless sequence.
 
     Each epoch visits every training scene once, in an order of its own. Sample k, the k-th of the
     whole sequence, depends on (seed, k) alone, so `start` resumes exactly. The next batch is made
-    in a thread while the caller uses this one.
+    in a thread while the caller uses this one; closing the generator ends that thread.
 
     Raises ValueError when the source has no training scenes or a scene has too few frames.
     """
@@ -53,7 +53,7 @@ def _drawer(scenes: Sequence[Scene], views: ViewsConfig, seed: int) -> Callable[
     return draw
 
 
-def _prefetched(batch: Callable[[int], Batch], start: int) -> Iterator[Batch]:
+def _prefetched(batch: Callable[[int], Batch], start: int) -> Generator[Batch, None, None]:
     """Yield batch(start), batch(start + 1), ..., each made while the one before is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         number, pending = start, pool.submit(batch, start)

@@ -15,18 +15,26 @@ EMPTY_ALPHA = 2e-3
 """Mean alpha below which a rendering shows the background alone."""
 
 FLAT = 1 / 255
-"""Largest deviation from the background of a rendering that shows nothing else."""
+"""Mean deviation from the background of a rendering that shows nothing else."""
 
 NO_GRADIENT = 1e-8
 """Gradient norm of a model that learns nothing any more."""
 
-REMEDIES = (
+COLLAPSE_REMEDIES = (
     "a learning rate too high for this model (lower training.learning_rate, lengthen "
     "training.warmup)",
     "a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
     "behind_camera: invisible)",
     "an initialisation that hides every Gaussian (raise model.head.opacity_bias, check "
     "views.scale_factor against the anchors' and the scenes' depth)",
+)
+
+BROKEN_REMEDIES = (
+    "a learning rate too high for this model (lower training.learning_rate, lengthen "
+    "training.warmup)",
+    "a range that bfloat16 does not hold (training.precision: float32)",
+    "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; with "
+    "views.scale distance, at input cameras that almost stand on one point)",
 )
 
 
@@ -44,8 +52,12 @@ class Vitals:
 
 
 def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean alpha, and largest |rgb - background| of renderings (B, V, C, H, W); both 0-d."""
-    return alpha.mean(), (rgb - background[:, None, None]).abs().amax()
+    """Mean alpha, and the largest of the views' mean |rgb - background|; both 0-d.
+
+    rgb: (B, V, 3, H, W). Means over a view's pixels, so that a stray splat is no sign of life.
+    """
+    deviation = (rgb - background[:, None, None]).abs().mean((-3, -2, -1))
+    return alpha.mean(), deviation.amax()
 
 
 class CollapseDetector:
@@ -72,6 +84,10 @@ class CollapseDetector:
     def collapsed(self) -> bool:
         """Whether the window is full of dead steps."""
         return self.dead_steps >= self.window
+
+    def dead_after(self, steps: int) -> bool:
+        """Whether a run that ends after `steps` never lived, or filled the window with death."""
+        return self.dead_steps >= min(self.window, steps)
 
     def _symptom_of(self, vitals: Vitals) -> str:
         if vitals.alpha < EMPTY_ALPHA:
@@ -113,6 +129,12 @@ class GoodWeights:
         return {name: t.detach().to("cpu", copy=True) for name, t in tensors.items()}
 
 
+def broken_tensors(model: nn.Module) -> str:
+    """Which tensors of `model` hold NaN or infinity; "" if none does."""
+    names = [n for n, t in unique_tensors(model).items() if not torch.isfinite(t).all()]
+    return f"weights are not finite: {_listed(names)}" if names else ""
+
+
 def not_finite(terms: Mapping[str, float], module: nn.Module, gradient: float) -> str:
     """What is NaN or infinite: loss terms, else tensors with such gradients; "" if nothing is."""
     bad = [
@@ -127,5 +149,8 @@ def not_finite(terms: Mapping[str, float], module: nn.Module, gradient: float) -
         for name, parameter in module.named_parameters()
         if parameter.grad is not None and not torch.isfinite(parameter.grad).all()
     ]
-    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    return f"the gradient norm is {gradient}" + (f", from {shown}" if shown else "")
+    return f"the gradient norm is {gradient}" + (f", from {_listed(names)}" if names else "")
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -21,20 +21,21 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: str | Path) -> Self:
-        """A new folder at `path`; an empty one is taken as new.
-
-        Raises FileExistsError when `path` is a file or holds anything.
-        """
+        """A new folder at `path`; an empty one is taken as new. Raises as `refuse_used`."""
         folder = cls(path)
-        if folder.path.is_file():
-            raise FileExistsError(f"{path} is a file; choose another folder for this run")
-        if folder.path.is_dir() and any(folder.path.iterdir()):
-            raise FileExistsError(
-                f"{path} is not empty and a run never overwrites another; choose another folder "
-                "or delete it yourself"
-            )
+        folder.refuse_used()
         folder.path.mkdir(parents=True, exist_ok=True)
         return folder
+
+    def refuse_used(self) -> None:
+        """Raise FileExistsError when the path is a file or a folder that holds anything."""
+        if self.path.is_file():
+            raise FileExistsError(f"{self.path} is a file; choose another folder for this run")
+        if self.path.is_dir() and any(self.path.iterdir()):
+            raise FileExistsError(
+                f"{self.path} is not empty and a run never overwrites another; choose another "
+                "folder or delete it yourself"
+            )
 
     @property
     def checkpoint(self) -> Path:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Iterator
-from contextlib import nullcontext
+from collections.abc import Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import NoReturn
 
 import torch
 from accelerate import Accelerator
@@ -15,16 +18,18 @@ from torch import Tensor
 
 from qgs.composer import Recipe
 from qgs.data.loader import training_batches
-from qgs.data.sampling import Batch
 from qgs.engine.collapse import (
-    REMEDIES,
+    BROKEN_REMEDIES,
+    COLLAPSE_REMEDIES,
     CollapseDetector,
     CollapseError,
     GoodWeights,
     Vitals,
+    broken_tensors,
     measure,
     not_finite,
 )
+from qgs.engine.device import choose_device
 from qgs.engine.folder import RunFolder
 from qgs.engine.interrupt import StopRequest, stop_requests
 from qgs.engine.objective import Objective, Outcome
@@ -36,12 +41,15 @@ from qgs.io.checkpoint import save
 from qgs.metrics import psnr
 from qgs.model import QueryGaussianModel
 
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class TrainingResult:
     """What a run left: the trained model, its folder, optimiser steps, seconds on the clock.
 
-    stopped_by: name of the signal that ended it early, else None.
+    stopped_by: name of the signal that ended it early, else None; SIGTERM where another process got
+    the signal. main: whether this is the one process, of several, that writes files.
     """
 
     model: QueryGaussianModel
@@ -49,44 +57,53 @@ class TrainingResult:
     steps: int
     seconds: float
     stopped_by: str | None
+    main: bool
 
 
-def train(recipe: Recipe, run: str | Path, *, console: Console | None = None) -> TrainingResult:
-    """Train the model of `recipe` and leave everything in the folder `run`.
+def train(
+    recipe: Recipe, run: str | Path, *, console: Console | None = None, device: str = "auto"
+) -> TrainingResult:
+    """Train the model of `recipe` on `device` and leave everything in the folder `run`.
 
     Writes recipe.yaml, history.jsonl (one record per optimiser step) and checkpoint.safetensors: on
     schedule, at the end, and after SIGINT or SIGTERM, which finish the step and return. The clock
-    of `training.seconds` starts after the first step, in which kernels compile.
+    of `training.seconds` starts after the first step, in which kernels compile. A start that fails,
+    for want of data for instance, leaves no folder. Of several processes the main one writes.
 
-    Raises FileExistsError when `run` holds anything, and CollapseError when the model died; the
-    checkpoint then holds the last good weights.
+    Raises FileExistsError when `run` holds anything, ValueError as `choose_device` and `OneCycle`,
+    what the data source raises, and CollapseError when the model died; the checkpoint then holds
+    the last good weights.
     """
-    folder = RunFolder.create(run)
-    folder.write_recipe(recipe)
+    RunFolder(run).refuse_used()
+    console = console or Console(stderr=True)
+    chosen = choose_device(device, lambda text: console.print(text, soft_wrap=True))
     set_seed(recipe.seed)
-    trainer = Trainer(recipe, folder)
-    try:
-        with TrainingProgress(console or Console(stderr=True)) as progress, stop_requests() as stop:
+    with closing(Trainer(recipe, run, chosen)) as trainer:
+        if not trainer.accelerator.is_main_process:
+            console = Console(quiet=True)
+        with TrainingProgress(console) as progress, stop_requests() as stop:
             return trainer.run(progress, stop)
-    finally:
-        folder.close()
 
 
 class Trainer:
-    """The state of one run: model, optimiser, clock, detector."""
+    """The state of one run: model, optimiser, data, clock, detector.
 
-    def __init__(self, recipe: Recipe, folder: RunFolder) -> None:
+    Making one opens the data and draws the first batch, but touches no file of `run`; the folder is
+    made after the first step, when nothing is missing any more.
+    """
+
+    def __init__(self, recipe: Recipe, run: str | Path, device: str = "cpu") -> None:
+        self.recipe = recipe
         self.config = recipe.training
-        self.folder = folder
-        self.accelerator = Accelerator(cpu=not torch.cuda.is_available(), mixed_precision="no")
+        self.folder = RunFolder(run)
+        self.schedule = OneCycle(self.config)
+        self.accelerator = Accelerator(cpu=device == "cpu", mixed_precision="no")
         self.device = self.accelerator.device
         self.model = recipe.build_model(device=self.device).train()
-        self._batches = self._stream(recipe)
         objective = Objective(self.model, recipe.build_losses()).to(self.device)
         self.objective, self.optimizer = self.accelerator.prepare(
             objective, make_optimizer(objective, self.config)
         )
-        self.schedule = OneCycle(self.config)
         self.detector = CollapseDetector(self.config.collapse_window)
         self.good = GoodWeights(self.model)
         self.background = torch.tensor(self.model.renderer.config.background, device=self.device)
@@ -94,25 +111,42 @@ class Trainer:
         self.images = 0
         self.seconds = 0.0
         self._clock_started: float | None = None
+        self._folder_is_open = False
+        seed = recipe.seed + 1_000_003 * self.accelerator.process_index
+        self._stream = training_batches(
+            recipe.build_data(), recipe.views, self.config.batch_size, seed
+        )
+        self._batches = chain([next(self._stream)], self._stream)
+
+    def close(self) -> None:
+        """Stop reading ahead and close the history."""
+        self._stream.close()
+        self.folder.close()
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
         while self.used < 1:
             record = self._optimise(stop)
-            self.folder.append(record)
+            self._open_folder()
+            if self.accelerator.is_main_process:
+                self.folder.append(record)
             shown = progress.update(
                 self.step, record["loss"], record["psnr"], self.images, self.seconds, self.used
             )
             if shown:
                 self.folder.flush()
             if self.detector.collapsed:
-                self._give_up(f"for {self.detector.dead_steps} steps {self.detector.symptom}")
+                symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
+                self._give_up(symptom, COLLAPSE_REMEDIES)
             self._keep_good_weights()
             if record["stop"]:
                 break
-        self._finish(stop)
-        name = stop.signal.name if stop.signal else None
-        return TrainingResult(self.model.eval(), self.folder, self.step, self.seconds, name)
+        stopped_by = self._stopped_by(stop)
+        self._finish(stopped_by)
+        main = self.accelerator.is_main_process
+        return TrainingResult(
+            self.model.eval(), self.folder, self.step, self.seconds, stopped_by, main
+        )
 
     @property
     def used(self) -> float:
@@ -121,12 +155,14 @@ class Trainer:
         of_seconds = self.seconds / self.config.seconds if self.config.seconds else 0.0
         return max(of_steps, of_seconds)
 
-    def _stream(self, recipe: Recipe) -> Iterator[Batch]:
-        rank = self.accelerator.process_index
-        seed = recipe.seed + 1_000_003 * rank
-        return iter(
-            training_batches(recipe.build_data(), recipe.views, self.config.batch_size, seed)
-        )
+    def _open_folder(self) -> None:
+        """Make the folder, once, and write the recipe. Raises FileExistsError."""
+        if self._folder_is_open:
+            return
+        self._folder_is_open = True
+        if self.accelerator.is_main_process:
+            RunFolder.create(self.folder.path).write_recipe(self.recipe)
+        self.accelerator.wait_for_everyone()
 
     def _optimise(self, stop: StopRequest) -> dict[str, float]:
         """One optimiser step; returns its record for the history."""
@@ -140,9 +176,7 @@ class Trainer:
         record = self._read(measured, stop)
         self._refuse_nonfinite(record)
         self.optimizer.step()
-        self.detector.observe(
-            Vitals(record.pop("alpha"), record.pop("deviation"), record["gradient"])
-        )
+        self.detector.observe(Vitals(record["alpha"], record["deviation"], record["gradient"]))
         self.step += 1
         self._tick()
         return {"step": self.step, "seconds": self.seconds, "lr": rate, **record}
@@ -204,35 +238,54 @@ class Trainer:
         terms = {k: v for k, v in record.items() if k not in ("gradient", "stop", "psnr")}
         problem = not_finite(terms, self.model, record["gradient"])
         if problem:
-            self._give_up(problem)
+            self._give_up(problem, BROKEN_REMEDIES)
 
     def _keep_good_weights(self) -> None:
         if self.detector.dead_steps:
             return
         if self.step % self.config.collapse_window == 0:
+            self._refuse_broken_weights()
             self.good.refresh(self.step)
         if self.config.save_every and self.step % self.config.save_every == 0:
             self._save()
 
-    def _finish(self, stop: StopRequest) -> None:
-        if not self.detector.dead_steps:
-            self._save()
-        elif stop:
-            self._save_good()
-        else:
-            self._give_up(f"for the last {self.detector.dead_steps} steps {self.detector.symptom}")
+    def _refuse_broken_weights(self) -> None:
+        problem = broken_tensors(self.model)
+        if problem:
+            self._give_up(problem, BROKEN_REMEDIES)
 
-    def _give_up(self, problem: str) -> None:
+    def _stopped_by(self, stop: StopRequest) -> str | None:
+        """The signal's name when any process was asked to stop."""
+        asked = self._mean(torch.tensor(float(bool(stop)), device=self.device))
+        name = stop.signal.name if stop.signal else "SIGTERM"
+        return name if float(asked) else None
+
+    def _finish(self, stopped_by: str | None) -> None:
+        dead = self.detector.dead_steps
+        symptom = f"for the last {dead} steps {self.detector.symptom}"
+        if self.detector.dead_after(self.step) and not stopped_by:
+            self._give_up(symptom, COLLAPSE_REMEDIES)
+        if self.detector.dead_after(self.step):
+            self._save_good()
+            return
+        if dead:
+            _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
+        self._save()
+
+    def _give_up(self, problem: str, causes: Sequence[str]) -> NoReturn:
+        self._open_folder()
         self._save_good()
-        remedies = "".join(f"\n  - {remedy}" for remedy in REMEDIES)
+        remedies = "".join(f"\n  - {cause}" for cause in causes)
         raise CollapseError(
             f"training collapsed at step {self.step}: {problem}. The weights of step "
             f"{self.good.step} are kept in {self.folder.checkpoint}. Likely causes:{remedies}"
         )
 
     def _save(self) -> None:
+        self._refuse_broken_weights()
         if self.accelerator.is_main_process:
             save(self.model, self.folder.checkpoint, extra={"step": str(self.step)})
+        self.accelerator.wait_for_everyone()
 
     def _save_good(self) -> None:
         if self.accelerator.is_main_process:
@@ -242,3 +295,4 @@ class Trainer:
                 extra={"step": str(self.good.step)},
                 weights=self.good.tensors,
             )
+        self.accelerator.wait_for_everyone()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe
+from qgs.contracts import TrainingConfig
 from qgs.data.loader import evaluation_samples
 from qgs.engine import CollapseError, RunFolder, train
 from qgs.engine.collapse import (
@@ -19,6 +21,8 @@ from qgs.engine.collapse import (
     CollapseDetector,
     GoodWeights,
     Vitals,
+    broken_tensors,
+    measure,
     not_finite,
 )
 from qgs.engine.interrupt import StopRequest
@@ -103,9 +107,9 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
         "training.warmup=300",
         "training.learning_rate=2.0",
         "training.initial_divisor=1e5",
-        "training.collapse_window=10",
-        "training.save_every=1",
+        "training.save_every=25",
     )
+    assert recipe.training.collapse_window == TrainingConfig().collapse_window
     with pytest.raises(CollapseError) as caught:
         train(recipe, tmp_path / "run", console=QUIET)
     message = str(caught.value)
@@ -114,7 +118,9 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     folder = RunFolder(tmp_path / "run")
     history = folder.history()
     kept = int(load_extra(folder.checkpoint)["step"])
-    assert 0 < kept < len(history) < 300
+    dead = [record["step"] for record in history if record["alpha"] < EMPTY_ALPHA]
+    assert len(history) <= dead[0] + 100
+    assert kept < len(history) < 300
     assert mean_alpha(folder.checkpoint, recipe) > EMPTY_ALPHA
 
 
@@ -143,10 +149,63 @@ def test_a_run_that_ends_inside_a_collapse_fails_too(
 
 
 def test_nan_stops_at_once_with_finite_weights(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    trainer = Trainer(tiny("locus"), RunFolder.create(tmp_path / "run"))
+    trainer = Trainer(tiny("locus"), tmp_path / "run")
     with torch.no_grad():
         trainer.model.decoder[0].feed_forward_scale.gamma.fill_(torch.nan)
-    with pytest.raises(CollapseError, match=r"step 0: .*nan"):
+    with closing(trainer), pytest.raises(CollapseError, match=r"step 0: .*nan") as caught:
         trainer.run(TrainingProgress(QUIET), StopRequest())
+    for cause in ("learning_rate", "precision", "images, poses"):
+        assert cause in str(caught.value)
+    assert "opacity_bias" not in str(caught.value)
     model = qgs.load(trainer.folder.checkpoint)
     assert all(p.isfinite().all() for p in model.parameters())
+
+
+def test_weights_that_are_not_finite_are_never_saved_as_good(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    trainer = Trainer(tiny("tokengs", "training.steps=3"), tmp_path / "run")
+    break_weights = trainer.model.queries.features.data.fill_
+
+    class BreakingAtTheEnd(TrainingProgress):
+        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
+            if step == 3:
+                break_weights(torch.nan)
+            return False
+
+    with (
+        closing(trainer),
+        pytest.raises(CollapseError, match=r"weights are not finite: queries\.features"),
+    ):
+        trainer.run(BreakingAtTheEnd(QUIET), StopRequest())
+    assert broken_tensors(qgs.load(trainer.folder.checkpoint)) == ""
+
+
+def test_one_dead_step_at_the_end_fails_no_run(
+    tiny: Callable[..., Recipe], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    trainer = Trainer(tiny("tokengs", "training.steps=3"), tmp_path / "run")
+
+    class DyingAtTheEnd(TrainingProgress):
+        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
+            if step == 3:
+                trainer.detector.observe(Vitals(0.0, 0.0, 0.0))
+            return False
+
+    with closing(trainer):
+        trainer.run(DyingAtTheEnd(QUIET), StopRequest())
+    assert load_extra(trainer.folder.checkpoint) == {"step": "3"}
+    assert "for the last 1 steps" in caplog.text
+
+
+def test_a_stray_splat_is_no_sign_of_life() -> None:
+    background = torch.ones(3)
+    rgb = torch.ones(2, 3, 3, 32, 32)
+    rgb[0, 0, :, 4:6, 4:6] = 0
+    alpha, deviation = measure(rgb, 1 - rgb[:, :, :1], background)
+    assert alpha < EMPTY_ALPHA
+    assert deviation == pytest.approx(4 / 32**2)
+    detector = CollapseDetector(10)
+    detector.observe(ALIVE)
+    detector.observe(Vitals(alpha=0.5, deviation=float(deviation), gradient=0.1))
+    assert "equal the background" in detector.symptom

@@ -38,6 +38,22 @@ def test_a_time_budget_takes_over_when_it_runs_out_first() -> None:
     assert rates[-1] == pytest.approx(schedule.last)
 
 
+def test_a_short_time_budget_cuts_the_warm_up() -> None:
+    schedule = OneCycle(TrainingConfig(steps=10_000, warmup=2000, seconds=10.0))
+    rates = [schedule.rate(step, step * 0.05) for step in range(201)]
+    assert max(rates) == pytest.approx(schedule.peak)
+    assert rates.index(max(rates)) == 20, "a tenth of the time"
+    assert rates[:21] == sorted(rates[:21])
+    assert rates[20:] == sorted(rates[20:], reverse=True)
+    assert rates[-1] == pytest.approx(schedule.last)
+
+
+def test_a_warm_up_that_never_ends_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"training\.warmup is 10, but training\.steps is 10"):
+        OneCycle(TrainingConfig(steps=10, warmup=10))
+    OneCycle(TrainingConfig(steps=10, warmup=10, seconds=5.0))
+
+
 def test_steps_take_over_when_time_is_plenty() -> None:
     timed = OneCycle(TrainingConfig(steps=50, warmup=10, seconds=1e6))
     plain = OneCycle(TrainingConfig(steps=50, warmup=10))

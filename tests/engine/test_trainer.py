@@ -17,6 +17,7 @@ from qgs.composer import Recipe, resolve
 from qgs.data.loader import training_batches
 from qgs.engine import RunFolder, train
 from qgs.engine.folder import checkpoint_of
+from qgs.engine.interrupt import stop_requests
 from qgs.io.checkpoint import load_extra
 
 QUIET = Console(quiet=True)
@@ -72,6 +73,7 @@ def test_accumulated_batches_are_one_larger_batch(
             f"training.batch_size={batch_size}",
             f"training.accumulate={accumulate}",
             "training.steps=1",
+            "training.warmup=0",
         )
         run = train(recipe, tmp_path / str(accumulate), console=QUIET)
         first.append(run.folder.history()[0])
@@ -124,6 +126,33 @@ def test_a_folder_in_use_is_refused_untouched(tiny: Callable[..., Recipe], tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(FileExistsError, match="is a file"):
         RunFolder.create(tmp_path / "notes.txt")
+
+
+def test_a_start_that_fails_leaves_no_folder(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    photos = {"type": "qgs/photos", "path": str(tmp_path / "nowhere"), "image_size": [32, 32]}
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        train(resolve({**tiny("tokengs").tree, "data": photos}), out, console=QUIET)
+    with pytest.raises(ValueError, match=r"training\.warmup"):
+        train(tiny("tokengs", "training.warmup=4"), out, console=QUIET)
+    with pytest.raises(ValueError, match=r"views\.gap"):
+        train(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out, console=QUIET)
+    assert not out.exists()
+
+
+def test_the_thread_that_reads_ahead_ends_with_the_run(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    train(tiny("tokengs"), tmp_path / "run", console=QUIET)
+    assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
+
+
+def test_a_second_signal_is_not_caught() -> None:
+    with stop_requests() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal is signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_the_checkpoint_of_a_run_is_found(tmp_path: Path) -> None:
