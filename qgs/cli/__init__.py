@@ -28,9 +28,19 @@ def main() -> None:
     """
     try:
         app()
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
+        if not _is_a_users_mistake(error):
+            raise
         if os.environ.get("QGS_DEBUG"):
             raise
         print(f"error: {error}", file=sys.stderr)
         print("(QGS_DEBUG=1 shows where it was raised)", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _is_a_users_mistake(error: Exception) -> bool:
+    if not isinstance(error, RuntimeError):
+        return True
+    from qgs.contracts.extras import MissingExtraError
+
+    return isinstance(error, MissingExtraError)

@@ -21,6 +21,10 @@ SAME = ("data", "views", "evaluation", "training")
 NO_STEP_LIMIT = 1_000_000_000
 
 
+class StoppedError(Exception):
+    """Someone stopped the contest; the argument is the signal's name."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """One recipe after training and evaluation."""
@@ -54,12 +58,12 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
     return recipes
 
 
-def compete(name: str, recipe: Recipe, run: Path) -> Entry:
-    """Train and evaluate one recipe. Raises KeyboardInterrupt when training was stopped."""
-    result = train(recipe, run)
+def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry:
+    """Train and evaluate one recipe. Raises StoppedError when training was stopped."""
+    result = train(recipe, run, device=device)
     if result.stopped_by:
-        raise KeyboardInterrupt(result.stopped_by)
-    evaluation = evaluate(result.model, recipe)
+        raise StoppedError(result.stopped_by)
+    evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
     dispersion = evaluation.summary()["dispersion_over_gaussians"]
     contender = Contender(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,8 +32,11 @@ def demo(
         Path | None, typer.Option(help="New folder for everything; default: demo, demo-2, ...")
     ] = None,
     folder: Annotated[
-        Path | None, typer.Option("--recipes", help="Folder of the tiny recipes.")
+        Path | None, typer.Option("--recipe-folder", help="Folder of the tiny recipes.")
     ] = None,
+    device: Annotated[
+        str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
+    ] = "auto",
 ) -> None:
     """Train the tiny TokenGS and LocusGS on the same rooms, compare them, write report.html."""
     files = recipes or default_recipes(folder)
@@ -41,7 +45,7 @@ def demo(
     from rich.console import Console
 
     from qgs.analysis.report import report_html
-    from qgs.cli.contest import compete, resolve_fairly, table_of
+    from qgs.cli.contest import StoppedError, compete, resolve_fairly, table_of
     from qgs.cli.contest_report import report_of, write_examples
     from qgs.engine import CollapseError
     from qgs.io.atomic import write_text
@@ -52,7 +56,10 @@ def demo(
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
         try:
-            entries.append(compete(name, recipe, target / name))
+            entries.append(compete(name, recipe, target / name, device))
+        except StoppedError as stop:
+            typer.echo(f"stopped by {stop}; no report", err=True)
+            raise typer.Exit(128 + signal.Signals[str(stop)]) from None
         except CollapseError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
@@ -80,7 +87,7 @@ def default_recipes(folder: Path | None) -> list[Path]:
     looked = ", ".join(str(place) for place in places)
     raise FileNotFoundError(
         f"found no {' and '.join(DEFAULT_RECIPES)} in {looked}; run this in a clone of the "
-        "repository, or give --recipes FOLDER or the recipe files themselves"
+        "repository, or give --recipe-folder FOLDER or the recipe files themselves"
     )
 
 

@@ -75,7 +75,7 @@ def test_two_recipes_of_one_name_are_refused(recipes):
 def test_missing_recipes_say_where_they_were_looked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(qgs, "__file__", str(tmp_path / "site-packages" / "qgs" / "__init__.py"))
-    with pytest.raises(FileNotFoundError, match=r"recipes/tiny.*--recipes FOLDER"):
+    with pytest.raises(FileNotFoundError, match=r"recipes/tiny.*--recipe-folder FOLDER"):
         default_recipes(None)
     with pytest.raises(FileNotFoundError, match="elsewhere"):
         default_recipes(tmp_path / "elsewhere")

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
+from qgs import cli, engine
 from qgs.cli import app
+from qgs.contracts.extras import MissingExtraError
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
 SMALL = (
@@ -20,6 +24,7 @@ SMALL = (
     "evaluation.scenes=2",
     "training.seconds=null",
     "training.steps=2",
+    "training.warmup=1",
 )
 
 
@@ -63,6 +68,45 @@ def test_eval_of_other_data(run: Path, tmp_path: Path) -> None:
     result = qgs("eval", checkpoint, "--set", "evaluation.scenes=1", "--out", tmp_path / "new")
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "new" / "summary.json").read_text())["scenes"] == 1
+
+
+def test_eval_of_other_settings_keeps_the_first_results(run: Path) -> None:
+    before = (run / "evaluation" / "summary.json").read_bytes()
+    for name in ("evaluation-2", "evaluation-3"):
+        result = qgs("eval", run, "--set", "evaluation.scenes=1", "--device", "cpu")
+        assert result.exit_code == 0, result.output
+        summary = json.loads((run / name / "summary.json").read_text())
+        assert summary["settings"]["evaluation"]["scenes"] == 1
+        assert summary["settings"]["data"]["image_size"] == [32, 32]
+        assert summary["step"] == 2
+        assert "held_out_frames" in summary
+    assert (run / "evaluation" / "summary.json").read_bytes() == before
+
+
+def test_a_signal_ends_with_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = engine.train
+
+    def stopped(*args: Any, **options: Any) -> engine.TrainingResult:
+        return replace(real(*args, **options), stopped_by="SIGTERM")
+
+    monkeypatch.setattr(engine, "train", stopped)
+    result = train(tmp_path / "run")
+    assert result.exit_code == 128 + 15
+    assert "stopped early by SIGTERM" in result.output
+    assert not (tmp_path / "run" / "evaluation").exists()
+
+
+def test_a_missing_extra_is_told_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing() -> None:
+        raise MissingExtraError("pip install qgs[cpu]")
+
+    monkeypatch.setattr(cli, "app", missing)
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert "pip install qgs[cpu]" in capsys.readouterr().err
 
 
 def test_eval_refuses_to_change_the_model(run: Path) -> None:

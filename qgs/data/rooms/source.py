@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
+from qgs.contracts.extras import MissingExtraError
 from qgs.data.rooms.draws import Draws
 from qgs.data.rooms.layout import furnish
 from qgs.data.rooms.path import camera_path
@@ -186,7 +187,7 @@ class RoomsSource(SceneSource):
     def __init__(self, config: RoomsConfig) -> None:
         super().__init__(config)
         if find_spec("numba") is None:
-            raise RuntimeError(
+            raise MissingExtraError(
                 "the data source qgs/rooms needs numba, which is not installed: run "
                 "`pip install qgs[cpu]`"
             )
