@@ -35,8 +35,9 @@ class _TensorContainer:
                 return {key: move(item) for key, item in value.items()}
             return value
 
-        moved = {f.name: move(getattr(self, f.name)) for f in fields(self) if f.init}
-        return replace(self, **moved)  # type: ignore[type-var]
+        container: Any = self
+        moved = {f.name: move(getattr(self, f.name)) for f in fields(container) if f.init}
+        return replace(container, **moved)
 
 
 def _expect(name: str, tensor: Tensor, trailing: tuple[int | None, ...]) -> None:

@@ -66,7 +66,8 @@ def diff(
     from qgs.cli.tables import difference_tables
     from qgs.composer import resolve
 
-    for table in difference_tables(resolve(first), resolve(second), str(first), str(second)):
+    names = [path.name if first.name != second.name else str(path) for path in (first, second)]
+    for table in difference_tables(resolve(first), resolve(second), *names):
         Console().print(table)
 
 

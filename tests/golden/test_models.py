@@ -100,6 +100,14 @@ def _packed(gaussians: qgs.Gaussians) -> Tensor:
     return torch.cat([g.means, g.opacities[..., None], g.scales, g.quats, g.colors], -1)
 
 
+def test_the_published_models_are_all_here() -> None:
+    variants = (
+        "anchor_offset", "center_only_bias", "content_cross_attn", "content_self_attn",
+        "free_center", "full", "no_radius_state", "static_radius",
+    )  # fmt: skip
+    assert sorted([*(f"locus_{variant}_a" for variant in variants), "tokengs_a"]) == MODELS
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_every_tensor_of_a_golden_file(name: str) -> None:
     golden, config = read_golden(name)
