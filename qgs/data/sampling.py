@@ -131,22 +131,28 @@ def make_sample(
 
 
 def normalised(c2w: Tensor, inputs: int, views: ViewsConfig, scene: str = "") -> Tensor:
-    """Poses (V, 4, 4) in the frame and scale of their first `inputs` ones.
+    """Poses (V, 4, 4) in the frame and scale of the first `inputs` ones. Raises as `own_world`."""
+    reference, factor = own_world(c2w[:inputs], views, scene)
+    return scaled(relative_to(reference, c2w), factor)
 
+
+def own_world(c2w: Tensor, views: ViewsConfig, scene: str = "") -> tuple[Tensor, Tensor]:
+    """The world in which a model sees inputs with poses c2w (V, 4, 4): reference pose and scale.
+
+    A point p of it is, in the scene's world, the reference (4, 4) applied to p / scale (0-d).
     Raises ValueError for `scale: distance` when the input cameras stand on one point.
     """
-    reference = first_camera if views.frame == "first_cam" else mean_camera
-    relative = relative_to(reference(c2w[:inputs]), c2w)
+    reference = (first_camera if views.frame == "first_cam" else mean_camera)(c2w)
     factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
     if views.scale == "distance":
-        distance = largest_distance(relative[:inputs])
+        distance = largest_distance(relative_to(reference, c2w))
         if not distance > 0:
             raise ValueError(
                 f"views.scale is 'distance', but the input cameras of scene {scene!r} stand on one "
                 "point: use at least two inputs that moved, or `scale: constant`"
             )
         factor = factor / distance
-    return scaled(relative, factor)
+    return reference, factor
 
 
 def mirrored_views(views: Views) -> Views:

@@ -8,6 +8,7 @@ the one that the poses are given in.
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,9 +17,14 @@ from typing import Any
 
 import numpy as np
 
+_log = logging.getLogger(__name__)
+
 FILE = "transforms.json"
 _PINHOLE = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+_UNKNOWN_DISTORTION = (
+    "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2",
+)  # fmt: skip
 _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 _TOLERANCE = 1e-3  # of rotations against orthonormality
 
@@ -41,6 +47,8 @@ class PhotoFrame:
 def read_transforms(folder: Path) -> list[PhotoFrame]:
     """The frames of `folder`/transforms.json, in the file's order; image files are not opened.
 
+    Neighbours in the file should be neighbours in space, as exporters write them: inputs and
+    targets are drawn from spans of it. Masks ('mask_path') are not used, which is logged.
     Raises FileNotFoundError when there is no such file, ValueError for what it cannot mean.
     """
     path = _find(folder)
@@ -51,7 +59,14 @@ def read_transforms(folder: Path) -> list[PhotoFrame]:
     frames = data.get("frames") if isinstance(data, Mapping) else None
     if not isinstance(frames, list) or not frames:
         raise ValueError(f"{path} lists no frames: expected a non-empty list under 'frames'")
-    return [_frame(path, i, data, frame) for i, frame in enumerate(frames)]
+    result = [_frame(path, i, data, frame) for i, frame in enumerate(frames)]
+    masked = sum(bool(frame.get("mask_path")) for frame in frames)
+    if masked:
+        _log.warning(
+            "%d of %d frames of %s have a 'mask_path', and masks are not used: what they hide is "
+            "learnt like the rest", masked, len(frames), path,
+        )  # fmt: skip
+    return result
 
 
 def _find(folder: Path) -> Path:
@@ -157,9 +172,22 @@ def _distortion(where: str, values: Mapping[str, Any]) -> tuple[float, ...]:
             f"{where}: the camera model {name!r} bends rays in a way that no pinhole camera can "
             f"undo: undistort the photos first, or export one of {', '.join(sorted(_PINHOLE))}"
         )
-    if _number(values, "k4"):
+    for key in _UNKNOWN_DISTORTION:
+        if _coefficient(where, values, key):
+            raise ValueError(
+                f"{where}: {key!r} is set, which belongs to fisheye lenses or to OpenCV's larger "
+                "models: undistort the photos first, or export without it"
+            )
+    return tuple(_coefficient(where, values, key) for key in _DISTORTION)
+
+
+def _coefficient(where: str, values: Mapping[str, Any], key: str) -> float:
+    """A distortion coefficient; 0 where it is absent or null."""
+    if values.get(key) is None:
+        return 0.0
+    number = None if isinstance(values[key], bool) else _number(values, key)
+    if number is None:
         raise ValueError(
-            f"{where}: 'k4' is set, which belongs to fisheye lenses or to OpenCV's rational model: "
-            "undistort the photos first, or export without it"
+            f"{where}: the distortion {key!r} must be a finite number, got {values[key]!r}"
         )
-    return tuple(_number(values, key) or 0.0 for key in _DISTORTION)
+    return number

@@ -136,7 +136,7 @@ class Evaluation:
 def evaluate(model: QueryGaussianModel, recipe: Recipe, step: int | None = None) -> Evaluation:
     """Evaluate `model` on the test views of `recipe`, on the device where the model is.
 
-    Leaves the model in the mode it was in. step: optimiser steps behind the weights, to be recorded.
+    Leaves the model in the mode it was in. step: optimiser steps behind the weights.
     Raises what the data source raises, and ValueError when it has no test sample.
     """
     training = model.training

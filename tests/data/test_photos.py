@@ -10,6 +10,7 @@ from PIL import Image
 
 from qgs.data import PhotosSource, read_photos
 from qgs.data.images import CropResize
+from qgs.data.undistortion import distorted
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
@@ -92,6 +93,10 @@ def test_missing_images_are_counted_and_named(tmp_path, caplog):
         ({}, {"fl_x": None}, "no focal length"),
         ({}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*undistort"),
         ({}, {"k4": 0.1}, "k4"),
+        ({"k6": 1e-3}, {}, "frame 1 .*'k6' is set"),
+        ({}, {"s1": 1e-3}, "'s1' is set"),
+        ({}, {"k1": math.nan}, "'k1' must be a finite number, got nan"),
+        ({}, {"p2": "0.1"}, "'p2' must be a finite number, got '0.1'"),
         ({}, {"w": 48}, "another aspect ratio"),
     ],
 )
@@ -128,6 +133,29 @@ def test_lens_distortion_is_undone(tmp_path):
     y = 0.5 / 110
     expected = 32 + 100 * x * (1 - 0.5 * (x * x + y * y)) - 0.5
     assert image[24, 60].item() == pytest.approx(4 * expected, abs=2)
+
+
+def test_masks_that_are_not_used_are_told_once(tmp_path, caplog):
+    opened(folder(tmp_path, frame={"mask_path": "masks/1.png"}))
+    (told,) = [record.message for record in caplog.records if "mask" in record.message]
+    assert told.startswith("1 of 10 frames")
+
+
+@pytest.mark.parametrize("place", range(5))
+def test_each_coefficient_bends_rays_as_opencv_writes_it(place):
+    coefficients = [0.0] * 5
+    coefficients[place] = 0.15
+    k1, k2, p1, p2, k3 = coefficients
+    for x, y in ((0.3, -0.4), (-0.7, 0.2), (0.0, 0.5)):
+        r = math.hypot(x, y)
+        radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+        expected = (
+            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+        )
+        bent = distorted(torch.tensor([x, y], dtype=torch.float64), tuple(coefficients))
+        assert bent.tolist() == pytest.approx(expected)
+        assert bent.tolist() != pytest.approx((x, y))
 
 
 def test_read_photos(tmp_path):

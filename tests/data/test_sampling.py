@@ -8,7 +8,7 @@ from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfi
 from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.loader import training_batches
 from qgs.data.sampling import draw_frames, make_sample, mirrored_views
-from qgs.types import Cameras
+from qgs.types import Cameras, Views
 
 
 class Line(Scene):
@@ -89,6 +89,31 @@ def test_mirroring_flips_images_poses_and_principal_point():
     assert torch.equal(flipped.images, plain.images.flip(-1))
     assert flipped.cameras.intrinsics[0, 0].tolist() == [8, 8, 5, 4]
     assert flipped.cameras.c2w[0, 1, 0, 3] == -plain.cameras.c2w[0, 1, 0, 3]
+
+
+def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
+    axes = torch.tensor([[0.3, -0.8, 0.2], [-0.5, 0.1, 0.9]], dtype=torch.float64)
+    c2w = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    c2w[:, :3, :3] = torch.linalg.matrix_exp(
+        torch.linalg.cross(axes[:, None], torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+    )
+    c2w[:, :3, 3] = torch.tensor([[0.2, 0.1, -3.0], [-0.4, 0.3, -2.0]])
+    intrinsics = torch.tensor([8.0, 9, 3, 4], dtype=torch.float64).expand(2, 4)
+    plain = Views(torch.rand(1, 2, 3, 8, 8), Cameras(c2w[None], intrinsics[None], (8, 8)))
+    flipped = mirrored_views(plain).cameras
+    assert torch.linalg.det(flipped.c2w[0, :, :3, :3]).tolist() == pytest.approx([1, 1])
+    point = torch.tensor([0.7, -0.2, 4.0, 1.0], dtype=torch.float64)
+    x, y, depth = projected(plain.cameras, point).unbind(-1)
+    mirror = torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64)
+    expected = torch.stack([8 - x, y, depth], -1)
+    torch.testing.assert_close(projected(flipped, mirror * point), expected)
+
+
+def projected(cameras: Cameras, point: torch.Tensor) -> torch.Tensor:
+    """x, y in pixels and depth of a homogeneous world point in each camera."""
+    x, y, z, _ = (torch.linalg.inv(cameras.c2w) @ point).unbind(-1)
+    fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy, z], -1)
 
 
 def test_too_few_frames_and_a_gap_too_short_are_explained():
