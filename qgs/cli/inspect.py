@@ -59,6 +59,12 @@ def compose(
 def diff(
     first: Annotated[Path, typer.Argument(help="Recipe file.")],
     second: Annotated[Path, typer.Argument(help="Recipe file.")],
+    set_a: Annotated[
+        list[str] | None, typer.Option("--set-a", help="Override of the first; repeatable.")
+    ] = None,
+    set_b: Annotated[
+        list[str] | None, typer.Option("--set-b", help="Override of the second; repeatable.")
+    ] = None,
 ) -> None:
     """Which slots and options of two recipes differ, and what that costs in parameters."""
     from rich.console import Console
@@ -66,8 +72,9 @@ def diff(
     from qgs.cli.tables import difference_tables
     from qgs.composer import resolve
 
+    resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
     names = [path.name if first.name != second.name else str(path) for path in (first, second)]
-    for table in difference_tables(resolve(first), resolve(second), *names):
+    for table in difference_tables(*resolved, *names):
         Console().print(table)
 
 

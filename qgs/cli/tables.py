@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rich.markup import escape
@@ -15,7 +15,7 @@ from qgs.composer.show import flat
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
 from qgs.composer.suggest import did_you_mean
 from qgs.composer.yaml12 import dump
-from qgs.contracts import Component
+from qgs.contracts import Component, ComponentConfig, Fields
 
 
 def component_tables(slot: str | None) -> tuple[list[Table], list[str]]:
@@ -135,7 +135,7 @@ def _add_difference(table: Table, name: str, ours: int, theirs: int) -> None:
     table.add_row(name, f"{ours:,}", f"{theirs:,}", f"{theirs - ours:+,}" if ours != theirs else "")
 
 
-def _row(component: type[Component], plugin: InstalledPlugin) -> tuple[str, str, str, str]:
+def _row(component: type[Component], plugin: InstalledPlugin) -> tuple[str, ...]:
     options = []
     for name, field in component.Config.model_fields.items():
         default = "required" if field.is_required() else _plain(component, name)
@@ -144,9 +144,16 @@ def _row(component: type[Component], plugin: InstalledPlugin) -> tuple[str, str,
     config = default_config(component)
     if config is None:
         return _lines(options), "depends on options", "depends on options", origin
-    requires = _lines(f"{n}: {spec}" for n, spec in component.requires(config).items())
-    provides = _lines(f"{n}: {spec}" for n, spec in component.provides(config).items())
-    return _lines(options), requires, provides, origin
+    fields = [_fields(declare, config) for declare in (component.requires, component.provides)]
+    return _lines(options), *fields, origin
+
+
+def _fields(declare: Callable[[ComponentConfig], Fields], config: ComponentConfig) -> str:
+    """Declared fields, or why a plugin's code cannot tell them."""
+    try:
+        return _lines(f"{name}: {spec}" for name, spec in declare(config).items())
+    except Exception as error:
+        return f"fails: {type(error).__name__}: {error}"
 
 
 def _plain(component: type[Component], name: str) -> str:

@@ -88,6 +88,13 @@ def test_diff_fits_into_80_columns(recipe, tmp_path, monkeypatch):
     assert "gamma_init" not in output
 
 
+def test_diff_of_one_recipe_with_overrides(recipe):
+    count = "model.queries.count={}".format
+    output = run("diff", recipe, recipe, "--set-a", count(5), "--set-b", count(6))
+    assert "model.queries.count" in output
+    assert "model.head" not in output
+
+
 def test_list_titles_are_paths_of_a_recipe(recipe):
     output = run("list")
     for title in ("model.decoder.cross_attention (default", "model.queries (default", "data (def"):

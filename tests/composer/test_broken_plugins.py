@@ -79,6 +79,31 @@ def test_fix_names_only_what_would_help(write, install):
     assert problem.fix == "use `chain/start` in the slot `queries`"
 
 
+def test_config_whose_code_fails_is_reported_with_its_distribution(write, install):
+    install(
+        "qgs-faulty",
+        "faulty",
+        """
+        from pydantic import field_validator
+        from qgs.contracts import ComponentConfig, Plugin, Refinement
+        class Faulty(Refinement):
+            name = "faulty"
+            class Config(ComponentConfig):
+                step: int = 1
+                @field_validator("step")
+                @classmethod
+                def _check(cls, step):
+                    raise KeyError("oops")
+            def forward(self, state):
+                return state
+        plugin = Plugin("faulty", 1, (Faulty,))
+        """,
+    )
+    decoder = "model: {decoder: {refinement: {type: faulty/faulty, step: 2}}}\n"
+    with pytest.raises(RecipeError, match=r"qgs-faulty 1\.2 fails: `Config` of `faulty/faulty`"):
+        resolve(write("recipe: 1\nplugins: [faulty]\n" + decoder))
+
+
 @pytest.mark.parametrize("name", ["requires", "provides", "problems"])
 def test_component_whose_code_fails_is_reported_with_its_distribution(name, write, install):
     install(
