@@ -14,28 +14,33 @@ def choose_frames(
     frames: Sequence[int] | None = None,
     compare: Sequence[int] | None = None,
     novel: int = 6,
+    held_out: Sequence[int] = (),
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Input frames and novel frames, from 0 to total - 1.
 
     frames: the inputs; None spreads `inputs` of them over `span` frames in the middle of all, both
     ends included, or over all when there are fewer. compare: the novel ones; None takes at most
-    `novel`, evenly spread over the frames between the inputs.
+    `novel`, evenly spread over the frames between the inputs. held_out: frames that the model was
+    not trained on, of a folder that it was trained on; the inputs are then chosen from the others,
+    and compared are those between the inputs, where there are any.
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
-    chosen = _middle(total, inputs, max(span, inputs)) if frames is None else tuple(frames)
+    usable = [frame for frame in range(total) if frame not in held_out]
+    chosen = _middle(usable, inputs, max(span, inputs)) if frames is None else tuple(frames)
     if compare is None:
         between = [f for f in range(min(chosen), max(chosen) + 1) if f not in chosen]
+        between = [f for f in between if f in held_out] or between
         compare = _evenly(between, min(novel, len(between)))
     _check([*chosen, *compare], total)
     return chosen, tuple(compare)
 
 
-def _middle(total: int, count: int, span: int) -> tuple[int, ...]:
-    if count > total:
-        raise ValueError(f"{count} input views were asked for, but there are {total} photos")
-    span = min(span, total)
-    first = (total - span) // 2
-    return _evenly(range(first, first + span), count)
+def _middle(frames: Sequence[int], count: int, span: int) -> tuple[int, ...]:
+    if count > len(frames):
+        raise ValueError(f"{count} input views were asked for, but there are {len(frames)} photos")
+    span = min(span, len(frames))
+    first = (len(frames) - span) // 2
+    return _evenly(frames[first : first + span], count)
 
 
 def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,10 @@ from qgs.analysis.pictures.images import (
     side_by_side,
 )
 from qgs.data.sampling import Sample
-from qgs.io.atomic import write_text
+from qgs.io.atomic import replacing_entries, write_text
 from qgs.io.pictures import write_gif, write_png
 from qgs.io.ply import write_ply
-from qgs.metrics import psnr
+from qgs.metrics import mean_colour, nearest_input, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -33,40 +34,80 @@ ORBIT_SIDE = 320
 FRAMES_PER_SECOND = 16
 OVERVIEW_COLUMNS = 8
 
+KINDS = ("input", "novel", "seen in training")
+"""A compared view of a folder that the model was trained on is novel if it was held out."""
+
+BASELINES = {"nearest input": nearest_input, "mean colour": mean_colour}
+
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One rendered view against its photo; psnr in dB."""
+    """One rendered view against its photo; all PSNR in dB.
+
+    kind: one of KINDS. baselines: PSNR of the nearest input view and of the inputs' mean colour;
+    empty for inputs.
+    """
 
     frame: int
-    is_input: bool
+    kind: str
     psnr: float
+    baselines: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_input(self) -> bool:
+        """Whether the model saw this photo as an input."""
+        return self.kind == "input"
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Gaussians (1, G) of a sample, and what its input and target cameras see of them."""
+    """Gaussians (1, G) of a sample, and what its input and target cameras see of them.
+
+    world: reference pose (4, 4) and scale of the sample's world, as `own_world` gives them.
+    """
 
     sample: Sample
     gaussians: Gaussians
     rendering: Rendering
     scores: list[ViewScore]
+    world: tuple[Tensor, Tensor]
 
 
 @torch.no_grad()
-def reconstruct(model: QueryGaussianModel, sample: Sample) -> Reconstruction:
-    """Gaussians from the inputs of `sample`, rendered from its inputs, then its targets."""
+def reconstruct(
+    model: QueryGaussianModel,
+    sample: Sample,
+    world: tuple[Tensor, Tensor],
+    seen: Collection[int] = (),
+) -> Reconstruction:
+    """Gaussians from the inputs of `sample`, rendered from its inputs, then its targets.
+
+    world: see `Reconstruction`. seen: frames that the model was trained on.
+    """
     gaussians = model(sample.inputs).gaussians
     rendering = model.render(gaussians, _cameras(sample))
     photos = torch.cat([sample.inputs.images, sample.targets.images], 1)
     quality = psnr(rendering.rgb[0], photos[0]).tolist()
-    frames = (*sample.input_frames, *sample.target_frames)
     inputs = len(sample.input_frames)
     scores = [
-        ViewScore(frame, index < inputs, value)
-        for index, (frame, value) in enumerate(zip(frames, quality, strict=True))
+        ViewScore(frame, "input", value)
+        for frame, value in zip(sample.input_frames, quality[:inputs], strict=True)
     ]
-    return Reconstruction(sample, gaussians, rendering, scores)
+    baselines = _baselines(sample)
+    for index, frame in enumerate(sample.target_frames):
+        kind = "seen in training" if frame in seen else "novel"
+        others = {name: values[index] for name, values in baselines.items()}
+        scores.append(ViewScore(frame, kind, quality[inputs + index], others))
+    return Reconstruction(sample, gaussians, rendering, scores, world)
+
+
+def _baselines(sample: Sample) -> dict[str, list[float]]:
+    """PSNR of each baseline on each target."""
+    truth = sample.targets.images
+    return {
+        name: psnr(baseline(sample.inputs, sample.targets.cameras), truth)[0].tolist()
+        for name, baseline in BASELINES.items()
+    }
 
 
 def write_reconstruction(
@@ -75,17 +116,20 @@ def write_reconstruction(
     """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
 
     views/ holds photo and render side by side. Everything is in the normalised world of the model,
-    in which cameras.json tells the cameras.
+    in which cameras.json tells the cameras, and how that world lies in the photos'. Earlier files
+    and folders of these names are replaced, all at the end.
     """
-    ply, cameras = out / "gaussians.ply", out / "cameras.json"
-    write_ply(reconstruction.gaussians, ply)
-    pictures = _write_views(reconstruction, out)
-    path = _write_orbit(model, reconstruction, out / "orbit.gif")
-    write_text(cameras, json.dumps(_camera_record(reconstruction, path), indent=1))
-    return [ply, *pictures, out / "orbit.gif", cameras]
+    with replacing_entries(out) as fresh:
+        write_ply(reconstruction.gaussians, fresh / "gaussians.ply")
+        _write_views(reconstruction, fresh)
+        path = _write_orbit(model, reconstruction, fresh / "orbit.gif")
+        record = json.dumps(_camera_record(reconstruction, path), indent=1)
+        write_text(fresh / "cameras.json", record)
+        names = sorted(entry.name for entry in fresh.iterdir())
+    return [out / name for name in names]
 
 
-def _write_views(reconstruction: Reconstruction, out: Path) -> list[Path]:
+def _write_views(reconstruction: Reconstruction, out: Path) -> None:
     sample, rendering = reconstruction.sample, reconstruction.rendering
     photos = [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])]
     renders = [rgb_picture(image) for image in rendering.rgb[0]]
@@ -94,13 +138,12 @@ def _write_views(reconstruction: Reconstruction, out: Path) -> list[Path]:
     for score, photo, render, depth in zip(
         reconstruction.scores, photos, renders, depths, strict=True
     ):
-        name = f"{score.frame:05d}_{'input' if score.is_input else 'novel'}.png"
+        name = f"{score.frame:05d}_{score.kind.split()[0]}.png"
         write_png(side_by_side([photo, render]), out / "views" / name)
         write_png(depth, out / "depth" / name)
     rows = {"photo": photos, "render": renders, "depth": depths}
     overview = _overview(reconstruction.scores, rows, near, far)
     write_png(overview, out / "overview.png")
-    return [out / "overview.png", out / "views", out / "depth"]
 
 
 def _overview(
@@ -109,8 +152,7 @@ def _overview(
     """At most OVERVIEW_COLUMNS views, the inputs last to be left out."""
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
     titles = [
-        f"frame {scores[i].frame}, {'input' if scores[i].is_input else 'novel'}\n"
-        f"{scores[i].psnr:.1f} dB"
+        f"frame {scores[i].frame}, {scores[i].kind.split()[0]}\n{scores[i].psnr:.1f} dB"
         for i in shown
     ]
     chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
@@ -141,13 +183,24 @@ def _cameras(sample: Sample) -> Cameras:
 
 def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, Any]:
     cameras = _cameras(reconstruction.sample)
+    reference, scale = reconstruction.world
     views = [
-        {"frame": s.frame, "input": s.is_input, "psnr": round(s.psnr, 3), **_plain(cameras[:, [i]])}
+        {
+            "frame": s.frame,
+            "kind": s.kind,
+            "psnr": round(s.psnr, 3),
+            **_plain(cameras[:, [i]]),
+        }
         for i, s in enumerate(reconstruction.scores)
     ]
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
+        "to_photos": {
+            "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
+            "reference_c2w": reference.tolist(),
+            "scale": float(scale),
+        },
         "views": views,
         "orbit": [_plain(path[:, [i]]) for i in range(path.shape[1])],
     }

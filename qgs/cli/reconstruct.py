@@ -38,33 +38,41 @@ def reconstruct(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
+    device: Annotated[
+        str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
+    ] = "auto",
 ) -> None:
-    """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras."""
+    """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
+
+    Of a folder that the model was trained on, held-out photos are compared with where there are.
+    """
     check_out(out, overwrite)
     chosen = frame_list(frames, "--frames")
     compared = frame_list(holdout, "--holdout")
 
-    import torch
     from rich.console import Console
 
     from qgs.analysis.frames import choose_frames
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.analysis.reconstruction import write_reconstruction
     from qgs.data.photos import PhotosSource
-    from qgs.data.sampling import make_sample
+    from qgs.data.sampling import make_sample, own_world, training_frames
+    from qgs.engine.device import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.io.checkpoint import load, load_recipe
 
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     file = checkpoint_of(checkpoint)
+    device = choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
     (scene,) = PhotosSource(photos_config(recipe, photos)).scenes("test")
+    seen = training_frames(scene) if was_trained_on(recipe, photos) else ()
     wanted = inputs or recipe.views.inputs
     span = recipe.views.gap[1] + 1
-    picked = choose_frames(len(scene), wanted, span, chosen, compared)
+    picked = choose_frames(len(scene), wanted, span, chosen, compared, held_out=scene.held_out)
     sample = make_sample(scene, *picked, recipe.views, mirror=False)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    result = run(model, sample)
+    world = own_world(scene.cameras[list(picked[0])].c2w, recipe.views, scene.name)
+    result = run(model, sample, world, seen)
     console = Console()
     console.print(score_table(result))
     for path in write_reconstruction(model, result, out):
@@ -74,6 +82,7 @@ def reconstruct(
 def photos_config(recipe: Recipe, photos: Path) -> PhotosConfig:
     """How to read `photos` for a model of `recipe`: at the image size that it was trained on.
 
+    Held-out frames are kept when it was trained on these very photos.
     Raises ValueError for a recipe without data, which has no image size.
     """
     from qgs.contracts import SceneSourceConfig
@@ -83,10 +92,23 @@ def photos_config(recipe: Recipe, photos: Path) -> PhotosConfig:
         raise ValueError("the checkpoint's recipe has no data, so its image size is not known")
     trained = recipe.parts["data",].config
     assert isinstance(trained, SceneSourceConfig)
+    if was_trained_on(recipe, photos):
+        assert isinstance(trained, PhotosConfig)
+        return trained.model_copy(update={"path": str(photos)})
     if isinstance(trained, PhotosConfig):
         every = {"path": str(photos), "holdout": 0, "max_frames": 0}
         return trained.model_copy(update=every)
     return PhotosConfig(path=str(photos), image_size=trained.image_size, holdout=0)
+
+
+def was_trained_on(recipe: Recipe, photos: Path) -> bool:
+    """Whether the data of `recipe` is the folder `photos`."""
+    from qgs.data.photos import PhotosConfig
+
+    data = recipe.parts["data",].config if ("data",) in recipe.parts else None
+    if not isinstance(data, PhotosConfig):
+        return False
+    return Path(data.path).expanduser().resolve() == photos.expanduser().resolve()
 
 
 def check_out(out: Path, overwrite: bool) -> None:
@@ -113,19 +135,23 @@ def frame_list(text: str | None, option: str) -> list[int] | None:
 
 
 def score_table(result: Reconstruction) -> Table:
-    """PSNR of every rendered view, inputs first, and the means of both kinds."""
+    """PSNR of every rendered view and of the baselines, inputs first, and the means by kind."""
     from rich.table import Table
+
+    from qgs.analysis.reconstruction import BASELINES, KINDS
 
     table = Table(title=f"{result.sample.scene}: {result.gaussians.count:,} Gaussians")
     table.add_column("view")
     table.add_column("frames", justify="right")
-    table.add_column("PSNR", justify="right")
-    for kind, is_input in (("input", True), ("novel", False)):
-        scores = [score for score in result.scores if score.is_input == is_input]
-        for score in scores:
-            table.add_row(kind, str(score.frame), f"{score.psnr:.2f}")
-        if scores:
-            mean = sum(score.psnr for score in scores) / len(scores)
-            table.add_row(f"{kind}, mean", str(len(scores)), f"{mean:.2f}", style="bold")
+    for column in ("PSNR", *BASELINES):
+        table.add_column(column, justify="right")
+    for kind in KINDS:
+        scores = [score for score in result.scores if score.kind == kind]
+        rows = [[score.psnr, *score.baselines.values()] for score in scores]
+        for score, row in zip(scores, rows, strict=True):
+            table.add_row(kind, str(score.frame), *(f"{value:.2f}" for value in row))
+        if rows:
+            means = [f"{sum(column) / len(rows):.2f}" for column in zip(*rows, strict=True)]
+            table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")
             table.add_section()
     return table

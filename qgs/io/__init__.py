@@ -1,1 +1,1 @@
-"""."""
+"""Files: checkpoints, PLY, pictures; each whole or not at all."""

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 
 @contextmanager
@@ -26,6 +27,28 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_entries(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary folder whose entries move into `folder` when the block ends well.
+
+    An entry takes the place of all that was under its name, folders included; what else `folder`
+    holds stays. When the block raises, `folder` stays as it was.
+    """
+    target = Path(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
+        fresh, old = Path(temporary, "fresh"), Path(temporary, "old")
+        fresh.mkdir()
+        old.mkdir()
+        yield fresh
+        target.mkdir(exist_ok=True)
+        for entry in sorted(fresh.iterdir()):
+            place = target / entry.name
+            if place.exists():
+                place.rename(old / entry.name)
+            entry.rename(place)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

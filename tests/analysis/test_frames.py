@@ -39,3 +39,11 @@ def test_neighbouring_inputs_leave_nothing_between():
 def test_frames_that_cannot_be_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         choose_frames(*arguments)
+
+
+def test_held_out_frames_are_compared_with_and_never_inputs():
+    inputs, novel = choose_frames(20, 3, 10, held_out=(1, 6, 9, 12))
+    assert not {1, 6, 9, 12} & set(inputs)
+    assert set(novel) <= {6, 9, 12}
+    assert novel
+    assert choose_frames(20, 2, 10, [0, 4], held_out=(9,)) == ((0, 4), (1, 2, 3))

@@ -60,19 +60,25 @@ def test_everything_is_written(checkpoint, photos, tmp_path):
     out = tmp_path / "scene"
     assert read_ply(out / "gaussians.ply").count == 32
     cameras = json.loads((out / "cameras.json").read_text())
-    assert [(view["frame"], view["input"]) for view in cameras["views"]] == [
-        (1, True),
-        (5, True),
-        (2, False),
-        (3, False),
-        (4, False),
+    assert [(view["frame"], view["kind"]) for view in cameras["views"]] == [
+        (1, "input"),
+        (5, "input"),
+        (2, "novel"),
+        (3, "novel"),
+        (4, "novel"),
     ]
+    back = cameras["to_photos"]
+    for view in cameras["views"]:
+        centre = np.array([*(np.array(view["c2w"])[:3, 3] / back["scale"]), 1])
+        world = np.array(back["reference_c2w"]) @ centre
+        np.testing.assert_allclose(world, [0.1 * view["frame"], 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(cameras["views"][0]["c2w"], np.eye(4), atol=1e-6)
     assert Image.open(out / "views" / "00003_novel.png").size == (36, 16)
     assert Image.open(out / "depth" / "00005_input.png").size == (16, 16)
     assert Image.open(out / "overview.png").size[0] > 500
     assert Image.open(out / "orbit.gif").n_frames == len(cameras["orbit"])
-    assert "novel, mean" in result.output
+    for word in ("novel, mean", "nearest input", "mean colour"):
+        assert word in result.output
 
 
 def test_named_frames_are_used(checkpoint, photos, tmp_path):
@@ -84,14 +90,37 @@ def test_named_frames_are_used(checkpoint, photos, tmp_path):
 
 def test_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "views").mkdir()
+    (tmp_path / "views" / "00099_novel.png").touch()
     refused = run(checkpoint, photos, "--out", tmp_path)
     assert isinstance(refused.exception, FileExistsError)
     assert "--overwrite" in str(refused.exception)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "views"]
     allowed = run(checkpoint, photos, "--out", tmp_path, "--overwrite")
     assert allowed.exception is None
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert (tmp_path / "gaussians.ply").is_file()
+    assert not (tmp_path / "views" / "00099_novel.png").exists()
+    assert (tmp_path / "views" / "00003_novel.png").is_file()
+
+
+def test_photos_seen_in_training_are_not_called_novel(photos, tmp_path):
+    data = {"type": "qgs/photos", "path": str(photos), "image_size": [16, 16], "holdout": 3}
+    file = tmp_path / "checkpoint.safetensors"
+    qgs.save(qgs.compose({**RECIPE, "data": data}), file)
+    result = run(file, photos, "--out", tmp_path / "a")
+    assert result.exception is None
+    views = json.loads((tmp_path / "a" / "cameras.json").read_text())["views"]
+    assert [(view["frame"], view["kind"]) for view in views] == [
+        (0, "input"),
+        (6, "input"),
+        (1, "novel"),
+        (4, "novel"),
+    ]
+    result = run(file, photos, "--out", tmp_path / "b", "--frames", "0,6", "--holdout", "1,3")
+    views = json.loads((tmp_path / "b" / "cameras.json").read_text())["views"]
+    assert [view["kind"] for view in views] == ["input", "input", "novel", "seen in training"]
+    assert "seen in training, mean" in result.output
 
 
 def test_a_missing_checkpoint_and_missing_photos_are_told(checkpoint, photos, tmp_path):

@@ -1,0 +1,33 @@
+"""Folders whose entries are replaced together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from qgs.io.atomic import replacing_entries
+
+
+def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "views").mkdir(parents=True)
+    (out / "views" / "old.png").touch()
+    (out / "notes.txt").write_text("mine")
+    with replacing_entries(out) as fresh:
+        (fresh / "views").mkdir()
+        (fresh / "views" / "new.png").touch()
+    assert [path.name for path in (out / "views").iterdir()] == ["new.png"]
+    assert (out / "notes.txt").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_an_error_changes_nothing(tmp_path: Path) -> None:
+    def fail() -> None:
+        with replacing_entries(tmp_path / "out") as fresh:
+            (fresh / "views").mkdir()
+            raise RuntimeError("the disk is full")
+
+    with pytest.raises(RuntimeError, match="the disk is full"):
+        fail()
+    assert list(tmp_path.iterdir()) == []
