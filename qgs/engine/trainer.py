@@ -75,13 +75,13 @@ def train(
     the last good weights.
     """
     RunFolder(run).refuse_used()
-    console = console or Console(stderr=True)
-    chosen = choose_device(device, lambda text: console.print(text, soft_wrap=True))
+    terminal = console or Console(stderr=True)
+    chosen = choose_device(device, terminal.print)
     set_seed(recipe.seed)
     with closing(Trainer(recipe, run, chosen)) as trainer:
         if not trainer.accelerator.is_main_process:
-            console = Console(quiet=True)
-        with TrainingProgress(console) as progress, stop_requests() as stop:
+            terminal = Console(quiet=True)
+        with TrainingProgress(terminal) as progress, stop_requests() as stop:
             return trainer.run(progress, stop)
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import Renderer, RendererConfig
+from qgs.contracts.extras import MissingExtraError
 from qgs.renderers.inputs import background_of, check_inputs, raise_precision
 from qgs.renderers.projection import CLAMP_MARGIN
 from qgs.renderers.reference import resolve
@@ -36,7 +37,7 @@ class CpuRenderer(Renderer):
     def __init__(self, config: RendererConfig) -> None:
         super().__init__(config)
         if find_spec("numba") is None:
-            raise RuntimeError(
+            raise MissingExtraError(
                 "the renderer qgs/cpu needs numba, which is not installed: run "
                 "`pip install qgs[cpu]`, or choose `renderer: {type: qgs/torch}` (much slower)"
             )

@@ -104,7 +104,7 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     recipe = tiny(
         "tokengs",
         "training.steps=400",
-        "training.warmup=100",
+        "training.warmup=300",
         "training.learning_rate=2.0",
         "training.initial_divisor=1e5",
         "training.save_every=25",
