@@ -128,13 +128,19 @@ def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[
 
 
 def _models_at(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[type[BaseModel]]:
-    """The (nested) configs that `loc` leads to."""
+    """The (nested) configs that `loc` leads to; the tag of a union chooses among its members."""
     models = {config}
     for step in loc:
         fields = [m.model_fields[str(step)] for m in models if str(step) in m.model_fields]
         if fields:
             models = {model for field in fields for model in _models_in(field.annotation)}
+        else:
+            models = {model for model in models if _is_tagged(model, step)} or models
     return models
+
+
+def _is_tagged(model: type[BaseModel], tag: str | int) -> bool:
+    return any(tag in get_args(field.annotation) for field in model.model_fields.values())
 
 
 def _items_expected(config: type[BaseModel], loc: tuple[str | int, ...]) -> int:

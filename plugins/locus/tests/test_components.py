@@ -204,6 +204,16 @@ def test_without_anchors_the_fix_is_to_use_anchored_queries(decoder: dict) -> No
     assert "locus/refine" not in problem.fix
 
 
+def test_option_of_another_kind_of_start_is_no_suggestion() -> None:
+    center_init = {"kind": "frustum", "mean": [0.0, 0.0, 1.0]}
+    queries = {"type": "locus/anchored", "center_init": center_init}
+    with pytest.raises(RecipeError) as caught:
+        resolve({**LOCUS, "model": {"queries": queries}})
+    (problem,) = caught.value.problems
+    assert problem.reason == "there is no option `mean`"
+    assert problem.fix == "options: depth, kind, slope"
+
+
 @pytest.mark.parametrize("depth", [[0.0, 1.0], [2.0, 1.0], [-1.0, 1.0], [1.0]])
 def test_frustum_needs_ordered_positive_depths(depth: list[float]) -> None:
     queries = {"type": "locus/anchored", "center_init": {"kind": "frustum", "depth": depth}}
