@@ -96,10 +96,15 @@ class Cameras(_TensorContainer):
 
 @dataclass(frozen=True)
 class Views(_TensorContainer):
-    """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V)."""
+    """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V).
+
+    masks: (B, V, 1, H, W) in [0, 1], 1 where the photo shows what is to be modelled; None for
+    photos without masks.
+    """
 
     images: Tensor
     cameras: Cameras
+    masks: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.images.ndim != 5:
@@ -118,10 +123,14 @@ class Views(_TensorContainer):
                 f"Views.images has {tuple(self.images.shape[:2])} scenes and views, "
                 f"Views.cameras {tuple(self.cameras.shape)}"
             )
+        if self.masks is not None:
+            single = (*self.images.shape[:2], 1, *self.cameras.size)
+            _expect_shape("Views.masks", self.masks, single)
 
     def select(self, index: Any) -> Views:
         """The views at `index` of every scene (a slice or a list of ints)."""
-        return Views(self.images[:, index], self.cameras[:, index])
+        masks = None if self.masks is None else self.masks[:, index]
+        return Views(self.images[:, index], self.cameras[:, index], masks)
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ class Recipe:
     dims: ModelDims
     layer_scale: float
     seed: int
+    init_from: str | None
     views: ViewsConfig
     training: TrainingConfig
     evaluation: EvaluationConfig
@@ -165,6 +166,7 @@ def _finish(
         dims=ModelDims(model.width, model.heads, decoder.depth),
         layer_scale=decoder.layer_scale,
         seed=settings.recipe.seed,
+        init_from=settings.recipe.init_from,
         views=settings.views,
         training=settings.training,
         evaluation=settings.evaluation,

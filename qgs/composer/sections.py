@@ -31,10 +31,15 @@ class DecoderSettings(ComponentConfig):
 
 
 class RecipeSettings(ComponentConfig):
-    """recipe: version of the recipe format. seed: of the model's initial parameters."""
+    """recipe: version of the recipe format. seed: of the model's initial parameters.
+
+    init_from: checkpoint whose weights training starts from, grown or shrunk to this recipe's
+    number of queries (LocusGS release: finetuning).
+    """
 
     recipe: Literal[1]
     seed: int = Field(default=0, ge=0, lt=2**63)
+    init_from: str | None = None
 
 
 _SETTINGS: dict[Path, type[ComponentConfig]] = {

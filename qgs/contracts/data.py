@@ -27,11 +27,22 @@ class Scene(ABC):
     @property
     @abstractmethod
     def cameras(self) -> Cameras:
-        """Cameras (F,) of all frames at the delivered image size, in the scene's own frame."""
+        """Cameras (F,) of all frames at the delivered image size, in the scene's own frame.
+
+        Poses are float64 where the data has that precision: normalising them loses digits.
+        """
 
     @abstractmethod
     def images(self, frames: Sequence[int]) -> Tensor:
         """Images (len(frames), 3, H, W) float32 in [0, 1]."""
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """Masks (len(frames), 1, H, W) in [0, 1], 1 on what is to be modelled; None without."""
+        return None
+
+    def frame_name(self, frame: int) -> str:
+        """What a person knows a frame by: a file name or a time stamp."""
+        return str(frame)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
         """Camera-frame z (len(frames), 1, H, W), world units; None where it is not known."""
@@ -66,3 +77,11 @@ class SceneSource(Component):
     @abstractmethod
     def scenes(self, split: Split) -> Sequence[Scene]:
         """The scenes of a split; indexing is cheap and deterministic."""
+
+    def groups(self, split: Split) -> Sequence[Sequence[int]]:
+        """Indices of `scenes(split)` by where they are stored, such as one group per file.
+
+        Training visits groups in random order, and the scenes of a group one after another in
+        random order, so that a file is read once an epoch. One group shuffles everything.
+        """
+        return [range(len(self.scenes(split)))]

@@ -51,7 +51,13 @@ class TrainingConfig(ComponentConfig):
     cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
     final_divisor: first rate over last rate (torch's OneCycleLR). clip: gradient norm. precision:
     autocast dtype. save_every: steps between checkpoints, 0 for never but at the end.
-    collapse_window: steps of background-only output after which training stops.
+    collapse_window: steps of background-only output after which training stops. workers: processes
+    that decode data, 0 for a thread of this one. render_views: target views rendered at a time, 0
+    for all; bounds memory and changes no gradient. ema: decay of an exponential moving average of
+    the weights, saved and evaluated beside them. on_nonfinite: after a NaN or infinite loss or
+    gradient, whose batch and weights are saved, training stops or skips the step. evaluate_every:
+    steps between evaluations with pictures, 0 for none. trackers: where metrics go besides the
+    run's own history.
     """
 
     steps: int = Field(default=150_000, ge=1)
@@ -68,11 +74,30 @@ class TrainingConfig(ComponentConfig):
     precision: Literal["float32", "bf16"] = "bf16"
     save_every: int = Field(default=1000, ge=0)
     collapse_window: int = Field(default=50, ge=10, le=100)
+    workers: int = Field(default=0, ge=0)
+    render_views: int = Field(default=0, ge=0)
+    ema: float | None = Field(default=None, gt=0, lt=1)
+    on_nonfinite: Literal["stop", "skip"] = "stop"
+    evaluate_every: int = Field(default=0, ge=0)
+    trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
 
 
 class EvaluationConfig(ComponentConfig):
-    """What `qgs eval` runs: at most `scenes` test scenes, `samples` view samples from each."""
+    """What `qgs eval` runs: at most `scenes` test scenes, `samples` view samples from each.
+
+    index: a JSON file {scene: null | {"context": [frames], "target": [frames]}} that names scenes
+    and frames instead (pixelSplat's format); then scenes, samples and seed mean nothing. protocol:
+    a name for these settings in tables. metrics: besides PSNR and SSIM. lpips_weights: file of VGG
+    weights, None for torch's cache. tuning_steps, tuning_rate: token tuning on the input views
+    before each scene is judged (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
+    """
 
     scenes: int = Field(default=32, ge=1)
     samples: int = Field(default=1, ge=1)
     seed: int = Field(default=0, ge=0)
+    index: str | None = None
+    protocol: str | None = None
+    metrics: tuple[Literal["lpips"], ...] = ()
+    lpips_weights: str | None = None
+    tuning_steps: int = Field(default=0, ge=0)
+    tuning_rate: float = Field(default=1e-4, gt=0)
