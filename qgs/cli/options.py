@@ -1,0 +1,26 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias
+
+import typer
+
+Overrides: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override, such as training.seconds=300; repeatable."),
+]
+Threads: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="CPU threads; all cores if not given.")
+]
+Device: TypeAlias = Annotated[
+    str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
+]
+
+
+def use_threads(threads: int | None) -> None:
+    """Compute on that many CPU threads; None leaves torch's choice."""
+    if threads is not None:
+        import torch
+
+        torch.set_num_threads(threads)
