@@ -1,5 +1,7 @@
 """What training minimises."""
 
+from qgs.losses.mask import Mask
+from qgs.losses.opacity import Opacity
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import (
     BehindCamera,
@@ -8,11 +10,13 @@ from qgs.losses.visibility import (
     view_visibility,
 )
 
-COMPONENTS = (Photometric, Visibility)
+COMPONENTS = (Photometric, Visibility, Mask, Opacity)
 
 __all__ = [
     "COMPONENTS",
     "BehindCamera",
+    "Mask",
+    "Opacity",
     "Photometric",
     "Visibility",
     "VisibilityOptions",

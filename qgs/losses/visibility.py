@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss
+from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.precision import full_precision
 from qgs.geometry.projection import to_camera
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
@@ -18,24 +19,41 @@ BehindCamera = Literal["published", "invisible"]
 _TINY_Z = 1e-8
 """Below this |z| counts as 0, so that gradients of x / z stay finite."""
 
-_INFINITE_PIXEL = 1e6
+INFINITE_PIXEL = 1e6
 """Stands for x / 0 with x != 0 (TokenGS release)."""
 
 
 class VisibilityOptions(ComponentConfig):
     """Options of a visibility loss.
 
-    weight: factor of the term. clamp: upper bound per point, half images (release: 1). near: in a
-    view, points with z <= near are behind the camera. behind_camera: "published" ignores the sign
-    of z as both releases do, so that such a point is seen mirrored and may count as visible;
-    "invisible" gives it the full `clamp` in that view. Like every clamped point it gets no gradient
-    from there, and still moves under views that it stands in front of.
+    weight: factor of the term. clamp: upper bound per point, half images (release: 1), None for
+    none. near: in a view, points with z <= near are behind the camera. behind_camera: "published"
+    ignores the sign of z as both releases do, so that such a point is seen mirrored and may count
+    as visible; "invisible" gives it the full `clamp` in that view. Like every clamped point it gets
+    no gradient from there, and still moves under views that it stands in front of.
     """
 
     weight: float = Field(default=1.0, ge=0)
-    clamp: float = Field(default=1.0, gt=0)
+    clamp: float | None = Field(default=1.0, gt=0)
     near: float = Field(default=0.025, gt=0)
     behind_camera: BehindCamera = "published"
+
+    @property
+    def behind(self) -> float | None:
+        """z at or below which a point counts as invisible; None ignores the sign of z."""
+        return self.near if self.behind_camera == "invisible" else None
+
+    def conflicts(self) -> Iterator[Problem]:
+        """Options that do not go together, or that nothing reads."""
+        if self.behind_camera == "published":
+            yield from without_effect(self, ("near",), "`behind_camera` is published")
+        elif self.clamp is None:
+            yield Problem(
+                "clamp",
+                "a point behind every camera would cost infinitely much: `behind_camera` is "
+                "invisible and nothing bounds it",
+                "give `clamp` a number, such as 1.0",
+            )
 
 
 class Visibility(Loss):
@@ -44,9 +62,21 @@ class Visibility(Loss):
     name: ClassVar[str] = "visibility"
 
     class Config(VisibilityOptions):
-        """See `VisibilityOptions`."""
+        """See `VisibilityOptions`.
+
+        infinite_pixel: stands for x / 0, x != 0, in pixels; nothing can tell below a clamp.
+        """
+
+        infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
 
     config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Options must go together, and each must matter."""
+        yield from config.conflicts()
+        if config.clamp is not None:
+            yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
 
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
@@ -56,7 +86,8 @@ class Visibility(Loss):
             prediction.gaussians.means,
             target.cameras,
             clamp=self.config.clamp,
-            behind=self.config.near if self.config.behind_camera == "invisible" else None,
+            behind=self.config.behind,
+            infinite_pixel=self.config.infinite_pixel,
         )
         return {"visibility": self.config.weight * per_point.mean()}
 
@@ -68,6 +99,7 @@ def view_visibility(
     clamp: float | None = 1.0,
     behind: float | None = None,
     z_guard: float | None = None,
+    infinite_pixel: float = INFINITE_PIXEL,
 ) -> Tensor:
     """How far each point is from the nearest view that would see it, 0 if one does (B, P).
 
@@ -75,12 +107,12 @@ def view_visibility(
     image: relu(|u| - 1) + relu(|v| - 1); then the minimum over views, at most `clamp` (TokenGS,
     LocusGS releases). behind: z at or below which a point is infinitely far from a view's image;
     None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard (LocusGS anchors);
-    None leaves z alone, where x / 0 is far outside and 0 / 0 visible (TokenGS).
+    None leaves z alone, where x / 0 is at `infinite_pixel` and 0 / 0 visible (TokenGS).
 
     Values and gradients are finite everywhere, as long as `clamp` is set whenever `behind` is.
     """
     camera_points = to_camera(points, cameras)
-    excess = _image_excess(camera_points, cameras, z_guard)
+    excess = _image_excess(camera_points, cameras, z_guard, infinite_pixel)
     if behind is not None:
         excess = torch.where(camera_points[..., 2] <= behind, torch.inf, excess)
     nearest = excess.amin(dim=1)
@@ -88,7 +120,9 @@ def view_visibility(
 
 
 @full_precision
-def _image_excess(camera_points: Tensor, cameras: Cameras, z_guard: float | None) -> Tensor:
+def _image_excess(
+    camera_points: Tensor, cameras: Cameras, z_guard: float | None, infinite_pixel: float
+) -> Tensor:
     """relu(|u| - 1) + relu(|v| - 1) of camera-frame points (B, V, P, 3) -> (B, V, P)."""
     xy, z = camera_points[..., :2], camera_points[..., 2:]
     if z_guard is not None:
@@ -96,7 +130,7 @@ def _image_excess(camera_points: Tensor, cameras: Cameras, z_guard: float | None
     at_zero = z.abs() < _TINY_Z
     focal, principal = cameras.intrinsics[..., None, :2], cameras.intrinsics[..., None, 2:]
     pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
-    limit = torch.where(xy == 0, 0.0, _INFINITE_PIXEL * xy.sign())
+    limit = torch.where(xy == 0, 0.0, infinite_pixel * xy.sign())
     pixels = torch.where(at_zero, limit, pixels)
     height, width = cameras.size
     normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1

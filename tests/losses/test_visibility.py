@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from qgs.contracts import ModelDims, RecipeContext
 from qgs.losses import Visibility, view_visibility
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
@@ -109,3 +110,30 @@ def test_component_weighs_the_mean_over_gaussians(
     torch.testing.assert_close(
         terms, {"visibility": 0.1 * view_visibility(means, cameras, behind=near).mean()}
     )
+
+
+@pytest.mark.parametrize(
+    ("options", "option"),
+    [
+        ({"near": 0.1}, "near"),
+        ({"infinite_pixel": 10.0}, "infinite_pixel"),
+        ({"behind_camera": "invisible", "clamp": None}, "clamp"),
+    ],
+)
+def test_options_that_cannot_work_are_refused(options: dict, option: str) -> None:
+    context = RecipeContext(ModelDims(width=8, heads=1, depth=1))
+    problems = Visibility.problems(Visibility.Config(**options), context)
+    assert [problem.option for problem in problems] == [option]
+    clean = Visibility.Config(behind_camera="invisible", near=0.1)
+    assert not list(Visibility.problems(clean, context))
+
+
+def test_infinite_pixel_is_where_points_at_zero_depth_go(
+    golden: dict[str, Tensor], cameras: Cameras
+) -> None:
+    near, far = (
+        view_visibility(golden["points"], cameras[:, :1], clamp=None, infinite_pixel=pixel)
+        for pixel in (1e3, 1e6)
+    )
+    assert near[0, 1] < far[0, 1]
+    assert torch.equal(near[0, 5:], far[0, 5:])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import Fields, Loss
+from qgs.contracts import Fields, Loss, Problem, RecipeContext
 from qgs.losses import VisibilityOptions, view_visibility
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs_locus.fields import CENTER, CENTER_FIELD
@@ -34,6 +35,11 @@ class AnchorVisibility(Loss):
         """Centres."""
         return CENTER_FIELD
 
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """Options must go together, and each must matter."""
+        return config.conflicts()
+
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
@@ -42,7 +48,7 @@ class AnchorVisibility(Loss):
             prediction.state[CENTER],
             target.cameras,
             clamp=self.config.clamp,
-            behind=self.config.near if self.config.behind_camera == "invisible" else None,
+            behind=self.config.behind,
             z_guard=self.config.z_guard,
         )
         return {"anchor_visibility": self.config.weight * per_anchor.mean()}

@@ -1,0 +1,38 @@
+"""`qgs/opacity`: Gaussians are drawn towards full opacity (TokenGS release)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import ComponentConfig, Loss
+from qgs.geometry.precision import full_precision
+from qgs.types import LayerPrediction, Rendering, Views
+
+
+class Opacity(Loss):
+    """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release; weight 0 in its recipes)."""
+
+    name: ClassVar[str] = "opacity"
+
+    class Config(ComponentConfig):
+        """weight: factor of the term. eps: keeps the logarithm finite (TokenGS release)."""
+
+        weight: float = Field(default=0.1, ge=0)
+        eps: float = Field(default=1e-6, gt=0)
+
+    config: Config
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        """One term, `opacity`."""
+        surprise = _surprise(prediction.gaussians.opacities, self.config.eps)
+        return {"opacity": self.config.weight * surprise}
+
+
+@full_precision
+def _surprise(opacities: Tensor, eps: float) -> Tensor:
+    return -(opacities + eps).log().mean()
