@@ -99,16 +99,35 @@ class QueryGaussianModel(nn.Module):
         """Number of decoder layers."""
         return len(self.decoder)
 
-    def forward(self, views: Views, layers: Collection[int] | None = None) -> Prediction:
+    def forward(
+        self,
+        views: Views,
+        layers: Collection[int] | None = None,
+        state: QueryState | None = None,
+    ) -> Prediction:
         """Reconstruct every scene of `views`.
 
+        layers, state: see `predict`; by default the scenes start from the learned queries.
+        """
+        if state is None:
+            state = self.queries(views.images.shape[0])
+        return self.predict(self.encoder(views), state, layers)
+
+    def predict(
+        self, memory: ImageMemory, state: QueryState, layers: Collection[int] | None = None
+    ) -> Prediction:
+        """Take the queries through the decoder and read the Gaussians off them.
+
+        memory: what `encoder` made of the views. state: the queries before the first layer, of as
+            many scenes.
         layers: numbers of the decoder layers to decode besides the last (1 is the first); None
             decodes the supervised ones while training and only the last otherwise.
-        Raises ValueError for a layer that does not exist.
+        Raises ValueError for a layer that does not exist and for states of other scenes.
         """
         wanted = self._decoded_layers(layers)
-        memory = self.encoder(views)
-        state = self.queries(views.images.shape[0])
+        scenes, given = memory.features.shape[0], state.features.shape[0]
+        if scenes != given:
+            raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
         decoded: dict[int, LayerPrediction] = {}
         for number, layer in enumerate(self.decoder, start=1):
             refine = self.refinements[self._refinement_of[number - 1]]

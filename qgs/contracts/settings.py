@@ -86,10 +86,13 @@ class EvaluationConfig(ComponentConfig):
     """What `qgs eval` runs: at most `scenes` test scenes, `samples` view samples from each.
 
     index: a JSON file {scene: null | {"context": [frames], "target": [frames]}} that names scenes
-    and frames instead (pixelSplat's format); then scenes, samples and seed mean nothing. protocol:
-    a name for these settings in tables. metrics: besides PSNR and SSIM. lpips_weights: file of VGG
-    weights, None for torch's cache. tuning_steps, tuning_rate: token tuning on the input views
-    before each scene is judged (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
+    and frames instead (pixelSplat's format); then scenes, samples and seed mean nothing. Frames
+    are positions in the scene's frames, the path is relative to the working directory. protocol: a
+    name for these settings in tables, by default the index's file name; what decides the numbers,
+    the index's content included, is hashed beside it. metrics: besides PSNR and SSIM.
+    lpips_weights: file of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth), None
+    for torch's cache. tuning_steps, tuning_rate: token tuning on the input views before each scene
+    is judged, with the recipe's photometric loss (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
     """
 
     scenes: int = Field(default=32, ge=1)
