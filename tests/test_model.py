@@ -107,25 +107,3 @@ def test_every_parameter_learns(name: str) -> None:
     ]
     # Softmax ignores what is added to all keys alike; k_norm's bias is that.
     assert [name for name in dead if not name.endswith("k_norm.bias")] == []
-
-
-PUBLISHED = ["model.queries.count=4096"]
-D, N = 1024, 4096
-
-
-def parameters(recipe: str, *overrides: str) -> int:
-    model = qgs.compose(RECIPES / recipe, overrides=[*PUBLISHED, *overrides], device="meta")
-    return sum(parameter.numel() for parameter in model.parameters())
-
-
-def test_parameter_counts_at_published_size() -> None:
-    tokengs = parameters("tokengs/dl3dv.yaml")
-    assert tokengs == 222_016_768
-
-    anchors = N * 3 + N
-    gammas = 12
-    position_mlps = 12 * ((384 * D + D) + (D * D + D))
-    refinement_heads = 2 * (D * D + D) + (3 * D + 3) + (D + 1)
-    locus = tokengs + anchors + gammas + position_mlps + refinement_heads
-    assert locus == 241_514_780 - 52_236
-    assert parameters("locus/dl3dv.yaml") == locus

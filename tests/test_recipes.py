@@ -1,17 +1,48 @@
-"""What the shipped recipes promise of each other."""
+"""What the shipped recipes promise of each other, of the papers' models and of the documents."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from golden.published import read_golden, recipe_of
 
 from qgs.composer import resolve
 
-RECIPES = Path(__file__).parents[1] / "recipes"
+ROOT = Path(__file__).parents[1]
+RECIPES = ROOT / "recipes"
+FILES = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
+EXPERIMENTS = ("re10k", "re10k_4096", "dl3dv", *(f"dl3dv_4096_{n}views" for n in (2, 4, 6)))
+PAIRS = ["tiny/{}.yaml", *(f"{{}}/{name}.yaml" for name in EXPERIMENTS)]
+ABLATIONS = {
+    "reference": "full",
+    "no_radius_state": "no_radius_state",
+    "static_radius": "static_radius",
+    "content_self_attention": "content_self_attn",
+    "content_cross_attention": "content_cross_attn",
+    "center_only_bias": "center_only_bias",
+    "free_centers": "free_center",
+    "anchor_offset": "anchor_offset",
+}
+"""Structural ablations and the golden files that the released code computed for them."""
 
 
-@pytest.mark.parametrize("pair", ["tiny/{}.yaml", "{}/re10k.yaml", "{}/dl3dv.yaml"])
+def document(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_recipe_composes(file: str) -> None:
+    recipe = resolve(RECIPES / file)
+    model = recipe.build_model("meta")
+    assert {parameter.device.type for parameter in model.parameters()} == {"meta"}
+    assert recipe.build_losses()
+    assert resolve(recipe.tree).tree == recipe.tree
+
+
+@pytest.mark.parametrize("pair", PAIRS)
 def test_tokengs_and_locusgs_have_the_same_budget(pair: str) -> None:
     ours, theirs = (resolve(RECIPES / pair.format(name)) for name in ("tokengs", "locus"))
     for section in ("data", "views", "training", "evaluation"):
@@ -23,3 +54,63 @@ def test_tokengs_and_locusgs_have_the_same_budget(pair: str) -> None:
     assert first.head.gaussians_per_query == second.head.gaussians_per_query
     assert first.depth == second.depth
     assert type(first.centers) is not type(second.centers)
+
+
+@pytest.mark.parametrize("model", ["tokengs", "locus"])
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if "4096" in name])
+def test_finetunes_change_no_more_than_they_say(model: str, name: str) -> None:
+    base = resolve(RECIPES / model / f"{name.partition('_')[0]}.yaml")
+    finetune = resolve(RECIPES / model / f"{name}.yaml")
+    assert finetune.init_from == f"runs/{model}/{name.partition('_')[0]}"
+    assert base.tree["model"]["queries"]["count"] == 1024
+    grown = {**base.tree["model"]["queries"], "count": 4096}
+    assert finetune.tree["model"] == {**base.tree["model"], "queries": grown}
+    assert finetune.tree["losses"] == base.tree["losses"]
+    assert finetune.training.steps in (20 * 500, 80 * 500)
+    assert (finetune.training.learning_rate, finetune.training.warmup) == (4e-5, 400)
+    assert base.training.steps == 300 * 500
+    assert (base.training.learning_rate, base.training.warmup) == (4e-4, 2000)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((RECIPES / "ablations").glob("*.yaml")), ids=lambda p: p.stem
+)
+def test_an_ablation_is_a_few_lines_over_locusgs(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 8
+    ours, reference = resolve(path), resolve(RECIPES / "locus/dl3dv.yaml")
+    changed = {key for key in reference.tree if ours.tree[key] != reference.tree[key]}
+    assert changed == (set() if path.stem in ("reference", "supervised_6_12") else {"model"})
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_an_ablation_is_the_released_variant(name: str) -> None:
+    ours = resolve(RECIPES / "ablations" / f"{name}.yaml").tree["model"]
+    _, config = read_golden(f"locus_{ABLATIONS[name]}_a")
+    released = resolve(recipe_of(config)).tree["model"]
+    assert _structure(ours) == _structure(released)
+
+
+SIZES = ("width", "heads", "count", "depth", "gaussians_per_query", "layers")
+STARTS = ("init_std", "layer_scale")
+
+
+def _structure(node: Any) -> Any:
+    """What is left of a model's recipe without sizes and initial values."""
+    if not isinstance(node, dict):
+        return node
+    return {key: _structure(value) for key, value in node.items() if key not in SIZES + STARTS}
+
+
+def test_every_recipe_has_its_place_in_the_documents() -> None:
+    named = set(re.findall(r"[\w-]+/[\w-]+\.yaml", document("docs/experiments.md")))
+    tiny = set(re.findall(r"recipes/([\w/-]+\.yaml)", document("README.md")))
+    assert [file for file in FILES if file not in named | tiny] == []
+    assert sorted(named - set(FILES)) == []
+
+
+def test_commands_of_the_experiments_are_of_recipes_that_exist() -> None:
+    text = document("docs/experiments.md")
+    lines = re.findall(r"^\s*qgs (?:train|bench|compose) .*", text, re.MULTILINE)
+    assert lines
+    named = [path for line in lines for path in re.findall(r"recipes/[\w/*.-]+", line)]
+    assert [path for path in named if not list(ROOT.glob(path))] == []

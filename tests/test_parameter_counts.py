@@ -1,0 +1,81 @@
+"""Parameters of every published model at its published size, composed without allocating one."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import qgs
+
+ROOT = Path(__file__).parents[1]
+RECIPES = ROOT / "recipes"
+
+D, N, LAYERS = 1024, 4096, 12
+HEAD_OF_CENTERS = (D * D + D) + (D * 3 + 3)
+HEAD_OF_RADII = (D * D + D) + (D + 1)
+POSITION_MLPS = LAYERS * ((3 * 128 * D + D) + (D * D + D))
+GAMMAS = LAYERS
+
+TOKENGS = 222_016_768
+UNUSED = 52_236
+"""Parameters that the published LocusGS carries and never uses; there are none such here."""
+
+LOCUSGS = 241_514_780 - UNUSED
+
+
+def parameters(recipe: str) -> int:
+    path = RECIPES / recipe
+    model = qgs.compose(path, overrides=[f"model.queries.count={N}"], device="meta")
+    assert {parameter.device.type for parameter in model.parameters()} == {"meta"}
+    return sum(parameter.numel() for parameter in model.parameters())
+
+
+@pytest.mark.parametrize("recipe", ["re10k_4096", "dl3dv_4096_4views", "dl3dv"])
+def test_tokengs_and_locusgs(recipe: str) -> None:
+    assert parameters(f"tokengs/{recipe}.yaml") == TOKENGS
+    assert parameters(f"locus/{recipe}.yaml") == LOCUSGS
+
+
+def test_what_locusgs_adds_to_tokengs() -> None:
+    anchors = N * 3 + N * 1
+    added = anchors + GAMMAS + POSITION_MLPS + HEAD_OF_CENTERS + HEAD_OF_RADII
+    assert TOKENGS + added == LOCUSGS
+
+
+@pytest.mark.parametrize(
+    ("ablation", "without"),
+    [
+        ("reference", 0),
+        ("no_radius_state", N * 1 + HEAD_OF_RADII),
+        ("static_radius", HEAD_OF_RADII),
+        ("content_self_attention", POSITION_MLPS),
+        ("content_cross_attention", GAMMAS),
+        # Only read differently: sigma without r, means without mu, means without r.
+        ("center_only_bias", 0),
+        ("free_centers", 0),
+        ("anchor_offset", 0),
+        ("supervised_12", 0),
+        ("supervised_6_12", 0),
+        ("supervised_3_6_9_12", 0),
+    ],
+)
+def test_ablations(ablation: str, without: int) -> None:
+    assert parameters(f"ablations/{ablation}.yaml") == LOCUSGS - without
+
+
+def test_1024_queries_of_the_base_stage() -> None:
+    fewer = N - 1024
+    for name, per_query, published in (("tokengs", D, TOKENGS), ("locus", D + 3 + 1, LOCUSGS)):
+        model = qgs.compose(RECIPES / name / "dl3dv.yaml", device="meta")
+        count = sum(parameter.numel() for parameter in model.parameters())
+        assert count == published - fewer * per_query
+
+
+def test_counts_in_the_documents() -> None:
+    text = (ROOT / "docs/experiments.md").read_text(encoding="utf-8")
+    rows = re.findall(r"`(ablations/\w+\.yaml)`.* \| ([\d,]+) \|$", text, re.MULTILINE)
+    assert len(rows) == 8
+    shown = {recipe: int(count.replace(",", "")) for recipe, count in rows}
+    assert shown == {recipe: parameters(recipe) for recipe in shown}
