@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
+from upath import UPath
 
 
 @dataclass(frozen=True)
@@ -46,19 +48,28 @@ class CropResize:
         return np.array(image.resize((width, height), Image.Resampling.LANCZOS, box=box))
 
 
-def open_rgb(path: Path, background: tuple[float, float, float]) -> Image.Image:
+def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
     """The image file as RGB, composited over `background` (in [0, 1]) where it is transparent.
 
     Raises ValueError for a file that is no readable image.
     """
     try:
-        with Image.open(path) as image:
-            image.load()
-    except (UnidentifiedImageError, OSError) as error:
+        with path.open("rb") as file:
+            return decode_rgb(file, background)
+    except OSError as error:
         raise ValueError(
             f"{path} cannot be read as an image ({error}): replace the file, or remove its frame "
             "from transforms.json"
         ) from error
+
+
+def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image.Image:
+    """As `open_rgb`, for an open file. Raises OSError for bytes that are no readable image."""
+    try:
+        with Image.open(file) as image:
+            image.load()
+    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise OSError(str(error)) from error
     if image.has_transparency_data:
         image = image.convert("RGBA")
         color = tuple(round(255 * channel) for channel in background)
