@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from qgs.engine.processes import whole
 from qgs.io.checkpoint import unique_tensors
 
 EMPTY_ALPHA = 2e-3
@@ -89,6 +91,15 @@ class CollapseDetector:
         """Whether a run that ends after `steps` never lived, or filled the window with death."""
         return self.dead_steps >= min(self.window, steps)
 
+    def state(self) -> dict[str, Any]:
+        """See `qgs.engine.state.Stateful`."""
+        return {"dead": self.dead_steps, "symptom": self.symptom, "has_drawn": self._has_drawn}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """See `qgs.engine.state.Stateful`."""
+        self.dead_steps, self.symptom = state["dead"], state["symptom"]
+        self._has_drawn = state["has_drawn"]
+
     def _symptom_of(self, vitals: Vitals) -> str:
         if vitals.alpha < EMPTY_ALPHA:
             return f"the renderings are empty (mean alpha {vitals.alpha:.1e})"
@@ -124,9 +135,24 @@ class GoodWeights:
         """Weights as `qgs.io.checkpoint.save` takes them."""
         return self._copies[0][1]
 
+    def state(self) -> dict[str, Any]:
+        """See `qgs.engine.state.Stateful`."""
+        copies = enumerate(tensors for _, tensors in self._copies)
+        return {
+            "steps": [step for step, _ in self._copies],
+            **{f"{i}/{name}": t for i, tensors in copies for name, t in tensors.items()},
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """See `qgs.engine.state.Stateful`."""
+        self._copies = [
+            (step, {name: state[f"{i}/{name}"] for name in self._copies[0][1]})
+            for i, step in enumerate(state["steps"])
+        ]
+
     def _copy(self) -> dict[str, Tensor]:
         tensors = unique_tensors(self._model)
-        return {name: t.detach().to("cpu", copy=True) for name, t in tensors.items()}
+        return {name: whole(tensor).to("cpu", copy=True) for name, tensor in tensors.items()}
 
 
 def broken_tensors(model: nn.Module) -> str:

@@ -13,7 +13,7 @@ from qgs.io.atomic import write_text
 
 
 class RunFolder:
-    """RUN/recipe.yaml, RUN/history.jsonl, RUN/checkpoint.safetensors, RUN/evaluation/."""
+    """RUN: recipe.yaml, history.jsonl, checkpoint.safetensors, state.safetensors, evaluation/."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -41,6 +41,11 @@ class RunFolder:
     def checkpoint(self) -> Path:
         """The latest good weights."""
         return self.path / "checkpoint.safetensors"
+
+    @property
+    def state(self) -> Path:
+        """Everything that continues the run."""
+        return self.path / "state.safetensors"
 
     @property
     def evaluation(self) -> Path:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from qgs.contracts import TrainingConfig
 
@@ -45,6 +47,14 @@ class OneCycle:
         left = 1 - self._descent_starts
         part = (used - self._descent_starts) / left if left > 0 else 1.0
         return _cosine(self.peak, self.last, min(part, 1.0))
+
+    def state(self) -> dict[str, float | None]:
+        """See `qgs.engine.state.Stateful`."""
+        return {"descent_starts": self._descent_starts}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """See `qgs.engine.state.Stateful`."""
+        self._descent_starts = state["descent_starts"]
 
     def _warmed(self, step: int, seconds: float) -> float:
         """Fraction of the warm-up that is over; may exceed 1."""

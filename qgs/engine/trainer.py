@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import torch
-from accelerate import Accelerator
 from rich.console import Console
 from torch import Tensor
 
 from qgs.composer import Recipe
 from qgs.data.loader import training_batches
+from qgs.engine.clock import Clock
 from qgs.engine.collapse import (
     BROKEN_REMEDIES,
     COLLAPSE_REMEDIES,
@@ -26,19 +25,20 @@ from qgs.engine.collapse import (
     GoodWeights,
     Vitals,
     broken_tensors,
-    measure,
     not_finite,
 )
 from qgs.engine.device import choose_device
 from qgs.engine.folder import RunFolder
+from qgs.engine.gradients import Gradients
 from qgs.engine.interrupt import StopRequest, stop_requests
-from qgs.engine.objective import Objective, Outcome
+from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
+from qgs.engine.processes import make_accelerator, mean
 from qgs.engine.progress import TrainingProgress
+from qgs.engine.saver import Saver
 from qgs.engine.schedule import OneCycle
-from qgs.engine.seeds import set_seed
-from qgs.io.checkpoint import save
-from qgs.metrics import psnr
+from qgs.engine.seeds import RandomStates, set_seed
+from qgs.engine.state import Moments, Stateful
 from qgs.model import QueryGaussianModel
 
 _log = logging.getLogger(__name__)
@@ -89,7 +89,9 @@ class Trainer:
     """The state of one run: model, optimiser, data, clock, detector.
 
     Making one opens the data and draws the first batch, but touches no file of `run`; the folder is
-    made after the first step, when nothing is missing any more.
+    made after the first step, when nothing is missing any more. What must survive an interruption
+    is in `parts`, each with `state` and `load_state`, and counted here: optimiser steps and samples
+    drawn, over all processes.
     """
 
     def __init__(self, recipe: Recipe, run: str | Path, device: str = "cpu") -> None:
@@ -97,20 +99,29 @@ class Trainer:
         self.config = recipe.training
         self.folder = RunFolder(run)
         self.schedule = OneCycle(self.config)
-        self.accelerator = Accelerator(cpu=device == "cpu", mixed_precision="no")
+        self.accelerator = make_accelerator(device)
         self.device = self.accelerator.device
         self.model = recipe.build_model(device=self.device).train()
         objective = Objective(self.model, recipe.build_losses()).to(self.device)
         self.objective, self.optimizer = self.accelerator.prepare(
             objective, make_optimizer(objective, self.config)
         )
+        background = torch.tensor(self.model.renderer.config.background, device=self.device)
+        self.gradients = Gradients(self.accelerator, self.objective, self.config, background)
         self.detector = CollapseDetector(self.config.collapse_window)
         self.good = GoodWeights(self.model)
-        self.background = torch.tensor(self.model.renderer.config.background, device=self.device)
+        self.clock = Clock(self.accelerator)
         self.step = 0
-        self.images = 0
-        self.seconds = 0.0
-        self._clock_started: float | None = None
+        self.samples = 0
+        self.parts: dict[str, Stateful] = {
+            "counters": self,
+            "moments": Moments(objective, self.optimizer),
+            "schedule": self.schedule,
+            "clock": self.clock,
+            "detector": self.detector,
+            "random": RandomStates(self.accelerator),
+        }
+        self.saver = Saver(self.accelerator, self.folder, self.model, self.good, self.parts)
         self._folder_is_open = False
         seed = recipe.seed + 1_000_003 * self.accelerator.process_index
         self._stream = training_batches(
@@ -123,18 +134,20 @@ class Trainer:
         self._stream.close()
         self.folder.close()
 
+    def state(self) -> dict[str, int]:
+        """See `qgs.engine.state.Stateful`."""
+        return {"step": self.step, "samples": self.samples}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """See `qgs.engine.state.Stateful`."""
+        self.step, self.samples = state["step"], state["samples"]
+
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
         while self.used < 1:
             record = self._optimise(stop)
             self._open_folder()
-            if self.accelerator.is_main_process:
-                self.folder.append(record)
-            shown = progress.update(
-                self.step, record["loss"], record["psnr"], self.images, self.seconds, self.used
-            )
-            if shown:
-                self.folder.flush()
+            self._report(record, progress)
             if self.detector.collapsed:
                 symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
                 self._give_up(symptom, COLLAPSE_REMEDIES)
@@ -145,14 +158,15 @@ class Trainer:
         self._finish(stopped_by)
         main = self.accelerator.is_main_process
         return TrainingResult(
-            self.model.eval(), self.folder, self.step, self.seconds, stopped_by, main
+            self.model.eval(), self.folder, self.step, self.clock.seconds, stopped_by, main
         )
 
     @property
     def used(self) -> float:
         """Fraction of the budget that is used, the larger of steps and seconds."""
         of_steps = self.step / self.config.steps
-        of_seconds = self.seconds / self.config.seconds if self.config.seconds else 0.0
+        budget = self.config.seconds
+        of_seconds = self.clock.seconds / budget if budget else 0.0
         return max(of_steps, of_seconds)
 
     def _open_folder(self) -> None:
@@ -166,73 +180,35 @@ class Trainer:
 
     def _optimise(self, stop: StopRequest) -> dict[str, float]:
         """One optimiser step; returns its record for the history."""
-        rate = self.schedule.rate(self.step, self.seconds)
+        rate = self.schedule.rate(self.step, self.clock.seconds)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        measured = self._backward()
-        norm = self.accelerator.clip_grad_norm_(self.objective.parameters(), self.config.clip)
-        measured["gradient"] = torch.as_tensor(norm, device=self.device).detach()
+        batches = list(islice(self._batches, self.config.accumulate))
+        measured = self.gradients.compute(batches)
+        scenes = sum(len(batch.scenes) for batch in batches)
+        self.samples += scenes * self.accelerator.num_processes
         record = self._read(measured, stop)
         self._refuse_nonfinite(record)
         self.optimizer.step()
         self.detector.observe(Vitals(record["alpha"], record["deviation"], record["gradient"]))
         self.step += 1
-        self._tick()
-        return {"step": self.step, "seconds": self.seconds, "lr": rate, **record}
+        self.clock.tick()
+        return {"step": self.step, "seconds": self.clock.seconds, "lr": rate, **record}
 
-    def _backward(self) -> dict[str, Tensor]:
-        """Gradients of `accumulate` batches; what was measured, as 0-d tensors averaged over them.
-
-        Only the last batch exchanges gradients between processes.
-        """
-        count = self.config.accumulate
-        sums: dict[str, Tensor] = {}
-        for index in range(count):
-            batch = next(self._batches)
-            inputs, targets = batch.inputs.to(self.device), batch.targets.to(self.device)
-            last = index == count - 1
-            with nullcontext() if last else self.accelerator.no_sync(self.objective):
-                with torch.autocast(
-                    self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"
-                ):
-                    outcome: Outcome = self.objective(inputs, targets)
-                self.accelerator.backward(outcome.total / count)
-            self.images += targets.images.shape[:2].numel() * self.accelerator.num_processes
-            for name, value in self._measure(outcome, targets.images).items():
-                sums[name] = sums.get(name, 0) + value / count
-        return sums
-
-    @torch.no_grad()
-    def _measure(self, outcome: Outcome, truth: Tensor) -> dict[str, Tensor]:
-        rgb = outcome.rendering.rgb
-        alpha, deviation = measure(rgb, outcome.rendering.alpha, self.background)
-        return {
-            "loss": outcome.total.detach(),
-            **outcome.terms,
-            "psnr": psnr(rgb, truth).mean(),
-            "alpha": alpha,
-            "deviation": deviation,
-        }
+    def _report(self, record: dict[str, float], progress: TrainingProgress) -> None:
+        if self.accelerator.is_main_process:
+            self.folder.append(record)
+        images, seconds = self.samples * self.recipe.views.targets, self.clock.seconds
+        if progress.update(self.step, record["loss"], record["psnr"], images, seconds, self.used):
+            self.folder.flush()
 
     def _read(self, measured: dict[str, Tensor], stop: StopRequest) -> dict[str, float]:
         """Numbers of one step, the mean over processes; the only synchronisation of a step."""
         asked = torch.tensor(float(bool(stop)), device=self.device)
         values = torch.stack([v.float() for v in (*measured.values(), asked)])
-        return dict(zip([*measured, "stop"], self._mean(values).tolist(), strict=True))
-
-    def _tick(self) -> None:
-        now = time.perf_counter()
-        if self._clock_started is None:
-            self._clock_started = now
-        elapsed = torch.tensor(now - self._clock_started, device=self.device)
-        self.seconds = float(self._mean(elapsed))
-
-    def _mean(self, value: Tensor) -> Tensor:
-        """Mean over processes, so that all of them decide alike."""
-        reduced = self.accelerator.reduce(value, "mean")
-        assert isinstance(reduced, Tensor)
-        return reduced
+        numbers = mean(self.accelerator, values).tolist()
+        return dict(zip([*measured, "stop"], numbers, strict=True))
 
     def _refuse_nonfinite(self, record: dict[str, float]) -> None:
         terms = {k: v for k, v in record.items() if k not in ("gradient", "stop", "psnr")}
@@ -256,7 +232,7 @@ class Trainer:
 
     def _stopped_by(self, stop: StopRequest) -> str | None:
         """The signal's name when any process was asked to stop."""
-        asked = self._mean(torch.tensor(float(bool(stop)), device=self.device))
+        asked = mean(self.accelerator, torch.tensor(float(bool(stop)), device=self.device))
         name = stop.signal.name if stop.signal else "SIGTERM"
         return name if float(asked) else None
 
@@ -266,7 +242,7 @@ class Trainer:
         if self.detector.dead_after(self.step) and not stopped_by:
             self._give_up(symptom, COLLAPSE_REMEDIES)
         if self.detector.dead_after(self.step):
-            self._save_good()
+            self.saver.save_good()
             return
         if dead:
             _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
@@ -274,7 +250,7 @@ class Trainer:
 
     def _give_up(self, problem: str, causes: Sequence[str]) -> NoReturn:
         self._open_folder()
-        self._save_good()
+        self.saver.save_good()
         remedies = "".join(f"\n  - {cause}" for cause in causes)
         raise CollapseError(
             f"training collapsed at step {self.step}: {problem}. The weights of step "
@@ -283,16 +259,4 @@ class Trainer:
 
     def _save(self) -> None:
         self._refuse_broken_weights()
-        if self.accelerator.is_main_process:
-            save(self.model, self.folder.checkpoint, extra={"step": str(self.step)})
-        self.accelerator.wait_for_everyone()
-
-    def _save_good(self) -> None:
-        if self.accelerator.is_main_process:
-            save(
-                self.model,
-                self.folder.checkpoint,
-                extra={"step": str(self.good.step)},
-                weights=self.good.tensors,
-            )
-        self.accelerator.wait_for_everyone()
+        self.saver.save(self.step)

@@ -61,6 +61,7 @@ def test_two_processes_train_alike_and_one_writes(
     assert [main for main, *_ in said] == ["True", "False"]
     assert said[0][1:] == said[1][1:] == ["3", said[0][2]], "the same weights everywhere"
     names = {path.name for path in (tmp_path / "r").iterdir()}
-    assert names == {"recipe.yaml", "history.jsonl", "checkpoint.safetensors"}
+    files = ("recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors")
+    assert names == set(files)
     lines = (tmp_path / "r" / "history.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == [1, 2, 3]

@@ -1,0 +1,60 @@
+"""When a run reaches the disk: what users load, and what continues it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from accelerate import Accelerator
+
+from qgs.engine.collapse import GoodWeights
+from qgs.engine.folder import RunFolder
+from qgs.engine.state import SavedState, Stateful, Weights, write_state
+from qgs.io.checkpoint import save
+from qgs.model import QueryGaussianModel
+
+
+class Saver:
+    """Writes the checkpoint and the state of a run; of several processes, the main one writes.
+
+    parts: everything that continues the run, by name; "weights" and "good", the copies that outlive
+        a collapse, are also what checkpoints are written from.
+    Each file appears whole or not at all, and the state is complete by itself.
+    """
+
+    def __init__(
+        self,
+        accelerator: Accelerator,
+        folder: RunFolder,
+        model: QueryGaussianModel,
+        good: GoodWeights,
+        parts: Mapping[str, Stateful],
+    ) -> None:
+        self._accelerator = accelerator
+        self._folder = folder
+        self._model = model
+        self._good = good
+        self._weights = Weights(model)
+        self._parts = {"weights": self._weights, "good": good, **parts}
+
+    def save(self, step: int) -> None:
+        """Save the run after `step` optimiser steps. All processes must call this."""
+        parts = {name: part.state() for name, part in self._parts.items()}
+        if self._accelerator.is_main_process:
+            extra = {"step": str(step)}
+            self._folder.flush()
+            save(self._model, self._folder.checkpoint, extra=extra, weights=parts["weights"])
+            assert self._model.recipe is not None
+            write_state(self._folder.state, self._model.recipe, parts)
+        self._accelerator.wait_for_everyone()
+
+    def save_good(self) -> None:
+        """Save a checkpoint of the last good weights. All processes must call this."""
+        if self._accelerator.is_main_process:
+            extra = {"step": str(self._good.step)}
+            save(self._model, self._folder.checkpoint, extra=extra, weights=self._good.tensors)
+        self._accelerator.wait_for_everyone()
+
+    def restore(self, saved: SavedState) -> None:
+        """Bring every part back to where `saved` was taken. All processes must call this."""
+        for name, part in self._parts.items():
+            part.load_state(saved.parts[name])
