@@ -115,14 +115,22 @@ def _targets_of(
 def make_sample(
     scene: Scene, input_frames: Frames, target_frames: Frames, views: ViewsConfig, mirror: bool
 ) -> Sample:
-    """Decode the frames, normalise their poses by the inputs, and mirror them if asked to."""
+    """Decode the frames, normalise their poses by the inputs, and mirror them if asked to.
+
+    Poses are normalised in the precision that the scene has; what is delivered is float32.
+    """
     frames = (*input_frames, *target_frames)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
-    images = torch.from_numpy(scene.images(wanted).numpy()[[place[frame] for frame in frames]])
+    order = [place[frame] for frame in frames]
+    images, masks = scene.images(wanted), scene.masks(wanted)
     cameras = scene.cameras[list(frames)]
-    c2w = normalised(cameras.c2w, len(input_frames), views, scene.name)
-    both = Views(images[None], Cameras(c2w[None], cameras.intrinsics[None], cameras.size))
+    c2w = normalised(cameras.c2w, len(input_frames), views, scene.name).float()
+    both = Views(
+        torch.from_numpy(images.numpy()[order])[None],
+        Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
+        None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
+    )
     if mirror:
         both = mirrored_views(both)
     inputs = both.select(slice(0, len(input_frames)))
@@ -161,12 +169,19 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    images = np.ascontiguousarray(views.images.numpy()[..., ::-1])
-    return Views(torch.from_numpy(images), flipped)
+    masks = None if views.masks is None else _flipped(views.masks)
+    return Views(_flipped(views.images), flipped, masks)
+
+
+def _flipped(images: Tensor) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(images.numpy()[..., ::-1]))
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size."""
+    """Stack samples of equal view counts and image size.
+
+    Where only some have masks, the others get masks that are 1 everywhere.
+    """
     return Batch(
         _stack([sample.inputs for sample in samples]),
         _stack([sample.targets for sample in samples]),
@@ -181,4 +196,14 @@ def _stack(views: Sequence[Views]) -> Views:
         views[0].cameras.size,
     )
     images = np.concatenate([v.images.numpy() for v in views])
-    return Views(torch.from_numpy(images), cameras)
+    masks = None
+    if any(v.masks is not None for v in views):
+        masks = torch.from_numpy(np.concatenate([_mask(v) for v in views]))
+    return Views(torch.from_numpy(images), cameras, masks)
+
+
+def _mask(views: Views) -> np.ndarray:
+    if views.masks is not None:
+        return views.masks.numpy()
+    batch, count, _, height, width = views.images.shape
+    return np.ones((batch, count, 1, height, width), np.float32)

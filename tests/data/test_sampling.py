@@ -7,7 +7,7 @@ import torch
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.loader import training_batches
-from qgs.data.sampling import draw_frames, make_sample, mirrored_views
+from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views
 from qgs.types import Cameras, Views
 
 
@@ -26,6 +26,19 @@ class Line(Scene):
     def images(self, frames):
         value = torch.tensor(list(frames)).float() / 100
         return value[:, None, None, None] + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
+
+
+class MaskedLine(Line):
+    """A line that wants only the left half of frame f modelled, f in percent; float64 poses."""
+
+    @property
+    def cameras(self) -> Cameras:
+        return super().cameras.to(torch.float64)
+
+    def masks(self, frames):
+        value = torch.tensor(list(frames)).float() / 100
+        left = torch.arange(8) < 4
+        return value[:, None, None, None] * left.expand(1, 8, 8)
 
 
 class Lines(SceneSource):
@@ -114,6 +127,37 @@ def projected(cameras: Cameras, point: torch.Tensor) -> torch.Tensor:
     x, y, z, _ = (torch.linalg.inv(cameras.c2w) @ point).unbind(-1)
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     return torch.stack([fx * x / z + cx, fy * y / z + cy, z], -1)
+
+
+def test_masks_follow_their_frames_into_mirrors_and_batches():
+    config = ViewsConfig(inputs=2)
+    plain = make_sample(MaskedLine(6), (1, 4), (3, 2), config, False)
+    assert plain.targets.masks is not None
+    assert plain.targets.masks[0, :, 0, 5, 0].tolist() == pytest.approx([0.03, 0.02])
+    flipped = make_sample(MaskedLine(6), (1, 4), (3, 2), config, True)
+    torch.testing.assert_close(flipped.targets.masks, plain.targets.masks.flip(-1))
+    bare = make_sample(Line(6), (1, 4), (3, 2), config, False)
+    assert collate([bare, bare]).inputs.masks is None
+    mixed = collate([plain, bare]).inputs.masks
+    assert mixed is not None
+    assert mixed.shape == (2, 2, 1, 8, 8)
+    assert torch.equal(mixed[0], plain.inputs.masks[0])
+    assert (mixed[1] == 1).all()
+
+
+def test_poses_far_from_the_origin_keep_their_digits():
+    class Far(MaskedLine):
+        @property
+        def cameras(self) -> Cameras:
+            near = super().cameras
+            c2w = near.c2w.clone()
+            c2w[:, :3, 3] += 1e6
+            return Cameras(c2w, near.intrinsics, near.size)
+
+    config = ViewsConfig(inputs=2, scale_factor=1.0)
+    near, far = (make_sample(kind(6), (1, 4), (3,), config, False) for kind in (MaskedLine, Far))
+    assert far.inputs.cameras.c2w.dtype == far.inputs.cameras.intrinsics.dtype == torch.float32
+    torch.testing.assert_close(far.inputs.cameras.c2w, near.inputs.cameras.c2w, rtol=0, atol=1e-7)
 
 
 def test_too_few_frames_and_a_gap_too_short_are_explained():
