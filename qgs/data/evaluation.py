@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
+from qgs.data.index import EvaluationIndex
 from qgs.data.sampling import (
     Frames,
     Sample,
@@ -16,33 +20,107 @@ from qgs.data.sampling import (
     training_frames,
 )
 
+FrameChoice: TypeAlias = tuple[Frames, Frames]
+"""Input and target frames."""
+
+
+@dataclass(frozen=True)
+class SceneFailure:
+    """A scene that could not be judged, and why."""
+
+    scene: str
+    reason: str
+
+
+class EvaluationPlan:
+    """The scenes of a test split that are judged, and on which views; never mirrored.
+
+    With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
+    of a scene with held-out frames `held_out_windows`, evenly thinned to `evaluation.scenes`; of
+    the others `evaluation.samples` samples, inputs drawn as in training with `evaluation.seed`,
+    targets the other frames of the span.
+
+    wanted: names of the scenes that are to be judged, in order. null: scenes that the index lists
+    without frames. unlisted: scenes of the split that the index lacks.
+    Raises ValueError when the test split is empty.
+    """
+
+    def __init__(
+        self,
+        source: SceneSource,
+        views: ViewsConfig,
+        evaluation: EvaluationConfig,
+        index: EvaluationIndex | None = None,
+    ) -> None:
+        self._scenes = source.scenes("test")
+        if not len(self._scenes):
+            raise ValueError(f"the data source {type(source).name!r} has no test scenes")
+        self._views, self._evaluation, self._index = views, evaluation, index
+        names = [scene.name for scene in self._scenes]
+        self._places = {name: place for place, name in reversed(list(enumerate(names)))}
+        self._count = Counter(names)
+        self.wanted: tuple[str, ...] = tuple(names[: evaluation.scenes])
+        self.null: tuple[str, ...] = ()
+        self.unlisted: tuple[str, ...] = ()
+        if index is not None:
+            self.wanted = tuple(name for name, entry in index.items() if entry)
+            self.null = tuple(name for name, entry in index.items() if not entry)
+            self.unlisted = tuple(name for name in self._places if name not in index)
+
+    def samples(self) -> Iterator[Sample | SceneFailure]:
+        """The samples, one decoded at a time; a scene that fails ends with its failure."""
+        for number, name in enumerate(self.wanted):
+            try:
+                scene, place = self._open(name, number)
+                for frames in self._choices(scene, place):
+                    yield make_sample(scene, *frames, self._views, mirror=False)
+            except Exception as error:  # whatever a reader raises is told, and never ends the rest
+                yield SceneFailure(name, told(error))
+
+    def _open(self, name: str, number: int) -> tuple[Scene, int]:
+        if self._index is None:
+            return self._scenes[number], number
+        if name not in self._places:
+            raise ValueError("not among the test scenes of the data")
+        if self._count[name] > 1:
+            raise ValueError(f"{self._count[name]} test scenes of the data have this name")
+        return self._scenes[self._places[name]], self._places[name]
+
+    def _choices(self, scene: Scene, place: int) -> Iterable[FrameChoice]:
+        if self._index is not None:
+            return [_listed(scene, self._index)]
+        if scene.held_out:
+            return _thinned(held_out_windows(scene, self._views), self._evaluation.scenes)
+        return _drawn(scene, place, self._views, self._evaluation)
+
 
 def evaluation_samples(
-    source: SceneSource, views: ViewsConfig, evaluation: EvaluationConfig
+    source: SceneSource,
+    views: ViewsConfig,
+    evaluation: EvaluationConfig,
+    index: EvaluationIndex | None = None,
 ) -> Sequence[Sample]:
-    """The samples of the test split, never mirrored; deterministic.
+    """All samples of an `EvaluationPlan` at once, for pictures of a few scenes.
 
-    A scene with held-out frames gives `held_out_windows`, evenly thinned to `evaluation.scenes`
-    samples. Of the others, the first `evaluation.scenes` give `evaluation.samples` samples each:
-    inputs drawn as in training, with `evaluation.seed`; targets are the other frames of the span.
-
-    Raises ValueError when the test split is empty or a scene has too few frames.
+    Raises ValueError for the first scene that fails.
     """
-    scenes = source.scenes("test")
-    if not len(scenes):
-        raise ValueError(f"the data source {type(source).name!r} has no test scenes")
     samples: list[Sample] = []
-    for index in range(min(evaluation.scenes, len(scenes))):
-        scene = scenes[index]
-        if scene.held_out:
-            chosen = _thinned(held_out_windows(scene, views), evaluation.scenes)
-        else:
-            chosen = list(_drawn(scene, index, views, evaluation))
-        samples += [make_sample(scene, *frames, views, mirror=False) for frames in chosen]
+    for sample in EvaluationPlan(source, views, evaluation, index).samples():
+        if isinstance(sample, SceneFailure):
+            raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
+        samples.append(sample)
     return samples
 
 
-def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+def told(error: Exception) -> str:
+    """An exception in one line; its kind is left out where the message is for users."""
+    message = " ".join(str(error).split())
+    if isinstance(error, ValueError | FileNotFoundError) and message:
+        return message
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
+
+
+def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
     """Input and target frames such that every held-out frame is a target once.
 
     For the first held-out frame not yet covered, a window of the largest gap (counted in training
@@ -52,7 +130,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
     """
     usable = np.array(training_frames(scene))
     gap = gap_range(len(usable), views, scene.name)[1]
-    windows: list[tuple[Frames, Frames]] = []
+    windows: list[FrameChoice] = []
     covered: set[int] = set()
     for frame in sorted(scene.held_out):
         if frame in covered:
@@ -70,17 +148,29 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
     return windows
 
 
-def _thinned(windows: list[tuple[Frames, Frames]], limit: int) -> list[tuple[Frames, Frames]]:
+def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
+    entry = index[scene.name]
+    assert entry is not None
+    outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
+    if outside:
+        raise ValueError(
+            f"frames {', '.join(map(str, outside))} are out of range, it has frames 0 to "
+            f"{len(scene) - 1}"
+        )
+    return tuple(entry.context), tuple(entry.target)
+
+
+def _thinned(windows: list[FrameChoice], limit: int) -> list[FrameChoice]:
     if len(windows) <= limit:
         return windows
     return [windows[i] for i in np.linspace(0, len(windows) - 1, limit).round().astype(int)]
 
 
 def _drawn(
-    scene: Scene, index: int, views: ViewsConfig, evaluation: EvaluationConfig
-) -> Iterator[tuple[Frames, Frames]]:
+    scene: Scene, place: int, views: ViewsConfig, evaluation: EvaluationConfig
+) -> Iterator[FrameChoice]:
     for k in range(evaluation.samples):
-        rng = np.random.default_rng([evaluation.seed, index, k])
+        rng = np.random.default_rng([evaluation.seed, place, k])
         inputs, drawn = draw_frames(scene, views, rng)
         between = tuple(f for f in range(inputs[0], inputs[-1] + 1) if f not in inputs)
         yield inputs, between or tuple(sorted(set(drawn)))

@@ -1,0 +1,119 @@
+"""LPIPS with a VGG-16 (Zhang et al., 2018, arXiv 1801.03924, version 0.1 of the release).
+
+The `lpips` package supplies the learned weights of the layers. Its own network is not imported: it
+takes VGG-16 from torchvision, whose wheels work with CUDA builds of torch only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from qgs.geometry.precision import full_precision
+
+VGG_FILE = "vgg16-397923af.pth"
+"""Name of torchvision's VGG-16 in torch's cache."""
+
+_BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
+"""Convolutions of VGG-16 by torchvision's numbers; a 2x2 max pooling stands between blocks."""
+
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+_EPS = 1e-10
+_SMALLEST = 2 ** (len(_BLOCKS) - 1)
+
+
+class LpipsUnavailableError(RuntimeError):
+    """LPIPS cannot be computed here; the message says what is missing and how to get it."""
+
+
+class Lpips(nn.Module):
+    """Distance of two images in the features of VGG-16, weighted as people judge.
+
+    vgg: `features.N.weight` and `.bias` of torchvision's VGG-16. linear: `linN.model.1.weight`
+    (1, C, 1, 1) of the `lpips` package. Raises KeyError for a missing one.
+    """
+
+    def __init__(self, vgg: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(
+            nn.ModuleList(_convolution(vgg, number) for number in block) for block in _BLOCKS
+        )
+        for index in range(len(_BLOCKS)):
+            self.register_buffer(f"linear{index}", linear[f"lin{index}.model.1.weight"].float())
+        self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
+        self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
+
+    @full_precision
+    @torch.no_grad()
+    def forward(self, images: Tensor, truth: Tensor) -> Tensor:
+        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones.
+
+        Raises ValueError when a side is shorter than 16 pixels.
+        """
+        if min(images.shape[-2:]) < _SMALLEST:
+            raise ValueError(
+                f"LPIPS needs images of at least {_SMALLEST} pixels a side, got "
+                f"{images.shape[-2]}x{images.shape[-1]}"
+            )
+        pairs = zip(images.flatten(0, -4), truth.flatten(0, -4), strict=True)
+        return torch.stack([self._distance(*pair) for pair in pairs]).reshape(images.shape[:-3])
+
+    def _distance(self, image: Tensor, truth: Tensor) -> Tensor:
+        x = torch.stack([image, truth]).clamp(0, 1) * 2 - 1
+        x = (x - self.shift) / self.scale
+        total = x.new_zeros(())
+        for index, block in enumerate(self.blocks):
+            x = F.max_pool2d(x, 2) if index else x
+            for convolution in block:
+                x = convolution(x).relu()
+            unit = x / (x.norm(dim=1, keepdim=True) + _EPS)
+            apart = (unit[:1] - unit[1:]).square()
+            total = total + F.conv2d(apart, getattr(self, f"linear{index}")).mean()
+        return total
+
+
+def load_lpips(weights: str | None = None) -> Lpips:
+    """LPIPS-VGG as published; nothing is downloaded.
+
+    weights: file of VGG-16's weights (.safetensors, or torchvision's .pth), None for torch's cache.
+    Raises LpipsUnavailableError when the package or the weights are missing or unfit.
+    """
+    package = find_spec("lpips")
+    if package is None or not package.submodule_search_locations:
+        raise LpipsUnavailableError(
+            "the package lpips, which holds its weights, is not installed: pip install 'qgs[lpips]'"
+        )
+    linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
+    vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE
+    if not vgg.is_file():
+        raise LpipsUnavailableError(
+            f"there are no VGG-16 weights at {vgg if weights else f'torch hub cache/{VGG_FILE}'}: "
+            f"download {VGG_FILE} of torchvision and name it in evaluation.lpips_weights"
+        )
+    try:
+        return Lpips(_read(vgg), _read(linear)).eval()
+    except (KeyError, RuntimeError, ValueError, OSError) as error:
+        raise LpipsUnavailableError(
+            f"{vgg.name} or {linear.name} does not hold the weights of VGG-16 and LPIPS 0.1 "
+            f"({type(error).__name__}: {error})"
+        ) from error
+
+
+def _convolution(vgg: Mapping[str, Tensor], number: int) -> nn.Conv2d:
+    weight, bias = vgg[f"features.{number}.weight"], vgg[f"features.{number}.bias"]
+    convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
+    convolution.load_state_dict({"weight": weight, "bias": bias})
+    return convolution.requires_grad_(False)
+
+
+def _read(path: Path) -> Mapping[str, Tensor]:
+    if path.suffix == ".safetensors":
+        return load_file(path)
+    return torch.load(path, map_location="cpu", weights_only=True)
