@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from golden.published import read_golden, recipe_of
+from published.files import read_golden
+from published.models import recipe_of
 
 from qgs.composer import resolve
 
@@ -85,8 +86,8 @@ def test_an_ablation_is_a_few_lines_over_locusgs(path: Path) -> None:
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_is_the_released_variant(name: str) -> None:
     ours = resolve(RECIPES / "ablations" / f"{name}.yaml").tree["model"]
-    _, config = read_golden(f"locus_{ABLATIONS[name]}_a")
-    released = resolve(recipe_of(config)).tree["model"]
+    golden = read_golden(ROOT / "tests" / "golden" / f"locus_{ABLATIONS[name]}_a.safetensors")
+    released = resolve(recipe_of(golden)).tree["model"]
     assert _structure(ours) == _structure(released)
 
 

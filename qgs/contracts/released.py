@@ -1,0 +1,62 @@
+"""Reading the options of a published training run, so that none is misread in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class ReleasedOptionError(ValueError):
+    """An option of a published run is missing, or has a value that no recipe here stands for."""
+
+
+class ReleasedOptions:
+    """The options that a published codebase ran with, by its own names."""
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self._options = options
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of `name`; raises ReleasedOptionError without it."""
+        if name not in self._options:
+            raise ReleasedOptionError(f"the option {name} is missing; give it as the run had it")
+        return self._options[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._options
+
+    def meaning(self, name: str, meanings: Mapping[str, T]) -> T:
+        """What the value of `name` stands for; raises ReleasedOptionError for an unknown one."""
+        value = self[name]
+        if not isinstance(value, str) or value not in meanings:
+            known = ", ".join(sorted(meanings))
+            raise ReleasedOptionError(f"the option {name} is {value!r}; known are {known}")
+        return meanings[value]
+
+    def number(self, name: str) -> int | float:
+        """A number; raises ReleasedOptionError for anything else."""
+        value = self[name]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ReleasedOptionError(f"the option {name} is {value!r}; it must be a number")
+        return value
+
+    def flag(self, name: str) -> bool:
+        """A value that is true or false; raises ReleasedOptionError for any other."""
+        value = self[name]
+        if not isinstance(value, bool):
+            raise ReleasedOptionError(f"the option {name} is {value!r}; it must be true or false")
+        return value
+
+    def only(self, expected: Mapping[str, Any]) -> None:
+        """Raise ReleasedOptionError for an option with another value than the one supported.
+
+        Options that a run does not have are at the value that is expected of them.
+        """
+        for name, value in expected.items():
+            given = self._options.get(name, value)
+            if given != value:
+                raise ReleasedOptionError(
+                    f"the option {name} is {given!r}; only {value!r} is supported"
+                )

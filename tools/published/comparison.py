@@ -1,0 +1,73 @@
+"""How far two tensors are apart, and whether that is small enough."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+RTOL, ATOL = 1e-4, 5e-5
+
+
+@dataclass(frozen=True)
+class Row:
+    """One tensor: its largest absolute and relative error, and what is wrong with it, if anything.
+
+    Errors are over the elements that both have as finite numbers; None where nothing was compared.
+    """
+
+    name: str
+    shape: tuple[int, ...] = ()
+    absolute: float | None = None
+    relative: float | None = None
+    problem: str = ""
+
+
+def compare(
+    found: Mapping[str, Tensor], expected: Mapping[str, Tensor], promised: list[str]
+) -> list[Row]:
+    """A row for every expected tensor, and one for every promised name that the file lacks."""
+    rows = [_row(name, found.get(name), tensor) for name, tensor in expected.items()]
+    missing = sorted(set(promised) - set(expected))
+    return rows + [
+        Row(name, problem="listed in the metadata, missing in the file") for name in missing
+    ]
+
+
+def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
+    shape = tuple(expected.shape)
+    if found is None:
+        return Row(name, shape, problem="not compared: nothing here has this name")
+    if found.shape != expected.shape:
+        return Row(name, shape, problem=f"shape {tuple(found.shape)} here")
+    ours, theirs = found.detach().double(), expected.double()
+    both = ours.isfinite() & theirs.isfinite()
+    error = (ours - theirs).abs()[both]
+    size = theirs.abs()[both]
+    absolute = float(error.max()) if error.numel() else 0.0
+    relative = float((error[size > 0] / size[size > 0]).max()) if (size > 0).any() else 0.0
+    return Row(name, shape, absolute, relative, _verdict(ours, theirs))
+
+
+def _verdict(ours: Tensor, theirs: Tensor) -> str:
+    """Empty when every element is within rtol and atol; infinities and NaN must be the same."""
+    close = torch.isclose(ours, theirs, rtol=RTOL, atol=ATOL, equal_nan=True)
+    beyond = int((~close).sum())
+    return f"{beyond} of {close.numel()} beyond tolerance" if beyond else ""
+
+
+def table(rows: list[Row]) -> Iterator[str]:
+    """The rows as lines of text, failures marked."""
+    width = max((len(row.name) for row in rows), default=0)
+    yield f"{'tensor':<{width}}  {'shape':<18}  {'max abs':>9}  {'max rel':>9}"
+    for row in rows:
+        shape = "x".join(map(str, row.shape)) or "scalar"
+        verdict = f"FAIL  {row.problem}" if row.problem else "pass"
+        errors = f"{_number(row.absolute):>9}  {_number(row.relative):>9}"
+        yield f"{row.name:<{width}}  {shape:<18}  {errors}  {verdict}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2e}"

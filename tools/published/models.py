@@ -1,0 +1,68 @@
+"""The model of a golden file: composed from the published options, filled with its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from qgs_locus.released import locusgs_recipe
+from torch import Tensor
+
+from published.files import GoldenFile, GoldenFileError
+from published.recording import model_tensors
+from published.weights import renamed
+from qgs.components.released import tokengs_recipe
+from qgs.composer import compose
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Views
+
+RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+    "tokengs": tokengs_recipe,
+    "locusgs": locusgs_recipe,
+}
+
+DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
+
+
+def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+    """Whatever the file may hold, computed by its model on its photos and cameras.
+
+    Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
+    for options that no recipe stands for.
+    """
+    model = compose(recipe_of(golden)).eval()
+    _install(model, golden.weights())
+    cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
+    return model_tensors(model, Views(golden.input("rgb"), cameras))
+
+
+def recipe_of(golden: GoldenFile) -> dict[str, Any]:
+    """The recipe of the model that a file was computed with; raises as `golden_tensors` does."""
+    kind = golden.config.get("kind")
+    if not isinstance(kind, str) or kind not in RECIPES:
+        raise GoldenFileError(f"the kind of model is {kind!r}; known are {', '.join(RECIPES)}")
+    constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
+    recipe = RECIPES[kind](golden.config.get("options", {}) | constants)
+    model = recipe["model"]
+    _expect_agreement(golden, "gaussians_per_token", model["head"]["gaussians_per_query"])
+    _expect_agreement(golden, "anchor_radius_min", model["queries"].get("radius_min"))
+    weights = golden.weights()
+    if DECODER_MLP in weights:  # the releases have no option for it
+        hidden, width = weights[DECODER_MLP].shape
+        model["decoder"]["feed_forward"] = {"ratio": hidden // width}
+    return recipe
+
+
+def _expect_agreement(golden: GoldenFile, name: str, from_options: Any) -> None:
+    stated = golden.config.get(name)
+    if None not in (stated, from_options) and stated != from_options:
+        raise GoldenFileError(
+            f"the metadata contradicts itself: {name} is {stated}, by its options {from_options}"
+        )
+
+
+def _install(model: QueryGaussianModel, weights: dict[str, Tensor]) -> None:
+    try:
+        model.load_state_dict(renamed(weights), strict=True)
+    except RuntimeError as error:
+        raise GoldenFileError(f"the weights do not fit the options: {error}") from error

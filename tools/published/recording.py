@@ -1,0 +1,131 @@
+"""Everything that a file of a model can hold, computed here under the file's names.
+
+tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import torch
+from qgs_locus.anchors import AnchoredQueries
+from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
+from qgs_locus.self_attention import AnchorAwareSelfAttention
+from torch import Tensor, nn
+
+from qgs.components import MultiViewViT
+from qgs.components.encoder import IMAGENET_MEAN, IMAGENET_STD
+from qgs.geometry.rays import camera_rays, plucker_rays
+from qgs.model import DecoderLayer, QueryGaussianModel
+from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
+
+
+@torch.no_grad()
+def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
+    """Run `model` and return every tensor that a file can hold."""
+    found = ray_tensors(views.cameras) | {"images": _imagenet_normalised(views.images)}
+    with _recording(model, found):
+        prediction = model(views, layers=range(1, model.depth + 1))
+    found["gaussians"] = _packed(prediction.gaussians)
+    for number, layer in prediction.layers.items():
+        found[f"gaussians_layer.{number}"] = _packed(layer.gaussians)
+    return found
+
+
+def ray_tensors(cameras: Cameras) -> dict[str, Tensor]:
+    """Rays of the input cameras, channels before pixels."""
+    origins, directions = camera_rays(cameras)
+    return {
+        "rays_o": origins.movedim(-1, -3),
+        "rays_d": directions.movedim(-1, -3),
+        "plucker": plucker_rays(cameras),
+    }
+
+
+def _imagenet_normalised(rgb: Tensor) -> Tensor:
+    mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
+    return (rgb - mean) / std
+
+
+def _packed(g: Gaussians) -> Tensor:
+    return torch.cat([g.means, g.opacities[..., None], g.scales, g.quats, g.colors], -1)
+
+
+@contextmanager
+def _recording(model: QueryGaussianModel, found: dict[str, Tensor]) -> Iterator[None]:
+    with ExitStack() as stack:
+        for handle in _Recorder(model, found).handles():
+            stack.callback(handle.remove)
+        yield
+
+
+class _Recorder:
+    """Forward hooks that store what passes by. Layers run in order."""
+
+    def __init__(self, model: QueryGaussianModel, found: dict[str, Tensor]) -> None:
+        self.model = model
+        self.found = found
+        self.layer = 0
+
+    def handles(self) -> Iterator[Any]:
+        encoder = self.model.encoder
+        assert isinstance(encoder, MultiViewViT)
+        first = encoder.blocks[0] if len(encoder.blocks) else encoder.norm
+        yield first.register_forward_pre_hook(self._encoder_input)
+        yield encoder.register_forward_hook(self._memory)
+        for index, layer in enumerate(self.model.decoder):
+            assert isinstance(layer, DecoderLayer)
+            yield layer.register_forward_pre_hook(self._entering(index))
+            yield layer.cross_attention.register_forward_hook(self._cross_attention)
+            yield layer.self_attention.register_forward_hook(self._self_attention)
+            if isinstance(layer.self_attention, AnchorAwareSelfAttention):
+                position_mlp = layer.self_attention.position_mlp
+                yield position_mlp.register_forward_hook(self._position_embedding)
+        for refinement in self.model.refinements:
+            yield refinement.register_forward_hook(self._refined)
+
+    def _encoder_input(self, module: nn.Module, args: tuple[Tensor]) -> None:
+        self.found["encoder_in"] = args[0]
+
+    def _memory(self, module: nn.Module, args: Any, memory: ImageMemory) -> None:
+        self.found["encoder_features"] = memory.features
+        self.found["keys"], self.found["values"] = memory.keys, memory.values
+        self.found["plucker_patch"] = memory.patch_rays
+
+    def _entering(self, index: int) -> Any:
+        def enter(module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
+            self.layer = index
+            if index == 0:
+                self._state(args[0], 0)
+
+        return enter
+
+    def _refined(self, module: nn.Module, args: Any, state: QueryState) -> None:
+        self._state(state, self.layer + 1)
+
+    def _state(self, state: QueryState, number: int) -> None:
+        self.found[f"tokens.{number}"] = state.features
+        queries = self.model.queries
+        if isinstance(queries, AnchoredQueries):
+            self.found[f"anchor_center.{number}"] = state[CENTER]
+            if queries.config.radius:
+                radius = support_radius(state[RAW_RADIUS], queries.config)
+                self.found[f"anchor_radius.{number}"] = radius
+
+    def _cross_attention(
+        self, module: nn.Module, args: tuple[QueryState, ImageMemory], update: Tensor
+    ) -> None:
+        self.found[f"cross_attn_out.{self.layer}"] = update
+        if isinstance(module, RayBiasedCrossAttention):
+            self.found[f"geo_gamma.{self.layer}"] = module.gamma
+            self.found[f"geo_bias.{self.layer}"] = module.bias(*args) / module.gamma
+
+    def _self_attention(self, module: nn.Module, args: Any, update: Tensor) -> None:
+        self.found[f"self_attn_out.{self.layer}"] = update
+
+    def _position_embedding(self, module: nn.Module, args: tuple[Tensor], output: Tensor) -> None:
+        self.found[f"anchor_sine.{self.layer}"] = args[0]
+        self.found[f"anchor_pe.{self.layer}"] = output
