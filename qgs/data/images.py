@@ -41,7 +41,10 @@ class CropResize:
         return (source - source.new_tensor([0.0, 0.0, left, top])) * self.scale
 
     def image(self, image: Image.Image) -> np.ndarray:
-        """`image`, of the source's size, as (H, W, 3) uint8; Lanczos filter over the area."""
+        """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel.
+
+        Lanczos filter over the area.
+        """
         height, width = self.target
         left, top, right, bottom = self.box
         box = (left, top, min(right, self.source[1]), min(bottom, self.source[0]))
@@ -65,17 +68,27 @@ def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Imag
 
 def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image.Image:
     """As `open_rgb`, for an open file. Raises OSError for bytes that are no readable image."""
-    try:
-        with Image.open(file) as image:
-            image.load()
-    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise OSError(str(error)) from error
+    image = _decoded(file)
     if image.has_transparency_data:
         image = image.convert("RGBA")
         color = tuple(round(255 * channel) for channel in background)
         canvas = Image.new("RGBA", image.size, (*color, 255))
         image = Image.alpha_composite(canvas, image)
     return image.convert("RGB")
+
+
+def decode_gray(file: IO[bytes]) -> Image.Image:
+    """An open image file as one 8-bit channel. Raises OSError as `decode_rgb`."""
+    return _decoded(file).convert("L")
+
+
+def _decoded(file: IO[bytes]) -> Image.Image:
+    try:
+        with Image.open(file) as image:
+            image.load()
+    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise OSError(str(error)) from error
+    return image
 
 
 def to_tensor(images: np.ndarray) -> Tensor:
