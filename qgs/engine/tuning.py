@@ -1,0 +1,82 @@
+"""Test-time token tuning: the queries of one scene, fitted to its input views (TokenGS release)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from qgs.composer import Recipe
+from qgs.losses import Photometric
+from qgs.model import QueryGaussianModel
+from qgs.types import Prediction, QueryState, Views
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """prediction: from the tuned queries. losses: before each step, and after the last one."""
+
+    prediction: Prediction
+    losses: Sequence[float]
+
+
+def tuning_loss(recipe: Recipe) -> Photometric:
+    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults."""
+    for loss in recipe.build_losses().values():
+        if isinstance(loss, Photometric) and (loss.config.mse_weight or loss.config.ssim_weight):
+            return loss
+    return Photometric(Photometric.Config())
+
+
+def tune(
+    model: QueryGaussianModel, views: Views, loss: Photometric, steps: int, rate: float = 1e-4
+) -> Tuning:
+    """Fit the initial queries of `views` (B, V) to these views with Adam; weights stay as they are.
+
+    Whatever floats in the initial state is fitted, its features and every field, so LocusGS's
+    anchors too. The photos are encoded once; the last layer is rendered at the input cameras and
+    compared with the photos themselves. TokenGS takes 50 steps at a rate of 1e-4.
+    Raises ValueError for less than one step.
+    """
+    if steps < 1:
+        raise ValueError(f"token tuning takes at least one step, got {steps}")
+    with torch.no_grad():
+        memory = model.encoder(views)
+        start = model.queries(views.images.shape[0])
+    state, leaves = _leaves(start)
+    optimizer = torch.optim.Adam(leaves, lr=rate)
+    losses = []
+    with torch.enable_grad():
+        for _ in range(steps):
+            value = _loss(model, model.predict(memory, state, ()), views, loss)
+            gradients = torch.autograd.grad(value, leaves, allow_unused=True)
+            for leaf, gradient in zip(leaves, gradients, strict=True):
+                leaf.grad = gradient
+            optimizer.step()
+            losses.append(float(value.detach()))
+    with torch.no_grad():
+        prediction = model.predict(memory, state, ())
+        losses.append(float(_loss(model, prediction, views, loss)))
+    return Tuning(prediction, losses)
+
+
+def _leaves(start: QueryState) -> tuple[QueryState, list[Tensor]]:
+    """A copy of `start` whose floating tensors want gradients, and these."""
+
+    def leaf(tensor: Tensor) -> Tensor:
+        copy = tensor.detach().clone()
+        return copy.requires_grad_() if copy.is_floating_point() else copy
+
+    fields = {name: leaf(tensor) for name, tensor in start.fields.items()}
+    state = QueryState(leaf(start.features), fields)
+    return state, [t for t in (state.features, *fields.values()) if t.requires_grad]
+
+
+def _loss(
+    model: QueryGaussianModel, prediction: Prediction, views: Views, loss: Photometric
+) -> Tensor:
+    rendering = model.render(prediction.gaussians, views.cameras)
+    layer = prediction.layers[model.depth]
+    return torch.stack(list(loss(layer, rendering, views).values())).sum()
