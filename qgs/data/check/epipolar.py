@@ -1,0 +1,110 @@
+"""Whether poses agree with photos: matches against the epipolar lines that the poses predict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from qgs.data.check.matching import Matches
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+READINGS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
+    "as read": lambda pose: pose,
+    "flipped": lambda pose: pose @ _FLIP,
+    "inverted": np.linalg.inv,
+    "inverted and flipped": lambda pose: np.linalg.inv(pose) @ _FLIP,
+}
+"""What the poses of a data set may have been meant as; "flipped" swaps OpenCV and OpenGL axes."""
+
+TOLERANCE = 0.005
+"""Largest median distance that good poses leave, as a fraction of the image's diagonal."""
+
+CLEARLY_BETTER = 3.0
+"""A reading replaces the present one when its distance is this many times smaller."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two frames and what they share.
+
+    poses: (2, 4, 4) camera-to-world, OpenCV axes as read. intrinsics: (2, 4) fx, fy, cx, cy.
+    size: (H, W) of both photos, pixels.
+    """
+
+    frames: tuple[int, int]
+    matches: Matches
+    poses: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+
+    def distance(self, reading: str = "as read") -> float:
+        """Median epipolar distance under one of READINGS, as a fraction of the diagonal."""
+        first, second = (READINGS[reading](pose) for pose in self.poses)
+        distances = epipolar_distances(self.matches, first, second, self.intrinsics)
+        return float(np.median(distances) / np.hypot(*self.size))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """distances: median over pairs for each of READINGS, fractions of the diagonal."""
+
+    distances: Mapping[str, float]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the poses, as read, explain the photos."""
+        return self.distances["as read"] <= TOLERANCE and self.better is None
+
+    @property
+    def better(self) -> str | None:
+        """The reading that explains the photos where the present one does not."""
+        best = min(self.distances, key=lambda reading: self.distances[reading])
+        clear = self.distances["as read"] > CLEARLY_BETTER * self.distances[best]
+        return best if clear and self.distances[best] <= TOLERANCE else None
+
+
+def judge(pairs: Sequence[Pair]) -> Verdict:
+    """Compare all READINGS on at least one pair."""
+    return Verdict(
+        {
+            reading: float(np.median([pair.distance(reading) for pair in pairs]))
+            for reading in READINGS
+        }
+    )
+
+
+def epipolar_distances(
+    matches: Matches, first: np.ndarray, second: np.ndarray, intrinsics: np.ndarray
+) -> np.ndarray:
+    """Distance in pixels of each point (P,) to the epipolar line of its partner, both ways' mean.
+
+    first, second: (4, 4) camera-to-world, OpenCV axes. intrinsics: (2, 4). Two cameras on one point
+    have no epipolar lines: all distances are then 0 (Hartley and Zisserman 2004, section 9.2).
+    """
+    relative = np.linalg.inv(second) @ first
+    rotation, shift = relative[:3, :3], relative[:3, 3]
+    x, y, z = shift
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    inverse = [np.linalg.inv(_matrix(values)) for values in intrinsics]
+    fundamental = inverse[1].T @ cross @ rotation @ inverse[0]
+    a, b = _homogeneous(matches.first), _homogeneous(matches.second)
+    forth = _line_distance(b, a @ fundamental.T)
+    back = _line_distance(a, b @ fundamental)
+    return (forth + back) / 2
+
+
+def _line_distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(lines[:, :2], axis=1)
+    return np.abs((points * lines).sum(1)) / np.where(length > 0, length, 1.0)
+
+
+def _homogeneous(points: np.ndarray) -> np.ndarray:
+    return np.concatenate([points, np.ones((len(points), 1))], 1)
+
+
+def _matrix(intrinsics: np.ndarray) -> np.ndarray:
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
