@@ -2,55 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from dataclasses import dataclass
 
-import numpy as np
-
-from qgs.contracts import Scene, SceneSource, ViewsConfig
+from qgs.contracts import SceneSource, SceneSourceConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples
-from qgs.data.sampling import Batch, Sample, collate, draw_frames, make_sample
+from qgs.data.sampling import Batch
+from qgs.data.stream import SampleError, SampleStream
+from qgs.data.workers import decoded_by_workers
 
-__all__ = ["evaluation_samples", "training_batches"]
+__all__ = ["SampleError", "Share", "evaluation_samples", "training_batches"]
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which part of every global batch is one process's own: slice `rank` of `processes`."""
+
+    rank: int = 0
+    processes: int = 1
 
 
 def training_batches(
-    source: SceneSource, views: ViewsConfig, batch_size: int, seed: int, start: int = 0
+    source: SceneSource,
+    views: ViewsConfig,
+    batch_size: int,
+    seed: int,
+    start: int = 0,
+    *,
+    share: Share = Share(),
+    workers: int = 0,
 ) -> Generator[Batch, None, None]:
-    """Batches start, start + 1, ... of an endless sequence.
+    """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
-    Each epoch visits every training scene once, in an order of its own. Sample k, the k-th of the
-    whole sequence, depends on (seed, k) alone, so `start` resumes exactly. The next batch is made
-    in a thread while the caller uses this one; closing the generator ends that thread.
+    Each epoch visits every training scene once, in an order of its own that respects
+    `SceneSource.groups`. Sample k of the whole sequence depends on (seed, k) alone. Global batch n
+    is the samples from n * batch_size * processes on, and every process gets its slice: so W
+    processes see together what one with W times the batch size sees, `start` resumes exactly, and
+    the number of workers changes nothing.
 
-    Raises ValueError when the source has no training scenes or a scene has too few frames.
+    workers: processes that decode; with 0 the next batch is made in a thread while the caller uses
+    this one. Closing the generator ends them.
+    Raises ValueError when the source has no training scenes or a scene has too few frames, and
+    SampleError, which is one too, for a sample that cannot be made.
     """
-    scenes = source.scenes("train")
-    if not len(scenes):
-        raise ValueError(f"the data source {type(source).name!r} has no training scenes")
-    draw = _drawer(scenes, views, seed)
-
-    def batch(number: int) -> Batch:
-        first = number * batch_size
-        return collate([draw(k) for k in range(first, first + batch_size)])
-
-    return _prefetched(batch, start)
+    stream = SampleStream(source, views, seed)
+    part = _Part(batch_size, share)
+    if not workers:
+        return _prefetched(lambda number: stream.batch(part.samples(number)), start)
+    opener = _Opener(type(source), source.config, views, seed, part)
+    return decoded_by_workers(opener, start, workers)
 
 
-def _drawer(scenes: Sequence[Scene], views: ViewsConfig, seed: int) -> Callable[[int], Sample]:
-    @lru_cache(maxsize=2)
-    def order(epoch: int) -> np.ndarray:
-        return np.random.default_rng([seed, 0, epoch]).permutation(len(scenes))
+@dataclass(frozen=True)
+class _Part:
+    batch_size: int
+    share: Share
 
-    def draw(k: int) -> Sample:
-        epoch, position = divmod(k, len(scenes))
-        rng = np.random.default_rng([seed, 1, k])
-        scene = scenes[int(order(epoch)[position])]
-        mirror = bool(rng.random() < views.mirror)
-        return make_sample(scene, *draw_frames(scene, views, rng), views, mirror)
+    def samples(self, number: int) -> range:
+        """The samples of this process's slice of global batch `number`."""
+        first = (number * self.share.processes + self.share.rank) * self.batch_size
+        return range(first, first + self.batch_size)
 
-    return draw
+
+@dataclass(frozen=True)
+class _Opener:
+    """Opens a source of the class and options that the training process has opened."""
+
+    kind: type[SceneSource]
+    config: SceneSourceConfig
+    views: ViewsConfig
+    seed: int
+    part: _Part
+
+    def __call__(self) -> Callable[[int], Batch]:
+        stream = SampleStream(self.kind(self.config), self.views, self.seed)
+        return lambda number: stream.batch(self.part.samples(number))
 
 
 def _prefetched(batch: Callable[[int], Batch], start: int) -> Generator[Batch, None, None]:

@@ -15,7 +15,7 @@ from rich.console import Console
 from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.data.loader import training_batches
+from qgs.data.loader import Share, training_batches
 from qgs.engine.clock import Clock
 from qgs.engine.collapse import (
     BROKEN_REMEDIES,
@@ -123,9 +123,13 @@ class Trainer:
         }
         self.saver = Saver(self.accelerator, self.folder, self.model, self.good, self.parts)
         self._folder_is_open = False
-        seed = recipe.seed + 1_000_003 * self.accelerator.process_index
         self._stream = training_batches(
-            recipe.build_data(), recipe.views, self.config.batch_size, seed
+            recipe.build_data(),
+            recipe.views,
+            self.config.batch_size,
+            recipe.seed,
+            share=Share(self.accelerator.process_index, self.accelerator.num_processes),
+            workers=self.config.workers,
         )
         self._batches = chain([next(self._stream)], self._stream)
 

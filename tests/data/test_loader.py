@@ -1,0 +1,175 @@
+"""Training batches: one stream, whoever decodes it and however many share it."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import threading
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from qgs.composer import Recipe, resolve
+from qgs.contracts import Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.data.loader import SampleError, Share, training_batches
+from qgs.data.order import SceneOrder
+from qgs.data.sampling import Batch
+from qgs.types import Cameras
+
+TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"
+ROOMS = resolve(TINY, ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"])
+
+
+def photos(folder: Path, broken: int | None = None) -> Recipe:
+    folder.mkdir()
+    frames = []
+    for number in range(8):
+        pixels = np.random.default_rng(number).integers(0, 256, (16, 16, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+        matrix = np.eye(4)
+        matrix[0, 3] = number
+        frames.append({"file_path": f"{number}.png", "transform_matrix": matrix.tolist()})
+    if broken is not None:
+        file = folder / f"{broken}.png"
+        file.write_bytes(file.read_bytes()[:400])
+    meta = {"fl_x": 16, "fl_y": 16, "cx": 8, "cy": 8, "w": 16, "h": 16, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    data = {"type": "qgs/photos", "path": str(folder), "image_size": [16, 16], "holdout": 0}
+    return resolve({**ROOMS.tree, "data": data}, ["views.gap=[4, 7]", "views.targets=6"])
+
+
+def batches(recipe: Recipe, count: int, size: int, **options) -> list[Batch]:
+    stream = training_batches(recipe.build_data(), recipe.views, size, 3, **options)
+    try:
+        return list(islice(stream, count))
+    finally:
+        stream.close()
+
+
+def assert_same(first: Sequence[Batch], second: Sequence[Batch]) -> None:
+    assert len(first) == len(second)
+    for a, b in zip(first, second, strict=True):
+        assert a.scenes == b.scenes
+        for ours, theirs in ((a.inputs, b.inputs), (a.targets, b.targets)):
+            assert torch.equal(ours.images, theirs.images)
+            assert torch.equal(ours.cameras.c2w, theirs.cameras.c2w)
+            assert torch.equal(ours.cameras.intrinsics, theirs.cameras.intrinsics)
+
+
+def test_worker_processes_change_nothing_and_end_with_the_stream(tmp_path):
+    recipe = photos(tmp_path / "shelf")
+    here = batches(recipe, 7, 2)
+    state = torch.get_rng_state()
+    stream = training_batches(recipe.build_data(), recipe.views, 2, 3, start=3, workers=2)
+    there = list(islice(stream, 4))
+    assert len(multiprocessing.active_children()) == 2
+    stream.close()
+    assert not multiprocessing.active_children()
+    assert_same(here[3:], there)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_closing_ends_the_thread():
+    batches(ROOMS, 1, 1)
+    assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_share_what_one_would_see(processes):
+    alone = batches(ROOMS, 3, 2 * processes)
+    for rank in range(processes):
+        share = Share(rank, processes)
+        part = batches(ROOMS, 3, 2, share=share)
+        own = slice(2 * rank, 2 * rank + 2)
+        for whole, ours in zip(alone, part, strict=True):
+            assert ours.scenes == whole.scenes[own]
+            assert torch.equal(ours.inputs.images, whole.inputs.images[own])
+            assert torch.equal(ours.targets.cameras.c2w, whole.targets.cameras.c2w[own])
+        assert_same(batches(ROOMS, 1, 2, share=share, start=2), part[2:])
+
+
+def test_the_seed_decides():
+    first = training_batches(ROOMS.build_data(), ROOMS.views, 5, 0)
+    second = training_batches(ROOMS.build_data(), ROOMS.views, 5, 1)
+    assert next(first).scenes != next(second).scenes
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_broken_image_is_told_with_its_scene_and_frame(tmp_path, workers):
+    recipe = photos(tmp_path / "shelf", broken=5)
+    recipe = resolve(recipe.tree, ["views.gap=[7, 7]"])
+    with pytest.raises(SampleError, match=r"scene 'shelf', frame 5 .*5\.png"):
+        batches(recipe, 1, 1, workers=workers)
+    assert not multiprocessing.active_children()
+
+
+def test_data_that_vanished_is_told_by_workers_too(tmp_path):
+    recipe = photos(tmp_path / "shelf")
+    source = recipe.build_data()
+    (tmp_path / "shelf" / "transforms.json").unlink()
+    with pytest.raises(SampleError, match=r"transforms\.json|shelf"):
+        next(training_batches(source, recipe.views, 1, 0, workers=1))
+
+
+class Grouped(SceneSource):
+    """Scenes of equal cameras, stored in files of three."""
+
+    name = "grouped"
+
+    def __init__(self, count: int, groups: Sequence[Sequence[int]]) -> None:
+        super().__init__(SceneSourceConfig(image_size=(4, 4)))
+        self._scenes = [Still(str(index)) for index in range(count)]
+        self._groups = groups
+
+    def scenes(self, split):
+        return self._scenes
+
+    def groups(self, split):
+        return self._groups
+
+
+class Still(Scene):
+    """Four grey frames, a step apart."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @property
+    def cameras(self) -> Cameras:
+        c2w = torch.eye(4).repeat(4, 1, 1)
+        c2w[:, 0, 3] = torch.arange(4)
+        return Cameras(c2w, torch.ones(4, 4), (4, 4))
+
+    def images(self, frames):
+        return torch.full((len(frames), 3, 4, 4), 0.5)
+
+
+def test_groups_are_visited_one_after_another_in_changing_orders():
+    groups = [range(3), range(3, 6), [8, 6, 7]]
+    source = Grouped(9, groups)
+    stream = training_batches(source, ViewsConfig(inputs=2, targets=1, gap=(1, 3)), 9, seed=0)
+    epochs = [[int(name) for name in next(stream).scenes] for _ in range(20)]
+    for epoch in epochs:
+        parts = [frozenset(epoch[i : i + 3]) for i in (0, 3, 6)]
+        assert set(parts) == {frozenset(group) for group in groups}
+    assert {epoch[0] for epoch in epochs} == set(range(9)), "groups and scenes in them vary"
+
+
+def test_groups_must_hold_every_scene_once():
+    for groups in ([range(4)], [range(5), [4]], []):
+        with pytest.raises(ValueError, match="not each scene once"):
+            next(training_batches(Grouped(5, groups), ViewsConfig(), 1, seed=0))
+
+
+def test_fingerprints_tell_stores_apart():
+    prints = {
+        SceneOrder(groups, 6, seed=1).fingerprint
+        for groups in ([range(6)], [range(3), range(3, 6)], [range(4), range(4, 6)])
+    }
+    assert len(prints) == 3
+    assert SceneOrder([[0, 1]], 2, 1).fingerprint == SceneOrder([range(2)], 2, 5).fingerprint
