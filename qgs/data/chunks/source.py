@@ -1,0 +1,263 @@
+"""`qgs/chunks`: RealEstate10K-style chunks."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import overload
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from upath import UPath
+
+from qgs.contracts import Scene, SceneSource, Split
+from qgs.data.chunks.listing import Listing, has_chunks, list_scenes
+from qgs.data.chunks.record import Record, judge_record
+from qgs.data.chunks.store import ChunkStore
+from qgs.data.encoded import EncodedFrame, EncodedScene
+from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
+from qgs.data.paths import opened_path
+from qgs.types import Cameras
+
+_log = logging.getLogger(__name__)
+_SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
+
+
+class ChunksConfig(SceneSource.Config):
+    """Options of `qgs/chunks`.
+
+    path: folder or fsspec URL that holds train/ and test/, relative to the working directory.
+    holdout: every n-th frame of each scene is kept for evaluation, from frame n // 2 on; 0 for
+    none. max_scenes: only the first scenes of each split, 0 for all. min_frames: scenes with fewer
+    frames are left out, which opens every chunk once at the start; 0 keeps all. background: RGB
+    behind transparent pixels.
+    """
+
+    path: str
+    holdout: int = Field(default=0, ge=0)
+    max_scenes: int = Field(default=0, ge=0)
+    min_frames: int = Field(default=0, ge=0)
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+class ChunkScene(EncodedScene):
+    """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
+
+    def __init__(self, store: ChunkStore, file: UPath, key: str, config: ChunksConfig) -> None:
+        self.name = key
+        self._store, self._file, self._config = store, file, config
+
+    @property
+    def _record(self) -> Record:
+        return self._store.chunk(self._file).record(self.name)
+
+    @cached_property
+    def _count(self) -> int:
+        return len(self._record)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @cached_property
+    def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
+        """See `Scene`."""
+        every = self._config.holdout
+        return tuple(range(every // 2, len(self), every)) if every else ()
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """See `Scene`. Raises ValueError for cameras that cannot be used."""
+        record = self._record
+        judge_record(record)
+        target = self._config.image_size
+        intrinsics = [
+            CropResize(size, target).intrinsics(torch.tensor(pixels, dtype=torch.float64))
+            for pixels, size in zip(_in_pixels(record), record.image_sizes, strict=True)
+        ]
+        return Cameras(torch.linalg.inv(record.w2c), torch.stack(intrinsics), target)
+
+    def frame_name(self, frame: int) -> str:
+        """See `Scene`: the writer's name of a frame, else its time stamp."""
+        return self._record.names[frame]
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`. Raises ValueError for an image that cannot be decoded."""
+        record = self._record
+        return to_tensor(np.stack([self._pixels(record, frame) for frame in frames]))
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; a frame without a mask has one of ones."""
+        record = self._record
+        if record.masks is None:
+            return None
+        masks = np.stack([self._mask(record, frame) for frame in frames])
+        return torch.from_numpy(masks)[:, None].float().div_(255)
+
+    def encoded(self, frame: int) -> EncodedFrame:
+        """See `EncodedScene`."""
+        record = self._record
+        if not -len(record) <= frame < len(record):
+            raise IndexError(f"frame {frame} of {len(record)}")
+        size = record.stored_size(frame)
+        height, width = size
+        fx, fy, cx, cy = record.cameras[frame, :4].double().tolist()
+        mask = None if record.masks is None else record.masks[frame].numpy().tobytes()
+        return EncodedFrame(
+            name=record.names[frame],
+            data=record.images[frame].numpy().tobytes(),
+            c2w=torch.linalg.inv(record.w2c[frame]).numpy(),
+            intrinsics=(fx * width, fy * height, cx * width, cy * height),
+            size=size,
+            mask=mask or None,
+        )
+
+    def _pixels(self, record: Record, frame: int) -> np.ndarray:
+        file = io.BytesIO(record.images[frame].numpy().tobytes())
+        try:
+            image = decode_rgb(file, self._config.background)
+        except OSError as error:
+            raise ValueError(
+                f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
+                "chunk again, or take the scene out of index.json"
+            ) from error
+        _check_aspect(record, frame, (image.height, image.width))
+        return CropResize((image.height, image.width), self._config.image_size).image(image)
+
+    def _mask(self, record: Record, frame: int) -> np.ndarray:
+        assert record.masks is not None
+        data = record.masks[frame]
+        if not len(data):
+            return np.full(self._config.image_size, 255, np.uint8)
+        try:
+            mask = decode_gray(io.BytesIO(data.numpy().tobytes()))
+        except OSError as error:
+            raise ValueError(
+                f"the mask of {record.place(frame)} cannot be read: {error}"
+            ) from error
+        return CropResize((mask.height, mask.width), self._config.image_size).image(mask)
+
+
+def _in_pixels(record: Record) -> list[list[float]]:
+    """fx, fy, cx, cy of every frame in pixels of its image."""
+    sizes = torch.tensor([(w, h, w, h) for h, w in record.image_sizes], dtype=torch.float64)
+    return (record.cameras[:, :4].double() * sizes).tolist()
+
+
+def _check_aspect(record: Record, frame: int, size: tuple[int, int]) -> None:
+    """Intrinsics were cropped for the size that the scene tells; another aspect breaks them."""
+    height, width = record.image_sizes[frame]
+    if abs(size[1] * height / (size[0] * width) - 1) > _SAME_ASPECT:
+        raise ValueError(
+            f"{record.place(frame)} is {size[1]} x {size[0]} pixels, and its scene's images are "
+            f"{width} x {height}, another aspect ratio: chunks of mixed sizes need 'sizes', "
+            "which `qgs data pack` writes"
+        )
+
+
+class ChunkScenes(Sequence[Scene]):
+    """The scenes of a split, made when they are asked for."""
+
+    def __init__(self, store: ChunkStore, files: Mapping[str, UPath], config: ChunksConfig) -> None:
+        self._store, self._files, self._config = store, files, config
+        self._keys = list(files)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @overload
+    def __getitem__(self, index: int) -> Scene: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
+    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        key = self._keys[index]
+        return ChunkScene(self._store, self._files[key], key, self._config)
+
+    def groups(self) -> list[list[int]]:
+        """Indices of the scenes of each file."""
+        by_file: dict[str, list[int]] = {}
+        for place, key in enumerate(self._keys):
+            by_file.setdefault(str(self._files[key]), []).append(place)
+        return list(by_file.values())
+
+
+class ChunksSource(SceneSource):
+    """Chunks under PATH/train and PATH/test; a folder without these is the training split.
+
+    A data set without test chunks is evaluated on the held-out frames of its training scenes, if
+    `holdout` asks for any.
+
+    missing: keys that an index.json names and whose chunks do not exist, by split.
+    """
+
+    name = "chunks"
+    Config = ChunksConfig
+
+    def __init__(self, config: ChunksConfig) -> None:
+        super().__init__(config)
+        store = ChunkStore()
+        folders = _folders(opened_path(config.path))
+        listings: dict[Split, Listing] = {
+            split: list_scenes(folder) for split, folder in folders.items()
+        }
+        self.missing = {split: list(listing.missing) for split, listing in listings.items()}
+        self._splits: dict[Split, ChunkScenes] = {
+            split: ChunkScenes(store, _chosen(store, listing, config), config)
+            for split, listing in listings.items()
+        }
+        nothing = ChunkScenes(store, {}, config)
+        self._splits.setdefault("train", nothing)
+        self._splits.setdefault("test", self._splits["train"] if config.holdout else nothing)
+
+    def scenes(self, split: Split) -> Sequence[Scene]:
+        """See `SceneSource`."""
+        return self._splits[split]
+
+    def groups(self, split: Split) -> Sequence[Sequence[int]]:
+        """See `SceneSource`: one group for each chunk file."""
+        return self._splits[split].groups()
+
+
+def _folders(path: UPath) -> dict[Split, UPath]:
+    if not path.is_dir():
+        raise FileNotFoundError(
+            f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
+        )
+    splits: tuple[Split, ...] = ("train", "test")
+    found: dict[Split, UPath] = {
+        split: path / split for split in splits if has_chunks(path / split)
+    }
+    if not found and has_chunks(path):
+        return {"train": path}
+    if not found:
+        inside = ", ".join(sorted(item.name for item in path.iterdir())[:8]) or "nothing"
+        raise FileNotFoundError(
+            f"{path} holds no chunks: expected train/ or test/ with index.json and .torch files, "
+            f"found {inside}. `qgs data pack` makes chunks of other formats"
+        )
+    return found
+
+
+def _chosen(store: ChunkStore, listing: Listing, config: ChunksConfig) -> dict[str, UPath]:
+    """The scenes that the options leave; those with too few frames are counted and named."""
+    files = dict(listing.files)
+    if config.min_frames:
+        frames = {key: store.chunk(file).frames(key) for key, file in _by_file(files)}
+        short = {key: count for key, count in frames.items() if count < config.min_frames}
+        if short:
+            _log.warning(
+                "%d of %d scenes of %s have fewer than %d frames (min_frames) and are left out: %s",
+                len(short), len(files), listing.folder, config.min_frames,
+                ", ".join(f"{key} ({count})" for key, count in short.items()),
+            )  # fmt: skip
+        files = {key: file for key, file in files.items() if key not in short}
+    return dict(list(files.items())[: config.max_scenes or None])
+
+
+def _by_file(files: Mapping[str, UPath]) -> list[tuple[str, UPath]]:
+    return sorted(files.items(), key=lambda item: str(item[1]))

@@ -1,0 +1,291 @@
+import io
+import json
+import os
+import pickle  # noqa: TID251  as multiprocessing does
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from upath import UPath
+
+from qgs.data.chunks import ChunksSource
+from qgs.data.chunks.record import camera_faults, parse_record
+from qgs.data.chunks.store import ChunkStore, load_chunk
+
+PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
+
+
+def encoded(color, size=(64, 36), kind="PNG", **options) -> torch.Tensor:
+    file = io.BytesIO()
+    Image.new("RGB" if len(color) == 3 else "RGBA", size, color).save(file, kind, **options)
+    return torch.tensor(list(file.getvalue()), dtype=torch.uint8)
+
+
+def camera(x: float = 0.0) -> list[float]:
+    """A camera at (x, 2, 3) that is turned a quarter about z."""
+    w2c = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]], float)
+    w2c[:, 3] = -w2c[:, :3] @ [x, 2, 3]
+    return [0.5, 0.9, 0.45, 0.55, 0, 0, *w2c.flatten()]
+
+
+def record(key: str, frames: int = 4, **extra) -> dict:
+    return {
+        "key": key,
+        "url": "",
+        "timestamps": torch.arange(frames) * 1000,
+        "cameras": torch.tensor([camera(i) for i in range(frames)]),
+        "images": [encoded((10 * i, 50, 200)) for i in range(frames)],
+        **extra,
+    }
+
+
+def write(folder, chunks: dict[str, list], index: bool = True) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, records in chunks.items():
+        with (folder / name).open("wb") as file:
+            torch.save(records, file)
+    if index:
+        keys = {entry["key"]: name for name, records in chunks.items() for entry in records}
+        (folder / "index.json").write_text(json.dumps(keys))
+
+
+def data_set(path) -> None:
+    write(path / "train", {"a.torch": [record("s0"), record("s1", 7)], "b.torch": [record("s2")]})
+    write(path / "test", {"a.torch": [record("t0")]})
+
+
+def opened(path, **options) -> ChunksSource:
+    return ChunksSource(ChunksSource.Config(path=str(path), **{"image_size": (16, 16), **options}))
+
+
+def test_frames_and_cameras(tmp_path):
+    data_set(tmp_path)
+    source = opened(tmp_path)
+    assert [scene.name for scene in source.scenes("train")] == ["s0", "s1", "s2"]
+    assert [scene.name for scene in source.scenes("test")] == ["t0"]
+    assert list(map(list, source.groups("train"))) == [[0, 1], [2]]
+    scene = source.scenes("train")[1]
+    assert len(scene) == 7
+    c2w = scene.cameras.c2w[5]
+    assert c2w.dtype == torch.float64
+    assert c2w[:3, 3].tolist() == pytest.approx([5, 2, 3])
+    assert c2w[:3, 0].tolist() == [0, 1, 0]  # the camera's x axis
+    # 64 x 36 cropped to 36 x 36, 14 pixels off the left, then scaled by 16 / 36
+    wanted = np.array([0.5 * 64, 0.9 * 36, 0.45 * 64 - 14, 0.55 * 36]) * 16 / 36
+    assert scene.cameras.intrinsics[0].tolist() == pytest.approx(wanted.tolist(), rel=1e-6)
+    images = scene.images([6, 2])
+    assert images.shape == (2, 3, 16, 16)
+    assert images[:, :, 5, 5].mul(255).round().tolist() == [[60, 50, 200], [20, 50, 200]]
+    assert scene.frame_name(3) == "3000"
+    assert scene.masks([0]) is None
+
+
+def test_listing_opens_no_chunk(tmp_path):
+    data_set(tmp_path)
+    (tmp_path / "train" / "b.torch").write_bytes(b"nothing")
+    source = opened(tmp_path)
+    assert len(source.scenes("train")) == 3
+    with pytest.raises(ValueError, match=r"b\.torch cannot be read as a torch file"):
+        source.scenes("train")[2].cameras  # noqa: B018
+
+
+def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
+    write(tmp_path / "train", {"a.torch": [record("s0")]})
+    assert len(opened(tmp_path).scenes("test")) == 0
+    source = opened(tmp_path, holdout=3)
+    assert source.scenes("test")[0].held_out == (1,)
+    write(tmp_path / "test", {"a.torch": [record("t0")]})
+    assert opened(tmp_path, holdout=3).scenes("test")[0].name == "t0"
+
+
+def test_chunks_without_split_folders_and_first_scenes(tmp_path):
+    write(tmp_path, {"a.torch": [record("s0"), record("s1")]})
+    assert len(opened(tmp_path).scenes("train")) == 2
+    assert [scene.name for scene in opened(tmp_path, max_scenes=1).scenes("train")] == ["s0"]
+
+
+def test_without_an_index_the_chunks_are_read(tmp_path, caplog):
+    write(tmp_path / "train", {"a.torch": [record("s0")], "b.torch": [record("s1")]}, index=False)
+    assert [scene.name for scene in opened(tmp_path).scenes("train")] == ["s0", "s1"]
+    assert "has no index.json" in caplog.text
+    write(tmp_path / "train", {"c.torch": [record("s1")]}, index=False)
+    with pytest.raises(ValueError, match=r"'s1' is in b\.torch and in c\.torch"):
+        opened(tmp_path)
+
+
+def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog):
+    data_set(tmp_path)
+    (tmp_path / "train" / "b.torch").unlink()
+    source = opened(tmp_path, min_frames=5)
+    assert source.missing == {"train": ["s2"], "test": []}
+    assert "1 of 3 scenes" in caplog.text
+    assert "s2 (b.torch)" in caplog.text
+    assert [scene.name for scene in source.scenes("train")] == ["s1"]
+    assert "fewer than 5 frames (min_frames) and are left out: s0 (4)" in caplog.text
+    (tmp_path / "train" / "a.torch").unlink()
+    with pytest.raises(FileNotFoundError, match="none of their chunks exists"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize("url", ["memory://chunks-{}", "file://{}"])
+def test_urls(tmp_path, url):
+    path = UPath(url.format(tmp_path))
+    data_set(path)
+    source = opened(path)
+    assert list(map(list, source.groups("train"))) == [[0, 1], [2]]
+    assert source.scenes("train")[1].images([3])[0, 0, 0, 0] * 255 == pytest.approx(30)
+
+
+def test_legacy_files_are_read_whole(tmp_path):
+    data_set(tmp_path)
+    torch.save([record("s2")], tmp_path / "train" / "b.torch", _use_new_zipfile_serialization=False)
+    assert not zipfile.is_zipfile(tmp_path / "train" / "b.torch")
+    assert opened(tmp_path).scenes("train")[2].images([2])[0, 0, 0, 0] * 255 == pytest.approx(20)
+
+
+def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
+    data_set(tmp_path)
+    source = opened(tmp_path)
+    scene = source.scenes("train")[0]
+    before = scene.images([1])
+    data = pickle.dumps(scene)
+    assert len(data) < 2000
+    copy = pickle.loads(data)  # noqa: S301
+    assert torch.equal(copy.images([1]), before)
+    assert len(pickle.loads(pickle.dumps(source)).scenes("train")) == 3  # noqa: S301
+
+
+def test_threads_share_few_open_chunks(tmp_path):
+    chunks = {f"{i}.torch": [record(f"s{i}", 2)] for i in range(8)}
+    write(tmp_path / "train", chunks)
+    scenes = opened(tmp_path).scenes("train")
+    with ThreadPoolExecutor(4) as pool:
+        images = list(pool.map(lambda k: scenes[k % 8].images([1])[0, 0, 0, 0] * 255, range(64)))
+    assert images == pytest.approx([10] * 64)
+    store = ChunkStore(limit=2)
+    opens = [store.chunk(UPath(tmp_path / "train" / f"{i}.torch")) for i in (0, 1, 0, 2, 0, 1)]
+    assert opens[0] is opens[2]
+    assert opens[2] is opens[4]
+    assert opens[1] is not opens[5]
+
+
+def test_masks_names_and_sizes_of_the_writer(tmp_path):
+    mask = io.BytesIO()
+    Image.fromarray(np.repeat([[0], [255]], [18, 18], 0).repeat(64, 1).astype(np.uint8)).save(
+        mask, "PNG"
+    )
+    masks = [torch.tensor(list(mask.getvalue()), dtype=torch.uint8), torch.empty(0).byte()]
+    images = [encoded((0, 0, 0)), encoded((0, 0, 0), size=(36, 36))]
+    sizes = torch.tensor([[36, 64], [36, 36]])
+    names = ["a/0.jpg", "b.jpg"]
+    extra = {"masks": masks, "sizes": sizes, "names": names, "images": images}
+    write(tmp_path, {"a.torch": [record("s0", 2, **extra)]})
+    scene = opened(tmp_path).scenes("train")[0]
+    delivered = scene.masks([0, 1])
+    assert delivered.shape == (2, 1, 16, 16)
+    assert delivered[0, 0, [0, 15], 3].tolist() == [0, 1]
+    assert delivered[1].min() == 1
+    assert scene.frame_name(0) == "a/0.jpg"
+    assert scene.cameras.intrinsics[1].tolist() == pytest.approx(
+        (np.array([0.5, 0.9, 0.45, 0.55]) * 16).tolist()
+    )
+
+
+def test_transparent_pixels_show_the_background(tmp_path):
+    write(tmp_path, {"a.torch": [record("s0", 1, images=[encoded((9, 9, 9, 0))])]})
+    scene = opened(tmp_path, background=(0.2, 0.4, 0.6)).scenes("train")[0]
+    assert scene.images([0])[0, :, 0, 0].tolist() == pytest.approx([0.2, 0.4, 0.6])
+
+
+BROKEN = {
+    "no list": ({"key": "s0"}, "holds a dict, expected a list of mappings"),
+    "no mappings": ([1], "holds a int, expected a mapping with 'key'"),
+    "too many cameras": (
+        [record("s0", cameras=torch.zeros(5, 18))],
+        r"scene 's0': 'cameras' must be a tensor of shape \[4, 18\].*got \[5, 18\]",
+    ),
+    "no images": ([record("s0", images=None)], "'images' must be a list of one-dimensional uint8"),
+    "no frames": ([record("s0", 0)], "scene 's0' has no frames"),
+    "another key": ([record("s9")], "does not hold the scene 's0'.*it holds s9"),
+    "one key twice": ([record("s0"), record("s0")], "'s0' twice"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_chunks_are_told(tmp_path, name):
+    records, message = BROKEN[name]
+    write(tmp_path, {"a.torch": records}, index=False)
+    (tmp_path / "index.json").write_text('{"s0": "a.torch"}')
+    with pytest.raises(ValueError, match=rf"a\.torch.*{message}"):
+        len(opened(tmp_path).scenes("train")[0])
+
+
+def changed(row: int, column: int, value: float) -> torch.Tensor:
+    cameras = record("s0")["cameras"]
+    cameras[row, column] = value
+    return cameras
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"cameras": changed(2, 9, torch.nan)}, r"frame 2 \(2000\): the pose has NaN"),
+        ({"cameras": changed(1, 7, 3.0)}, "frame 1 .*not rigid"),
+        ({"cameras": changed(1, 7, -1.0)}, "frame 1 .*mirrors"),
+        ({"cameras": changed(3, 0, 500.0)}, "frame 3 .*look like pixels"),
+        ({"cameras": changed(3, 1, -1.0)}, "frame 3 .*focal lengths must be positive"),
+        ({"images": [torch.zeros(9).byte()] * 4}, "frame 0 .*cannot be read|frame 0 .*no readable"),
+        ({"images": [*record("s0", 3)["images"], encoded((1, 2, 3), (64, 64))]}, "frame 3 .*64 x"),
+        (
+            {"images": [*record("s0", 3)["images"], encoded((1, 2, 3))[:60]]},
+            r"a\.torch: scene 's0', frame 3 \(3000\) cannot be read as an image",
+        ),
+    ],
+)
+def test_what_cannot_be_meant_names_file_key_and_frame(tmp_path, extra, message):
+    write(tmp_path, {"a.torch": [record("s0", **extra)]})
+    scene = opened(tmp_path).scenes("train")[0]
+    with pytest.raises(ValueError, match=rf"a\.torch: scene 's0', {message}|{message}"):
+        scene.images(range(len(scene.cameras.c2w)))
+
+
+def test_broken_scenes_can_be_listed():
+    faulty = parse_record("a.torch", record("s0", cameras=changed(2, 9, torch.nan)))
+    assert len(faulty) == 4
+    assert list(camera_faults(faulty, 1)) == []
+    assert "NaN" in str(next(camera_faults(faulty, 2)))
+
+
+def test_an_index_does_not_lead_outside(tmp_path):
+    data_set(tmp_path)
+    for name in ("../test/a.torch", str(tmp_path / "test" / "a.torch"), "c:\\a.torch"):
+        (tmp_path / "train" / "index.json").write_text(json.dumps({"s0": name}))
+        with pytest.raises(ValueError, match="outside its own folder"):
+            opened(tmp_path)
+    (tmp_path / "train" / "index.json").write_text("[1]")
+    with pytest.raises(ValueError, match="must map each scene's key"):
+        opened(tmp_path)
+
+
+def test_code_in_a_chunk_is_not_run(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "made"),)
+
+    torch.save([Payload()], tmp_path / "a.torch")
+    with pytest.raises(ValueError, match="cannot be read as a torch file"):
+        load_chunk(UPath(tmp_path / "a.torch"))
+    assert not (tmp_path / "made").exists()
+
+
+def test_folders_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        opened(tmp_path / "nothing")
+    with pytest.raises(FileNotFoundError, match=r"holds no chunks.*qgs data pack"):
+        opened(tmp_path)
+    with pytest.raises(ValueError, match="cannot be opened as a path or URL"):
+        opened("nosuch://bucket")
