@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from qgs.cli import demo, evaluate, inspect, reconstruct, train
+from qgs.cli import bench, demo, evaluate, inspect, reconstruct, train
 
 app = typer.Typer(
     name="qgs",
@@ -17,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _group in (inspect, train, evaluate, reconstruct, demo):
+for _group in (inspect, train, evaluate, reconstruct, bench, demo):
     _group.register(app)
 
 

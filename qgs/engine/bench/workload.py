@@ -1,0 +1,101 @@
+"""What a model is given to do: sizes of its input, device, precision."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from qgs.composer import Recipe
+from qgs.contracts import SceneSourceConfig
+from qgs.types import Cameras, Views
+
+Precision: TypeAlias = Literal["float32", "bf16"]
+
+
+@dataclass(frozen=True)
+class Workload:
+    """views, targets: photos read and photos rendered per scene. size: (H, W) of both, in pixels.
+
+    batch: scenes at once. precision: float32, or bf16 for autocast.
+    """
+
+    views: int
+    targets: int
+    size: tuple[int, int]
+    batch: int = 1
+    device: str = "cpu"
+    precision: Precision = "float32"
+
+    def autocast(self) -> torch.autocast:
+        """The context in which the model runs."""
+        enabled = self.precision == "bf16"
+        return torch.autocast(self.device, torch.bfloat16, enabled=enabled)
+
+    def inputs(self) -> Views:
+        """Random photos (batch, views), the same each time."""
+        return posed_photos(self.batch, self.views, self.size, seed=0).to(self.device)
+
+    def supervision(self) -> Views:
+        """Random photos (batch, targets), the same each time."""
+        return posed_photos(self.batch, self.targets, self.size, seed=1).to(self.device)
+
+
+def workload_of(
+    recipe: Recipe,
+    *,
+    views: int | None = None,
+    size: tuple[int, int] | None = None,
+    batch: int = 1,
+    device: str = "cpu",
+    precision: Precision = "float32",
+) -> Workload:
+    """The workload of `recipe`: its `views` and `data.image_size`, unless given here.
+
+    Raises ValueError when nothing says how large the images are.
+    """
+    data = recipe.parts.get(("data",))
+    if size is None and data is not None and isinstance(data.config, SceneSourceConfig):
+        size = data.config.image_size
+    if size is None:
+        raise ValueError(
+            "the recipe has no data.image_size, so the size of the photos is not known; "
+            "give one with --size HxW, such as --size 256x256"
+        )
+    return Workload(
+        views or recipe.views.inputs, recipe.views.targets, size, batch, device, precision
+    )
+
+
+def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
+    """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point.
+
+    The first camera is the identity, as pose normalisation leaves it; the field of view is some 53
+    degrees across the longer side.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.rand(batch, count, 3, *size, generator=generator)
+    c2w = torch.stack([_on_arc(math.radians(10 * index)) for index in range(count)])
+    focal = float(max(size))
+    height, width = size
+    intrinsics = torch.tensor([focal, focal, width / 2, height / 2])
+    cameras = Cameras(
+        c2w.expand(batch, -1, -1, -1).contiguous(), intrinsics.expand(batch, count, 4), size
+    )
+    return Views(images, cameras)
+
+
+def _on_arc(angle: float) -> Tensor:
+    """Camera-to-world matrix (4, 4), `angle` radians along the arc in the x-z plane."""
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return torch.tensor(
+        [
+            [cosine, 0.0, sine, -sine],
+            [0.0, 1.0, 0.0, 0.0],
+            [-sine, 0.0, cosine, 1.0 - cosine],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )

@@ -1,0 +1,89 @@
+"""`qgs bench` as a user types it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from qgs.cli import app
+from qgs.cli.bench_tables import short_names
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+TOKENGS, LOCUS = RECIPES / "tiny/tokengs.yaml", RECIPES / "tiny/locus.yaml"
+SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
+
+
+def bench(*words: str | Path) -> Result:
+    sets = [word for setting in SMALL for word in ("--set", setting)]
+    small = ["--size", "16x24", "--rounds", "3", "--warmup", "1", "--device", "cpu"]
+    return CliRunner().invoke(app, ["bench", *map(str, words), *small, *sets])
+
+
+def test_tokengs_against_locusgs(tmp_path: Path) -> None:
+    file = tmp_path / "reports/bench.json"
+    result = bench(TOKENGS, LOCUS, "--step", "--renderer", "--views", "3", "--json", file)
+    assert result.exit_code == 0, result.output
+    report = json.loads(file.read_text())
+    tokengs, locus = report["recipes"]
+    assert [tokengs["recipe"], locus["recipe"]] == [str(TOKENGS), str(LOCUS)]
+    assert (report["overrides"], report["rounds"], report["warmup"]) == ([*SMALL], 3, 1)
+    assert report["machine"].keys() >= {"device", "processor", "threads", "torch"}
+    for recipe in (tokengs, locus):
+        assert (recipe["views"], recipe["size"], recipe["precision"]) == (3, [16, 24], "float32")
+        assert recipe["gaussians"] == 8 * 8
+        assert recipe["parameters"]["weight_bytes"] == 4 * recipe["parameters"]["count"]
+        assert list(recipe["seconds"]) == ["forward", "render", "step"]
+        assert all(len(times["samples"]) == 3 for times in recipe["seconds"].values())
+    assert tokengs["seconds"]["step"]["ratio"]["median"] == 1
+    forward = [recipe["seconds"]["forward"]["samples"] for recipe in (tokengs, locus)]
+    paired = sorted(ours / theirs for theirs, ours in zip(*forward, strict=True))
+    assert locus["seconds"]["forward"]["ratio"]["median"] == paired[1]
+    assert f"{locus['parameters']['count']:,}" in result.output
+    assert re.search(r"tokengs +│ 3 x 16 x 24", result.output)
+
+
+def test_memory(tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    assert bench(LOCUS, "--memory", "--json", file).exit_code == 0
+    (recipe,) = json.loads(file.read_text())["recipes"]
+    assert list(recipe["memory"]) == ["forward"]
+    assert recipe["memory"]["forward"]["ratio"] == 1
+    assert recipe["memory"]["forward"]["peak_bytes"] > recipe["memory"]["forward"]["idle_bytes"] > 0
+
+
+def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    assert bench(TOKENGS, "--json", file).exit_code == 0
+    assert bench(LOCUS, "--json", file).exit_code == 0
+    assert json.loads(file.read_text())["recipes"][0]["recipe"] == str(LOCUS)
+    notes = tmp_path / "notes.json"
+    notes.write_text('{"mine": true}')
+    refused = bench(TOKENGS, "--json", notes)
+    assert isinstance(refused.exception, FileExistsError)
+    assert "is no report" in str(refused.exception)
+    assert notes.read_text() == '{"mine": true}'
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--size", "16"], "must be HxW in pixels"),
+        (["--size", "16x0"], "must be HxW in pixels"),
+        (["--size", "15x24"], "cannot be cut into patches of 8"),
+        (["--precision", "fp16"], "must be float32 or bf16, got 'fp16'"),
+    ],
+)
+def test_mistakes_are_told(words: list[str], message: str) -> None:
+    result = CliRunner().invoke(app, ["bench", str(TOKENGS), *words, "--device", "cpu"])
+    assert isinstance(result.exception, ValueError)
+    assert message in str(result.exception)
+
+
+def test_short_names(tmp_path: Path) -> None:
+    assert short_names(["a/tiny/x.yaml", "a/tiny/y.yaml"]) == ["x", "y"]
+    assert short_names(["a/tiny/x.yaml", "a/big/x.yaml"]) == ["tiny/x", "big/x"]
+    assert short_names([str(tmp_path / "x.yaml")] * 2) == ["x", "x"]
