@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import ClassVar, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -11,15 +11,24 @@ from torch import Tensor
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.types import LayerPrediction, Rendering, Views
 
+Renderings: TypeAlias = Literal["each", "all", "none"]
+
 
 class Loss(Component, torch.nn.Module):
     """(LayerPrediction, Rendering, target Views) -> named 0-d tensors, already weighted.
 
-    Called once for each supervised layer; the objective is the sum of all terms, weighted by layer.
-    The rendering shows the target's cameras. Term names are unique within a recipe.
+    Called for each supervised layer; the objective is the sum of all terms, weighted by layer. The
+    rendering shows the target's cameras. Term names are unique within a recipe.
+
+    renderings: which renderings of the target views the terms need, where training may render few
+    views at a time (`training.render_views`). "each": a term is the mean over target views of what
+    it is for one of them alone; the loss is called with some of the views at a time. "all": those
+    of all target views at once. "none": prediction and target suffice; the loss is called with all
+    target views and a rendering of no views, (B, 0, ...).
     """
 
     slot: ClassVar[str] = "losses"
+    renderings: ClassVar[Renderings] = "all"
 
     def __init__(self, config: ComponentConfig) -> None:
         torch.nn.Module.__init__(self)

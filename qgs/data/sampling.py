@@ -42,11 +42,16 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """B samples: inputs (B, V_in) and targets (B, V_out), float32 and contiguous."""
+    """B samples: inputs (B, V_in) and targets (B, V_out), float32 and contiguous.
+
+    scenes, input_frames, target_frames: what they show, sample by sample.
+    """
 
     inputs: Views
     targets: Views
     scenes: tuple[str, ...]
+    input_frames: tuple[Frames, ...]
+    target_frames: tuple[Frames, ...]
 
 
 def training_frames(scene: Scene) -> list[int]:
@@ -186,6 +191,8 @@ def collate(samples: Sequence[Sample]) -> Batch:
         _stack([sample.inputs for sample in samples]),
         _stack([sample.targets for sample in samples]),
         tuple(sample.scene for sample in samples),
+        tuple(sample.input_frames for sample in samples),
+        tuple(sample.target_frames for sample in samples),
     )
 
 

@@ -11,28 +11,18 @@ from torch import Tensor, nn
 
 from qgs.contracts import TrainingConfig
 from qgs.data.sampling import Batch
-from qgs.engine.collapse import measure
 from qgs.engine.objective import Outcome
-from qgs.metrics import psnr
 
 
 class Gradients:
-    """Runs batches forward and backward through an objective that `Accelerator.prepare` wrapped.
-
-    background: (3,) RGB of the renderer.
-    """
+    """Runs batches forward and backward through an objective that `Accelerator.prepare` wrapped."""
 
     def __init__(
-        self,
-        accelerator: Accelerator,
-        objective: nn.Module,
-        config: TrainingConfig,
-        background: Tensor,
+        self, accelerator: Accelerator, objective: nn.Module, config: TrainingConfig
     ) -> None:
         self.accelerator = accelerator
         self.objective = objective
         self.config = config
-        self.background = background
 
     def compute(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
         """Gradients of the mean over `batches`, clipped; what was measured, as 0-d tensors.
@@ -57,16 +47,11 @@ class Gradients:
         with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
             outcome: Outcome = self.objective(inputs, targets)
         self.accelerator.backward(outcome.total / count)
-        return self._measure(outcome, targets.images)
-
-    @torch.no_grad()
-    def _measure(self, outcome: Outcome, truth: Tensor) -> dict[str, Tensor]:
-        rgb = outcome.rendering.rgb
-        alpha, deviation = measure(rgb, outcome.rendering.alpha, self.background)
+        signs = outcome.signs
         return {
             "loss": outcome.total.detach(),
             **outcome.terms,
-            "psnr": psnr(rgb, truth).mean(),
-            "alpha": alpha,
-            "deviation": deviation,
+            "psnr": signs.psnr,
+            "alpha": signs.alpha,
+            "deviation": signs.deviation,
         }

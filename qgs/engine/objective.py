@@ -2,35 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from qgs.contracts import Loss
+from qgs.engine.collapse import measure
+from qgs.engine.leaves import Leaves
+from qgs.metrics import psnr
 from qgs.model import QueryGaussianModel
-from qgs.types import LayerPrediction, Rendering, Views
+from qgs.types import Cameras, Gaussians, LayerPrediction, Rendering, Views
+
+Observer: TypeAlias = Callable[[str, Any], None]
+"""Told the name and the value of what is computed, in order; values are containers of tensors."""
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What renderings of several views look like, 0-d: mean PSNR, `qgs.engine.collapse.measure`."""
+
+    psnr: Tensor
+    alpha: Tensor
+    deviation: Tensor
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """total: 0-d. terms: weighted by layer, detached. rendering: the last layer's."""
+    """total: 0-d. terms: weighted by layer, detached. signs: of the last supervised layer."""
 
     total: Tensor
     terms: Mapping[str, Tensor]
-    rendering: Rendering
+    signs: Signs
 
 
 class Objective(nn.Module):
-    """The model with its losses, one module so that distributed wrappers see one forward."""
+    """The model with its losses, one module so that distributed wrappers see one forward.
 
-    def __init__(self, model: QueryGaussianModel, losses: Mapping[str, Loss]) -> None:
+    The forward pass takes the losses' gradients with respect to the Gaussians too, one layer and
+    `render_views` target views at a time (0: all views), and frees each part's graph before it
+    makes the next; the backward pass leads their sums into the network. Memory thus grows neither
+    with the supervised layers nor with the target views, and no gradient depends on `render_views`.
+    Where a loss needs all renderings at once, only the renderer's graphs are made in parts.
+
+    observe: see `Observer`; for looking at a step that went wrong.
+    """
+
+    def __init__(
+        self, model: QueryGaussianModel, losses: Mapping[str, Loss], render_views: int = 0
+    ) -> None:
         super().__init__()
         if not losses:
             raise ValueError("a recipe needs at least one loss to train; add one under `losses`")
         self.model = model
         self.losses = nn.ModuleDict(losses)
+        self.render_views = render_views
+        self.observe: Observer = lambda name, value: None
+        self._blind = {name: loss for name, loss in losses.items() if loss.renderings == "none"}
+        self._seeing = {name: loss for name, loss in losses.items() if loss.renderings != "none"}
+        self._all_at_once = any(loss.renderings == "all" for loss in losses.values())
+        self._owners: dict[str, str] = {}
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
         """Reconstruct `inputs` and compare with `targets`, layers weighted by the supervision.
@@ -38,28 +72,115 @@ class Objective(nn.Module):
         Raises ValueError when two losses name a term alike.
         """
         prediction = self.model(inputs)
-        totals: dict[str, Tensor] = {}
-        rendering = None
+        total, terms = targets.images.new_zeros(()), {}
+        signs = []
         for number, weight in self.model.supervision.weights().items():
             layer = prediction.layers[number]
-            rendering = self.model.render(layer.gaussians, targets.cameras)
-            for name, term in self._terms(layer, rendering, targets).items():
-                totals[name] = totals.get(name, 0) + weight * term
-        assert rendering is not None
-        total = torch.stack(list(totals.values())).sum()
-        return Outcome(total, {name: term.detach() for name, term in totals.items()}, rendering)
+            self.observe(f"prediction of layer {number}", layer)
+            leaves = Leaves(layer, dict(self.losses.named_parameters()))
+            of_layer, signs = self._supervise(leaves, targets, weight, f"layer {number}")
+            self.observe(f"gradient of layer {number}", leaves.gradients)
+            total = total + leaves.attach(_sum(of_layer))
+            _accumulate(terms, of_layer)
+        return Outcome(total, terms, _over_parts(signs))
+
+    def _supervise(
+        self, leaves: Leaves, targets: Views, weight: float, name: str
+    ) -> tuple[dict[str, Tensor], list[tuple[float, Signs]]]:
+        """Add a layer's losses to `leaves`; its terms, detached, and signs of parts with shares."""
+        terms: dict[str, Tensor] = {}
+        signs: list[tuple[float, Signs]] = []
+
+        def add(losses: Mapping[str, Loss], rendering: Rendering, part: Views) -> None:
+            found = self._terms(losses, leaves.layer, rendering, part)
+            self.observe(f"loss of {name}", found)
+            share = weight * _count(part) / _count(targets)
+            weighted = {term: share * value for term, value in found.items()}
+            leaves.add(_sum(weighted))
+            _accumulate(terms, weighted)
+
+        for part in self._parts(targets):
+            rendering = self._render(leaves.layer.gaussians, part.cameras)
+            self.observe(f"rendering of {name}", rendering)
+            signs.append((_count(part) / _count(targets), self._signs(rendering, part)))
+            add(self._seeing, rendering, part)
+        add(self._blind, _rendering_of_no_views(targets), targets)
+        return terms, signs
+
+    def _parts(self, targets: Views) -> list[Views]:
+        """The target views as the losses take them."""
+        if self._all_at_once or not self.render_views:
+            return [targets]
+        return [targets.select(part) for part in _slices(_count(targets), self.render_views)]
+
+    def _render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """The rendering for all `cameras`; the graphs of at most `render_views` exist at a time."""
+        views = cameras.shape[1]
+        if views <= (self.render_views or views):
+            return self.model.render(gaussians, cameras)
+        parts = [
+            checkpoint(self.model.render, gaussians, cameras[:, part], use_reentrant=False)
+            for part in _slices(views, self.render_views)
+        ]
+        return Rendering(
+            rgb=torch.cat([part.rgb for part in parts], 1),
+            alpha=torch.cat([part.alpha for part in parts], 1),
+            depth=torch.cat([part.depth for part in parts], 1),
+        )
 
     def _terms(
-        self, layer: LayerPrediction, rendering: Rendering, targets: Views
+        self,
+        losses: Mapping[str, Loss],
+        layer: LayerPrediction,
+        rendering: Rendering,
+        target: Views,
     ) -> dict[str, Tensor]:
         terms: dict[str, Tensor] = {}
-        for name, loss in self.losses.items():
-            new = loss(layer, rendering, targets)
-            repeated = sorted(terms.keys() & new.keys())
+        for name, loss in losses.items():
+            new = loss(layer, rendering, target)
+            repeated = sorted(term for term in new if self._owners.setdefault(term, name) != name)
             if repeated:
                 raise ValueError(
-                    f"losses.{name} and an earlier loss both have terms {repeated}; "
-                    "a recipe can use each such loss once"
+                    f"losses.{name} and losses.{self._owners[repeated[0]]} both have terms "
+                    f"{repeated}; a recipe can use each such loss once"
                 )
             terms |= new
         return terms
+
+    @torch.no_grad()
+    def _signs(self, rendering: Rendering, target: Views) -> Signs:
+        background = rendering.rgb.new_tensor(self.model.renderer.config.background)
+        alpha, deviation = measure(rendering.rgb, rendering.alpha, background)
+        return Signs(psnr(rendering.rgb, target.images).mean(), alpha, deviation)
+
+
+def _over_parts(parts: list[tuple[float, Signs]]) -> Signs:
+    """The signs of all views from those of their parts, each with its share of the views."""
+    return Signs(
+        psnr=torch.stack([share * signs.psnr for share, signs in parts]).sum(),
+        alpha=torch.stack([share * signs.alpha for share, signs in parts]).sum(),
+        deviation=torch.stack([signs.deviation for _, signs in parts]).amax(),
+    )
+
+
+def _rendering_of_no_views(target: Views) -> Rendering:
+    scenes, size = target.images.shape[0], target.cameras.size
+    three, one = (target.images.new_empty((scenes, 0, channels, *size)) for channels in (3, 1))
+    return Rendering(rgb=three, alpha=one, depth=one)
+
+
+def _count(views: Views) -> int:
+    return views.images.shape[1]
+
+
+def _slices(count: int, step: int) -> list[slice]:
+    return [slice(start, min(start + step, count)) for start in range(0, count, step)]
+
+
+def _sum(terms: Mapping[str, Tensor]) -> Tensor:
+    return torch.stack([*terms.values()]).sum() if terms else torch.zeros(())
+
+
+def _accumulate(sums: dict[str, Tensor], terms: Mapping[str, Tensor]) -> None:
+    for name, term in terms.items():
+        sums[name] = sums.get(name, 0) + term.detach()

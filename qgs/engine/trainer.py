@@ -102,12 +102,12 @@ class Trainer:
         self.accelerator = make_accelerator(device)
         self.device = self.accelerator.device
         self.model = recipe.build_model(device=self.device).train()
-        objective = Objective(self.model, recipe.build_losses()).to(self.device)
+        losses = recipe.build_losses()
+        objective = Objective(self.model, losses, self.config.render_views).to(self.device)
         self.objective, self.optimizer = self.accelerator.prepare(
             objective, make_optimizer(objective, self.config)
         )
-        background = torch.tensor(self.model.renderer.config.background, device=self.device)
-        self.gradients = Gradients(self.accelerator, self.objective, self.config, background)
+        self.gradients = Gradients(self.accelerator, self.objective, self.config)
         self.detector = CollapseDetector(self.config.collapse_window)
         self.good = GoodWeights(self.model)
         self.clock = Clock(self.accelerator)

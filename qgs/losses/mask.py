@@ -17,6 +17,7 @@ class Mask(Loss):
     """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
 
     name: ClassVar[str] = "mask"
+    renderings = "each"
 
     class Config(ComponentConfig):
         """weight: factor of the term."""

@@ -16,6 +16,7 @@ class Opacity(Loss):
     """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release; weight 0 in its recipes)."""
 
     name: ClassVar[str] = "opacity"
+    renderings = "none"
 
     class Config(ComponentConfig):
         """weight: factor of the term. eps: keeps the logarithm finite (TokenGS release)."""

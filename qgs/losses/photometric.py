@@ -18,6 +18,7 @@ class Photometric(Loss):
     """mse_weight * MSE + ssim_weight * (1 - SSIM) / 2."""
 
     name: ClassVar[str] = "photometric"
+    renderings = "each"
 
     class Config(ComponentConfig):
         """Weights as published.

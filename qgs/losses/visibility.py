@@ -11,7 +11,6 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.precision import full_precision
-from qgs.geometry.projection import to_camera
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 
 BehindCamera = Literal["published", "invisible"]
@@ -60,6 +59,7 @@ class Visibility(Loss):
     """Mean over Gaussians of `view_visibility` of their means."""
 
     name: ClassVar[str] = "visibility"
+    renderings = "none"
 
     class Config(VisibilityOptions):
         """See `VisibilityOptions`.
@@ -109,29 +109,57 @@ def view_visibility(
     None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard (LocusGS anchors);
     None leaves z alone, where x / 0 is at `infinite_pixel` and 0 / 0 visible (TokenGS).
 
-    Values and gradients are finite everywhere, as long as `clamp` is set whenever `behind` is.
+    Gradients go to the nearest view alone (of several, the first), so that memory does not grow
+    with the views. Values and gradients are finite everywhere, as long as `clamp` is set whenever
+    `behind` is.
     """
-    camera_points = to_camera(points, cameras)
-    excess = _image_excess(camera_points, cameras, z_guard, infinite_pixel)
-    if behind is not None:
-        excess = torch.where(camera_points[..., 2] <= behind, torch.inf, excess)
-    nearest = excess.amin(dim=1)
-    return nearest if clamp is None else nearest.clamp_max(clamp)
+    options = (behind, z_guard, infinite_pixel)
+    with torch.no_grad():
+        views = [cameras[:, view, None] for view in range(cameras.shape[1])]
+        excess = torch.stack([_image_excess(points, view, *options) for view in views], 1)
+        nearest = excess.argmin(1)
+    scene = torch.arange(len(nearest), device=nearest.device)[:, None]
+    excess = _image_excess(points, cameras[scene, nearest], *options)
+    return excess if clamp is None else excess.clamp_max(clamp)
+
+
+def _image_excess(
+    points: Tensor,
+    cameras: Cameras,
+    behind: float | None,
+    z_guard: float | None,
+    infinite_pixel: float,
+) -> Tensor:
+    """relu(|u| - 1) + relu(|v| - 1) of world points (B, P, 3) -> (B, P).
+
+    cameras: (B, P), one for each point, or (B, 1).
+    """
+    camera_points = _into_camera(points, cameras.c2w)
+    pixels = _guarded_pixels(camera_points, cameras.intrinsics, z_guard, infinite_pixel)
+    height, width = cameras.size
+    normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1
+    excess = (normalised.abs() - 1).relu().sum(-1)
+    if behind is None:
+        return excess
+    return torch.where(camera_points[..., 2] <= behind, torch.inf, excess)
 
 
 @full_precision
-def _image_excess(
-    camera_points: Tensor, cameras: Cameras, z_guard: float | None, infinite_pixel: float
+def _into_camera(points: Tensor, c2w: Tensor) -> Tensor:
+    """Camera-frame points (B, P, 3), to the bit alike for c2w (B, 1, 4, 4) and (B, P, 4, 4)."""
+    from_camera = points - c2w[..., :3, 3]
+    return (from_camera[..., None] * c2w[..., :3, :3]).sum(-2)
+
+
+@full_precision
+def _guarded_pixels(
+    camera_points: Tensor, intrinsics: Tensor, z_guard: float | None, infinite_pixel: float
 ) -> Tensor:
-    """relu(|u| - 1) + relu(|v| - 1) of camera-frame points (B, V, P, 3) -> (B, V, P)."""
+    """Pixels (B, P, 2) of camera-frame points (B, P, 3), finite at z = 0."""
     xy, z = camera_points[..., :2], camera_points[..., 2:]
     if z_guard is not None:
         z = torch.where(z.abs() < z_guard, z_guard, z)
     at_zero = z.abs() < _TINY_Z
-    focal, principal = cameras.intrinsics[..., None, :2], cameras.intrinsics[..., None, 2:]
-    pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
+    pixels = intrinsics[..., :2] * xy / torch.where(at_zero, 1.0, z) + intrinsics[..., 2:]
     limit = torch.where(xy == 0, 0.0, infinite_pixel * xy.sign())
-    pixels = torch.where(at_zero, limit, pixels)
-    height, width = cameras.size
-    normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1
-    return (normalised.abs() - 1).relu().sum(-1)
+    return torch.where(at_zero, limit, pixels)

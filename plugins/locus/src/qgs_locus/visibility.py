@@ -18,6 +18,7 @@ class AnchorVisibility(Loss):
     """Mean over queries of `qgs.losses.view_visibility` of their anchor centres (LocusGS)."""
 
     name: ClassVar[str] = "anchor_visibility"
+    renderings = "none"
 
     class Config(VisibilityOptions):
         """See `qgs.losses.VisibilityOptions`.

@@ -1,0 +1,220 @@
+"""Rendering few target views at a time: the same gradients as all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from qgs.composer import Recipe
+from qgs.contracts import ComponentConfig, Loss
+from qgs.data.loader import training_batches
+from qgs.engine.collapse import measure
+from qgs.engine.objective import Objective, Outcome
+from qgs.losses import Mask, Opacity
+from qgs.metrics import psnr
+from qgs.types import LayerPrediction, Rendering, Views
+
+TARGETS = 5
+RENDERERS = ("qgs/torch", "qgs/cpu")
+
+
+class Flicker(Loss):
+    """How much views differ in brightness: no mean over views, and undeclared as such."""
+
+    name: ClassVar[str] = "flicker"
+
+    def __init__(self) -> None:
+        super().__init__(ComponentConfig())
+        self.gain = nn.Parameter(torch.tensor(0.7))
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        assert rendering.rgb.shape[1] == TARGETS
+        brightness = rendering.rgb.mean((-3, -2, -1))
+        return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
+
+
+class Blind(Loss):
+    """Wants no rendering, and gets none, nor views at a time."""
+
+    name: ClassVar[str] = "blind"
+    renderings = "none"
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        assert rendering.rgb.shape[1] == 0
+        assert target.images.shape[1] == TARGETS
+        return {"blind": prediction.state.features.square().mean()}
+
+
+def every_loss(recipe: Recipe) -> dict[str, Loss]:
+    extra = {
+        "mask": Mask(Mask.Config()),
+        "opacity": Opacity(Opacity.Config()),
+        "blind": Blind(ComponentConfig()),
+    }
+    return {**recipe.build_losses(), **extra}
+
+
+def with_masks(views: Views) -> Views:
+    masks = (views.images.mean(2, keepdim=True) > 0.4).float()
+    return replace(views, masks=masks)
+
+
+@pytest.fixture(scope="module")
+def setting(tiny: Callable[..., Recipe]) -> Callable[..., tuple]:
+    def make(renderer: str, *, dtype: torch.dtype = torch.float32) -> tuple:
+        recipe = tiny("locus", f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
+        torch.manual_seed(0)
+        batch = next(training_batches(recipe.build_data(), recipe.views, 2, seed=0))
+        model = recipe.build_model().train().to(dtype)
+        inputs, targets = batch.inputs.to(dtype), with_masks(batch.targets).to(dtype)
+        return model, every_loss(recipe), inputs, targets
+
+    return make
+
+
+def written_out(
+    model: nn.Module, losses: Mapping[str, Loss], inputs: Views, targets: Views
+) -> Tensor:
+    """The objective as its definition reads: one graph for all layers and views."""
+    prediction = model(inputs)
+    total = torch.zeros(())
+    for number, weight in model.supervision.weights().items():
+        layer = prediction.layers[number]
+        rendering = model.render(layer.gaussians, targets.cameras)
+        for loss in losses.values():
+            shown = rendering
+            if loss.renderings == "none":
+                shown = Rendering(
+                    rendering.rgb[:, :0], rendering.alpha[:, :0], rendering.depth[:, :0]
+                )
+            total = total + weight * torch.stack(list(loss(layer, shown, targets).values())).sum()
+    return total
+
+
+def gradients(module: nn.Module, total: Tensor) -> dict[str, Tensor]:
+    module.zero_grad()
+    total.backward()
+    return {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
+
+
+def furthest(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> float:
+    """Largest difference, relative to the largest gradient."""
+    assert found.keys() == wanted.keys()
+    largest = max(float(g.abs().max()) for g in wanted.values())
+    return max(float((found[n] - g).abs().max()) for n, g in wanted.items()) / largest
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("render_views", [0, 1, 2, 9])
+@pytest.mark.parametrize("all_at_once", [False, True])
+def test_gradients_do_not_depend_on_it(
+    setting: Callable[..., tuple], renderer: str, render_views: int, all_at_once: bool
+) -> None:
+    model, losses, *batch = setting(renderer)
+    if all_at_once:
+        losses["flicker"] = Flicker()
+    objective = Objective(model, losses, render_views)
+    wanted = gradients(objective, written_out(model, losses, *batch))
+    outcome = objective(*batch)
+    found = gradients(objective, outcome.total)
+    assert furthest(found, wanted) < 1e-6
+    assert float(outcome.total.detach()) == pytest.approx(float(sum(outcome.terms.values())))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
+@pytest.mark.parametrize("render_views", [1, 2])
+def test_gradients_through_gsplat_do_not_depend_on_it(
+    setting: Callable[..., tuple], render_views: int
+) -> None:
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    model, losses, *batch = setting("qgs/gsplat")
+    objective = Objective(model, losses, render_views).cuda()
+    batch = [views.to("cuda") for views in batch]
+    wanted = gradients(objective, written_out(model, losses, *batch))
+    found = gradients(objective, objective(*batch).total)
+    assert furthest(found, wanted) < 1e-5, "its kernels add in no fixed order"
+
+
+def test_in_float64_they_are_the_same_numbers(setting: Callable[..., tuple]) -> None:
+    model, losses, *batch = setting("qgs/torch", dtype=torch.float64)
+    objective = Objective(model, losses, 2)
+    wanted = gradients(objective, written_out(model, losses, *batch))
+    assert furthest(gradients(objective, objective(*batch).total), wanted) < 1e-13
+
+
+def test_under_autocast_the_gaussians_get_the_same_gradients(
+    setting: Callable[..., tuple],
+) -> None:
+    model, losses, *batch = setting("qgs/cpu")
+    found: dict[int, dict[str, Tensor]] = {}
+    for render_views in (0, 2):
+        objective = Objective(model, losses, render_views)
+        seen = found[render_views] = {}
+
+        def note(name: str, value: Mapping[str, Tensor], seen: dict = seen) -> None:
+            if name.startswith("gradient"):
+                seen.update({f"{name} {key}": tensor.float() for key, tensor in value.items()})
+
+        objective.observe = note
+        with torch.autocast("cpu", torch.bfloat16):
+            outcome = objective(*batch)
+        outcome.total.backward()
+    assert len(found[0]) >= 10, "Gaussians and states of two layers"
+    assert furthest(found[2], found[0]) < 1e-6
+
+
+def test_a_scaled_total_scales_every_gradient(setting: Callable[..., tuple]) -> None:
+    model, losses, *batch = setting("qgs/cpu")
+    objective = Objective(model, losses, 2)
+    whole = gradients(objective, objective(*batch).total)
+    quarter = gradients(objective, objective(*batch).total / 4)
+    assert furthest({n: 4 * g for n, g in quarter.items()}, whole) < 1e-6
+
+
+@pytest.mark.parametrize("render_views", [0, 2])
+def test_signs_are_those_of_all_views_of_the_last_layer(
+    setting: Callable[..., tuple], render_views: int
+) -> None:
+    model, losses, inputs, targets = setting("qgs/cpu")
+    outcome: Outcome = Objective(model, losses, render_views)(inputs, targets)
+    with torch.no_grad():
+        rendering = model.render(model(inputs).gaussians, targets.cameras)
+    background = torch.tensor(model.renderer.config.background)
+    wanted = (
+        psnr(rendering.rgb, targets.images).mean(),
+        *measure(rendering.rgb, rendering.alpha, background),
+    )
+    signs = outcome.signs
+    torch.testing.assert_close((signs.psnr, signs.alpha, signs.deviation), wanted)
+
+
+def test_without_gradients_it_only_measures(setting: Callable[..., tuple]) -> None:
+    model, losses, *batch = setting("qgs/cpu")
+    with torch.no_grad():
+        outcome = Objective(model, losses, 2)(*batch)
+    assert not outcome.total.requires_grad
+    assert float(outcome.total) == pytest.approx(float(sum(outcome.terms.values())))
+
+
+def test_every_shipped_loss_says_which_renderings_it_needs() -> None:
+    from qgs_locus.visibility import AnchorVisibility
+
+    from qgs.losses import COMPONENTS
+
+    said = {loss.name: loss.renderings for loss in (*COMPONENTS, AnchorVisibility)}
+    assert said == {
+        "photometric": "each",
+        "mask": "each",
+        "visibility": "none",
+        "anchor_visibility": "none",
+        "opacity": "none",
+    }
