@@ -1,11 +1,12 @@
 """The default components: TokenGS, one file per slot."""
 
-from qgs.components.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
+from qgs.components.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.components.centers import FreeCenters
 from qgs.components.cross_attention import ContentCrossAttention
 from qgs.components.encoder import MultiViewViT
 from qgs.components.feed_forward import MlpFeedForward
 from qgs.components.head import GaussianHead
+from qgs.components.layout import TOKENGS
 from qgs.components.position import posact
 from qgs.components.queries import LatentQueries
 from qgs.components.refinement import NoRefinement
@@ -27,6 +28,8 @@ COMPONENTS: tuple[type[Component], ...] = (
 
 __all__ = [
     "COMPONENTS",
+    "NORM_EPS",
+    "TOKENGS",
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",

@@ -17,4 +17,5 @@ BUILTIN = Plugin(
         *qgs.losses.COMPONENTS,
         *qgs.data.COMPONENTS,
     ),
+    layouts=(qgs.components.TOKENGS,),
 )

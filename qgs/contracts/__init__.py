@@ -19,6 +19,7 @@ from qgs.contracts.data import Scene, SceneSource, SceneSourceConfig, Split
 from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
 from qgs.contracts.feed_forward import FeedForward
 from qgs.contracts.head import Head
+from qgs.contracts.layout import LayoutError, Rename, Unused, WeightLayout
 from qgs.contracts.loss import Loss
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 from qgs.contracts.queries import Queries
@@ -43,6 +44,7 @@ __all__ = [
     "FieldSpec",
     "Fields",
     "Head",
+    "LayoutError",
     "Loss",
     "ModelComponent",
     "ModelDims",
@@ -52,6 +54,7 @@ __all__ = [
     "Queries",
     "RecipeContext",
     "Refinement",
+    "Rename",
     "Renderer",
     "RendererConfig",
     "Scene",
@@ -61,6 +64,8 @@ __all__ = [
     "Split",
     "Supervision",
     "TrainingConfig",
+    "Unused",
     "ViewsConfig",
+    "WeightLayout",
     "without_effect",
 ]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from qgs.contracts.component import Component
+from qgs.contracts.layout import WeightLayout
 
 CONTRACT_VERSION = 1
 """Raised when a contract changes so that components written for the old one no longer fit."""
@@ -21,8 +22,10 @@ class Plugin:
     name: the part of `type: NAME/component` before the slash.
     contract_version: the CONTRACT_VERSION that the components were written for.
     components: final component classes; their `name` is unique within their slot.
+    layouts: published state dicts of models that these components make.
     """
 
     name: str
     contract_version: int
     components: Sequence[type[Component]]
+    layouts: Sequence[WeightLayout] = ()

@@ -4,6 +4,7 @@ from qgs.contracts import Plugin
 from qgs_locus.anchors import AnchoredQueries
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
+from qgs_locus.layout import LOCUSGS
 from qgs_locus.refinement import AnchorRefinement
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from qgs_locus.visibility import AnchorVisibility
@@ -20,4 +21,5 @@ plugin = Plugin(
         RadiusScaledCenters,
         AnchorVisibility,
     ),
+    layouts=(LOCUSGS,),
 )

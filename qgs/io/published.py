@@ -1,0 +1,163 @@
+"""Published state dicts and ours: which parameter of a recipe's model is which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from torch import Tensor
+
+from qgs.composer import Recipe, resolve
+from qgs.composer.registry import load_registry
+from qgs.contracts import LayoutError, WeightLayout
+from qgs.contracts.layout import Shapes
+from qgs.io.checkpoint import unique_tensors
+
+T = TypeVar("T")
+
+
+class PublishedError(ValueError):
+    """Weights that do not fit a recipe, or a model that a published layout cannot hold."""
+
+
+@dataclass(frozen=True)
+class Names:
+    """The parameters of one recipe's model under both names.
+
+    shapes: of our parameters. published: our name to the published one, both unique.
+    unnamed: ours that the codebase has no name for. unused: what a published file may hold besides.
+    """
+
+    shapes: Shapes
+    published: Mapping[str, str]
+    unnamed: tuple[str, ...]
+    unused: tuple[str, ...]
+
+    @property
+    def ours(self) -> dict[str, str]:
+        """Published name to ours."""
+        return {theirs: ours for ours, theirs in self.published.items()}
+
+
+def layouts_of(recipe: Recipe) -> list[WeightLayout]:
+    """The published layouts of the plugins that `recipe` uses, the framework's first."""
+    names = [name for name in recipe.plugin_versions if name != "qgs"]
+    plugins = load_registry(names).plugins.values()
+    return [layout for installed in plugins for layout in installed.plugin.layouts]
+
+
+def strangers(recipe: Recipe, layout: WeightLayout) -> list[str]:
+    """Components of `recipe` that a codebase does not know, each told in one line."""
+    found: dict[str, None] = {}
+    varied: dict[str, set[str]] = {}
+    for path, chosen in recipe.parts.items():
+        slot = path[-1]
+        if path[0] != "model" or slot not in layout.components:
+            continue
+        known = layout.components[slot]
+        varied.setdefault(slot, set()).add(chosen.type)
+        if chosen.type not in known:
+            found[f"{chosen.written_at} is {chosen.type}; {layout.name} has {_or(known)}"] = None
+    for slot, types in varied.items():
+        if len(types) > 1:
+            found[f"decoder layers differ in their {slot} ({', '.join(sorted(types))})"] = None
+    return list(found)
+
+
+def layout_of(recipe: Recipe) -> WeightLayout:
+    """The published layout that can hold the model of `recipe`.
+
+    Raises PublishedError that says of each layout what stands against it.
+    """
+    reasons = []
+    for layout in layouts_of(recipe):
+        found = strangers(recipe, layout)
+        if not found:
+            return layout
+        reasons += [f"{layout.name}: {line}" for line in found]
+    raise PublishedError(
+        "no published layout can hold this model:" + "".join(f"\n  {line}" for line in reasons)
+    )
+
+
+def names_in(recipe: Recipe, layout: WeightLayout) -> Names:
+    """The parameters of the model of `recipe`; composed on the meta device."""
+    model = recipe.build_model("meta")
+    shapes = {name: tuple(tensor.shape) for name, tensor in unique_tensors(model).items()}
+    named = {name: layout.published_name(name) for name in shapes}
+    published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
+    assert len(set(published.values())) == len(published)
+    unused = layout.unused_names(published.values())
+    unnamed = tuple(name for name, theirs in named.items() if theirs is None)
+    return Names(shapes, published, unnamed, tuple(unused))
+
+
+def from_published(weights: Mapping[str, T], recipe: Recipe) -> dict[str, T]:
+    """A published state dict under our names, what the codebase never uses left out.
+
+    Raises PublishedError that lists every name that is missing or unexpected. Shapes and values are
+    not looked at.
+    """
+    names = names_in(recipe, layout_of(recipe))
+    problems = [f"no published name: {name}" for name in names.unnamed]
+    problems += [f"missing: {name}" for name in names.published.values() if name not in weights]
+    known = {*names.published.values(), *names.unused}
+    problems += [f"unexpected: {name}" for name in weights if name not in known]
+    if problems:
+        raise PublishedError(
+            f"the weights do not fit the recipe, {len(problems)} differences:\n  "
+            + "\n  ".join(problems)
+        )
+    return {ours: weights[theirs] for ours, theirs in names.published.items()}
+
+
+def to_published(weights: Mapping[str, T], recipe: Recipe) -> dict[str, T]:
+    """Weights under our names, as `unique_tensors` has them, under their published names.
+
+    The inverse of `from_published`. Raises PublishedError for a model that no layout can hold.
+    """
+    names = names_in(recipe, exact_layout_of(recipe))
+    return {theirs: weights[ours] for ours, theirs in names.published.items()}
+
+
+def exact_layout_of(recipe: Recipe) -> WeightLayout:
+    """The layout whose codebase has exactly the parameters of the model of `recipe`.
+
+    Raises PublishedError that lists what the codebase lacks, and what it has besides.
+    """
+    layout = layout_of(recipe)
+    names = names_in(recipe, layout)
+    problems = [f"{name}: {layout.name} has no such parameter" for name in names.unnamed]
+    if not problems:
+        problems = _differences(names, layout)
+    if problems:
+        raise PublishedError(
+            f"the layout of {layout.name} cannot hold this model:\n  " + "\n  ".join(problems)
+        )
+    return layout
+
+
+def _differences(names: Names, layout: WeightLayout) -> list[str]:
+    """How the model that the codebase builds at these sizes differs from this one."""
+    shapes = {theirs: names.shapes[ours] for ours, theirs in names.published.items()}
+    try:
+        theirs = names_in(resolve(layout.read(shapes)), layout)
+    except (LayoutError, ValueError) as error:
+        return [str(error)]
+    extra = [name for name in names.shapes if name not in theirs.shapes]
+    return [f"{name}: {layout.name} has no such parameter" for name in extra] + [
+        f"{name}: {layout.name} has it with the shape {shape}, this model has "
+        + (f"{names.shapes[name]}" if name in names.shapes else "no such parameter")
+        for name, shape in theirs.shapes.items()
+        if names.shapes.get(name) != shape
+    ]
+
+
+def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """Names to shapes."""
+    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+
+
+def _or(words: tuple[str, ...]) -> str:
+    return " or ".join(words)
