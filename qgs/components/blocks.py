@@ -12,6 +12,9 @@ from torch import Tensor, nn
 
 from qgs.contracts import AttentionWeights
 
+NORM_EPS = 1e-5
+"""Added to the variance by every LayerNorm of both releases (PyTorch's default)."""
+
 
 class LayerScale(nn.Module):
     """Per-channel factor on a residual update, initialised at `init`."""
@@ -59,12 +62,12 @@ def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias: Tensor | None) -> At
 class SelfAttentionCore(nn.Module):
     """Multi-head self-attention with fused qkv and per-head LayerNorm on queries and keys."""
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()
         self.heads = heads
         self.qkv = nn.Linear(width, 3 * width)
-        self.q_norm = nn.LayerNorm(width // heads)
-        self.k_norm = nn.LayerNorm(width // heads)
+        self.q_norm = nn.LayerNorm(width // heads, norm_eps)
+        self.k_norm = nn.LayerNorm(width // heads, norm_eps)
         self.proj = nn.Linear(width, width)
 
     def project(self, x_BTD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,12 +89,12 @@ class SelfAttentionCore(nn.Module):
 class CrossAttentionCore(nn.Module):
     """Pre-norm multi-head reading of given keys and values, with an additive bias on the logits."""
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()
         self.heads = heads
-        self.norm = nn.LayerNorm(width)
+        self.norm = nn.LayerNorm(width, norm_eps)
         self.q_proj = nn.Linear(width, width)
-        self.q_norm = nn.LayerNorm(width // heads)
+        self.q_norm = nn.LayerNorm(width // heads, norm_eps)
         self.out_proj = nn.Linear(width, width)
 
     def project(self, x_BND: Tensor) -> Tensor:

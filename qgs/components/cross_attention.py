@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from pydantic import Field
 from torch import Tensor
 
-from qgs.components.blocks import CrossAttentionCore
+from qgs.components.blocks import NORM_EPS, CrossAttentionCore
 from qgs.contracts import AttentionWeights, ComponentConfig, CrossAttention, ModelDims
 from qgs.contracts.component import Fields
 from qgs.contracts.encoder import MEMORY_FIELDS
@@ -18,9 +19,16 @@ class ContentCrossAttention(CrossAttention):
 
     name: ClassVar[str] = "content"
 
-    def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
+    class Config(ComponentConfig):
+        """norm_eps: of every LayerNorm."""
+
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.core = CrossAttentionCore(dims.width, dims.heads)
+        self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
 
     @classmethod
     def requires(cls, config: ComponentConfig) -> Fields:

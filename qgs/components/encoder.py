@@ -10,7 +10,7 @@ from einops import rearrange
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components.blocks import LayerScale, Mlp, SelfAttentionCore, split_heads
+from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
 from qgs.contracts import ComponentConfig, Encoder, ModelDims, Problem, RecipeContext
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
@@ -22,10 +22,10 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 class PatchEmbedding(nn.Module):
     """P x P convolution with stride P, then LayerNorm: (X, C, H, W) -> (X, H/P*W/P, D)."""
 
-    def __init__(self, channels: int, width: int, patch_size: int) -> None:
+    def __init__(self, channels: int, width: int, patch_size: int, norm_eps: float) -> None:
         super().__init__()
         self.proj = nn.Conv2d(channels, width, kernel_size=patch_size, stride=patch_size)
-        self.norm = nn.LayerNorm(width)
+        self.norm = nn.LayerNorm(width, norm_eps)
 
     def forward(self, images: Tensor) -> Tensor:
         """(X, C, H, W) -> (X, H/P*W/P, D), row by row."""
@@ -35,12 +35,14 @@ class PatchEmbedding(nn.Module):
 class EncoderBlock(nn.Module):
     """Pre-norm ViT block with QK-LayerNorm and LayerScale."""
 
-    def __init__(self, width: int, heads: int, mlp_ratio: int, layer_scale: float) -> None:
+    def __init__(
+        self, width: int, heads: int, mlp_ratio: int, layer_scale: float, norm_eps: float
+    ) -> None:
         super().__init__()
-        self.norm1 = nn.LayerNorm(width)
-        self.attention = SelfAttentionCore(width, heads)
+        self.norm1 = nn.LayerNorm(width, norm_eps)
+        self.attention = SelfAttentionCore(width, heads, norm_eps)
         self.scale1 = LayerScale(width, layer_scale)
-        self.norm2 = nn.LayerNorm(width)
+        self.norm2 = nn.LayerNorm(width, norm_eps)
         self.mlp = Mlp(width, mlp_ratio * width, width)
         self.scale2 = LayerScale(width, layer_scale)
 
@@ -56,25 +58,29 @@ class MultiViewViT(Encoder):
     name: ClassVar[str] = "multiview_vit"
 
     class Config(ComponentConfig):
-        """patch_size: P in pixels. depth: blocks. layer_scale: its initial value."""
+        """patch_size: P in pixels. depth: blocks. layer_scale: its initial value.
+
+        norm_eps: of every LayerNorm.
+        """
 
         patch_size: int = Field(default=8, ge=1)
         depth: int = Field(default=3, ge=0)
         mlp_ratio: int = Field(default=4, ge=1)
         layer_scale: float = Field(default=0.01, gt=0)
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.patch_size = config.patch_size
-        self.rgb_embedding = PatchEmbedding(3, dims.width, config.patch_size)
-        self.ray_embedding = PatchEmbedding(6, dims.width, config.patch_size)
+        self.patch_size, eps = config.patch_size, config.norm_eps
+        self.rgb_embedding = PatchEmbedding(3, dims.width, config.patch_size, eps)
+        self.ray_embedding = PatchEmbedding(6, dims.width, config.patch_size, eps)
         self.blocks = nn.ModuleList(
-            EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale)
+            EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale, eps)
             for _ in range(config.depth)
         )
-        self.norm = nn.LayerNorm(dims.width)
+        self.norm = nn.LayerNorm(dims.width, eps)
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
-        self.k_norm = nn.LayerNorm(dims.width // dims.heads)
+        self.k_norm = nn.LayerNorm(dims.width // dims.heads, eps)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components.blocks import Mlp
+from qgs.components.blocks import NORM_EPS, Mlp
 from qgs.contracts import ComponentConfig, FeedForward, ModelDims
 
 
@@ -17,13 +17,14 @@ class MlpFeedForward(FeedForward):
     name: ClassVar[str] = "mlp"
 
     class Config(ComponentConfig):
-        """ratio: hidden width over D."""
+        """ratio: hidden width over D. norm_eps: of the LayerNorm."""
 
         ratio: int = Field(default=4, ge=1)
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.mlp = Mlp(dims.width, config.ratio * dims.width, dims.width)
 
     def forward(self, features: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
@@ -11,7 +12,15 @@ from einops import rearrange
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.contracts import ComponentConfig, Head, ModelDims
+from qgs.components.blocks import NORM_EPS
+from qgs.contracts import (
+    ComponentConfig,
+    Head,
+    ModelDims,
+    Problem,
+    RecipeContext,
+    without_effect,
+)
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 
@@ -28,16 +37,17 @@ class GaussianHead(Head):
         """Defaults are the LocusGS release's; TokenGS: scale_input_limit null, quat_eps 1e-12.
 
         gaussians_per_query: K. init_std, position_std: truncated normal of all weights, of those
-        that make positions (None: the same). norm: a LayerNorm before the linear layer (in neither
-        release; steadier when small). scale_cap: largest scale c, world units. scale_input_limit:
-        clamp before the exponential, None for none. opacity_bias: added to the opacity logit.
-        quat_eps: floor of the quaternion's length before division.
+        that make positions (None: the same). norm, norm_eps: a LayerNorm before the linear layer
+        (in neither release; steadier when small) and its epsilon. scale_cap: largest scale c, world
+        units. scale_input_limit: clamp before the exponential, None for none. opacity_bias: added
+        to the opacity logit. quat_eps: floor of the quaternion's length before division.
         """
 
         gaussians_per_query: int = Field(default=64, ge=1)
         init_std: float = Field(default=0.002, gt=0)
         position_std: float | None = Field(default=None, gt=0)
         norm: bool = False
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
         scale_cap: float = Field(default=0.075, gt=0)
         scale_input_limit: float | None = Field(default=10.0, gt=0)
         opacity_bias: float = -2.0
@@ -47,7 +57,7 @@ class GaussianHead(Head):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width) if config.norm else nn.Identity()
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps) if config.norm else nn.Identity()
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
@@ -56,6 +66,12 @@ class GaussianHead(Head):
             nn.init.trunc_normal_(rows, std=config.position_std)
             with torch.no_grad():
                 self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """An epsilon needs its norm."""
+        if not config.norm:
+            yield from without_effect(config, ("norm_eps",), "`norm` is false")
 
     @property
     def gaussians_per_query(self) -> int:

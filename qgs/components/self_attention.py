@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components.blocks import SelfAttentionCore
+from qgs.components.blocks import NORM_EPS, SelfAttentionCore
 from qgs.contracts import AttentionWeights, ComponentConfig, ModelDims, SelfAttention
 from qgs.types import QueryState
 
@@ -16,10 +17,17 @@ class ContentSelfAttention(SelfAttention):
 
     name: ClassVar[str] = "content"
 
-    def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
+    class Config(ComponentConfig):
+        """norm_eps: of every LayerNorm."""
+
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width)
-        self.attention = SelfAttentionCore(dims.width, dims.heads)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
 
     def forward(self, state: QueryState) -> Tensor:
         """The update (B, N, D)."""

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components import CrossAttentionCore
+from qgs.components import NORM_EPS, CrossAttentionCore
 from qgs.contracts import (
     MEMORY_FIELDS,
     AttentionWeights,
@@ -44,21 +44,24 @@ class RayBiasedCrossAttention(CrossAttention):
     class Config(RadiusOptions):
         """bandwidth: sigma follows the radius or is fixed. sigma0: its factor, world units.
 
-        sigma_sq_min: floor of (sigma0 r)^2. bias_min: lower clamp of b. gamma_init: start of g, one
-        number per layer, gamma = softplus(g).
+        sigma_sq_min: floor of (sigma0 r)^2. bias_min: lower clamp of b. direction_eps: floor of the
+        length of a patch's mean direction before it is normalised. gamma_init: start of g, one
+        number per layer, gamma = softplus(g). norm_eps: of every LayerNorm.
         """
 
         bandwidth: Literal["radius", "fixed"] = "radius"
         sigma0: float = Field(default=0.1, gt=0)
         sigma_sq_min: float = Field(default=1e-3, gt=0)
         bias_min: float = Field(default=-20.0, lt=0)
+        direction_eps: float = Field(default=1e-6, gt=0)
         gamma_init: float = -2.25
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.core = CrossAttentionCore(dims.width, dims.heads)
+        self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
         self.raw_gamma = nn.Parameter(torch.tensor(config.gamma_init))
 
     @classmethod
@@ -89,10 +92,14 @@ class RayBiasedCrossAttention(CrossAttention):
 
     def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
         """gamma b (B, N, M), float32, computed from the state that enters the layer."""
+        eps = self.config.direction_eps
+        features = memory.once(
+            f"locus.ray_features.{eps:g}", lambda: ray_features(memory.patch_rays, eps)
+        )
         return ray_bias(
             state[CENTER],
             self.sigma_sq(state),
-            memory.once("locus.ray_features", lambda: ray_features(memory.patch_rays)),
+            features,
             self.config.bias_min,
             self.gamma,
         )

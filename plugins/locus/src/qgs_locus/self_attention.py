@@ -6,27 +6,27 @@ import math
 from typing import ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components import Mlp, SelfAttentionCore
+from qgs.components import NORM_EPS, Mlp, SelfAttentionCore
 from qgs.contracts import AttentionWeights, ComponentConfig, Fields, ModelDims, SelfAttention
 from qgs.geometry.precision import full_precision
 from qgs.types import QueryState
 from qgs_locus.fields import CENTER, CENTER_FIELD
 
-FEATURES_PER_AXIS = 128
-TEMPERATURE = 10_000.0
-
 
 @full_precision
-def sine_embedding(position: Tensor) -> Tensor:
-    """Sine features of positions in [-1, 1]: (..., 3) -> (..., 384), axis by axis.
+def sine_embedding(
+    position: Tensor, features: int = 128, temperature: float = 10_000.0, divisor_eps: float = 1e-6
+) -> Tensor:
+    """Sine features of positions in [-1, 1]: (..., 3) -> (..., 3 * features), axis by axis.
 
-    Each axis is mapped to [0, 2 pi] and divided by T^(2i/128) + 1e-6; sine and cosine interleave
-    (LocusGS release).
+    Each axis is mapped to [0, 2 pi] and divided by temperature^(2i / features) + divisor_eps; sine
+    and cosine interleave (LocusGS release).
     """
-    half = torch.arange(FEATURES_PER_AXIS // 2, dtype=position.dtype, device=position.device)
-    divisor = TEMPERATURE ** (2 * half / FEATURES_PER_AXIS) + 1e-6
+    half = torch.arange(features // 2, dtype=position.dtype, device=position.device)
+    divisor = temperature ** (2 * half / features) + divisor_eps
     angle = ((position + 1) * math.pi)[..., None] / divisor
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(-3)
 
@@ -40,17 +40,25 @@ class AnchorAwareSelfAttention(SelfAttention):
     name: ClassVar[str] = "anchor_aware"
 
     class Config(ComponentConfig):
-        """position: what is embedded, "tanh" of the centre (release) or "raw" (paper)."""
+        """position: what is embedded, "tanh" of the centre (release) or "raw" (paper).
+
+        features: sines and cosines per axis. temperature, divisor_eps: see `sine_embedding`.
+        norm_eps: of every LayerNorm.
+        """
 
         position: Literal["tanh", "raw"] = "tanh"
+        features: int = Field(default=128, ge=2, multiple_of=2)
+        temperature: float = Field(default=10_000.0, gt=0)
+        divisor_eps: float = Field(default=1e-6, ge=0)
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width)
-        self.attention = SelfAttentionCore(dims.width, dims.heads)
-        self.position_mlp = Mlp(3 * FEATURES_PER_AXIS, dims.width, dims.width)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
+        self.position_mlp = Mlp(3 * config.features, dims.width, dims.width)
 
     @classmethod
     def requires(cls, config: Config) -> Fields:
@@ -59,9 +67,11 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     def position_embedding(self, state: QueryState) -> Tensor:
         """p (B, N, D)."""
-        center = state[CENTER]
-        position = torch.tanh(center) if self.config.position == "tanh" else center
-        return self.position_mlp(sine_embedding(position))
+        center, config = state[CENTER], self.config
+        position = torch.tanh(center) if config.position == "tanh" else center
+        return self.position_mlp(
+            sine_embedding(position, config.features, config.temperature, config.divisor_eps)
+        )
 
     def forward(self, state: QueryState) -> Tensor:
         """The update (B, N, D)."""
