@@ -56,6 +56,10 @@ class Scene(ABC):
 class SceneSourceConfig(ComponentConfig):
     """image_size: (H, W) of every delivered image, in pixels."""
 
+    undecisive: ClassVar[frozenset[str]] = frozenset({"path"})
+    """Options that change no scene, image or camera: where files lie, how they are kept in memory.
+    Hashes of evaluation protocols leave them out."""
+
     image_size: tuple[Side, Side] = (64, 64)
 
 

@@ -59,7 +59,7 @@ class EvaluationPlan:
         names = [scene.name for scene in self._scenes]
         self._places = {name: place for place, name in reversed(list(enumerate(names)))}
         self._count = Counter(names)
-        self.wanted: tuple[str, ...] = tuple(names[: evaluation.scenes])
+        self.wanted: tuple[str, ...] = tuple(dict.fromkeys(names[: evaluation.scenes]))
         self.null: tuple[str, ...] = ()
         self.unlisted: tuple[str, ...] = ()
         if index is not None:
@@ -69,17 +69,16 @@ class EvaluationPlan:
 
     def samples(self) -> Iterator[Sample | SceneFailure]:
         """The samples, one decoded at a time; a scene that fails ends with its failure."""
-        for number, name in enumerate(self.wanted):
+        for name in self.wanted:
             try:
-                scene, place = self._open(name, number)
+                scene, place = self._open(name)
                 for frames in self._choices(scene, place):
                     yield make_sample(scene, *frames, self._views, mirror=False)
             except Exception as error:  # whatever a reader raises is told, and never ends the rest
                 yield SceneFailure(name, told(error))
 
-    def _open(self, name: str, number: int) -> tuple[Scene, int]:
-        if self._index is None:
-            return self._scenes[number], number
+    def _open(self, name: str) -> tuple[Scene, int]:
+        """The scene and its place in the split."""
         if name not in self._places:
             raise ValueError("not among the test scenes of the data")
         if self._count[name] > 1:

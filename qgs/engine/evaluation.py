@@ -1,195 +1,259 @@
-"""Held-out views: the model beside two baselines that need none."""
+"""Judging a model on the test views of a recipe, beside two baselines that need none."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from itertools import islice
-from pathlib import Path
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import torch
-from rich.console import Console
-from rich.table import Table
+from torch import Tensor
 
 from qgs.composer import Recipe
 from qgs.contracts import Scene
-from qgs.data.loader import evaluation_samples
-from qgs.data.sampling import Sample
-from qgs.io.atomic import write_text
-from qgs.metrics import mean_colour, nearest_input, psnr, spread, ssim, token_dispersion
+from qgs.data.evaluation import EvaluationPlan, SceneFailure, told
+from qgs.data.sampling import Frames, Sample, collate
+from qgs.engine.protocol import index_of, protocol_of
+from qgs.engine.scores import TUNING, Evaluation, SceneScore, column
+from qgs.engine.tuning import Tuning, tune, tuning_loss
+from qgs.metrics import (
+    gaussians_used,
+    mean_colour,
+    nearest_input,
+    psnr,
+    ssim,
+    token_dispersion,
+)
 from qgs.metrics.dispersion import median
+from qgs.metrics.lpips import LpipsUnavailableError, load_lpips
 from qgs.model import QueryGaussianModel
-
-METHODS = ("model", "nearest_input", "mean_colour")
+from qgs.types import Gaussians
 
 SECTIONS = ("data", "views", "evaluation")
 """What of a recipe decides which views are judged."""
 
+_NOT_ASKED = "not asked for; set evaluation.metrics=[lpips]"
 
-@dataclass(frozen=True)
-class Row:
-    """One sample of one scene. psnr, ssim: per method, means over the sample's target views.
-
-    dispersion_mean, dispersion_median: over Gaussians, of the distance to their token's centroid,
-    world units.
-    """
-
-    scene: str
-    input_frames: tuple[int, ...]
-    target_frames: tuple[int, ...]
-    psnr: Mapping[str, float]
-    ssim: Mapping[str, float]
-    dispersion_mean: float
-    dispersion_median: float
+Metric = Callable[[Tensor, Tensor], Tensor]
+Observer = Callable[[int, int], None]
+"""Told how many scenes are done, and how many there are."""
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """All rows and what they amount to; the same weights and recipe give the same numbers.
-
-    held_out: how many held-out frames were judged, and how many there are; None where the test
-    scenes hold none out. settings: the recipe's SECTIONS. step: optimiser steps behind the weights.
-    """
-
-    rows: Sequence[Row]
-    gaussians: int
-    held_out: tuple[int, int] | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    step: int | None = None
-
-    def mean(self, metric: str, method: str = "model") -> float:
-        """Mean over samples of `metric` ("psnr" or "ssim") of one of METHODS.
-
-        A sample's value is the mean over its target views, so samples weigh alike, however many
-        views they have.
-        """
-        return sum(getattr(row, metric)[method] for row in self.rows) / len(self.rows)
-
-    def summary(self) -> dict:
-        """Means over samples, and mean, variance and median of the dispersion over samples."""
-        dispersions = {
-            "mean": asdict(spread(torch.tensor([row.dispersion_mean for row in self.rows]))),
-            "median": asdict(spread(torch.tensor([row.dispersion_median for row in self.rows]))),
-        }
-        return {
-            "step": self.step,
-            "samples": len(self.rows),
-            "scenes": len({row.scene for row in self.rows}),
-            "gaussians": self.gaussians,
-            **{m: {k: self.mean(k, m) for k in ("psnr", "ssim")} for m in METHODS},
-            "dispersion_over_gaussians": dispersions,
-            "held_out_frames": self.held_out,
-            "settings": self.settings,
-        }
-
-    def write(self, folder: str | Path) -> None:
-        """Write samples.csv and summary.json into `folder`, each whole or not at all."""
-        write_text(Path(folder) / "samples.csv", self._csv())
-        write_text(Path(folder) / "summary.json", json.dumps(self.summary(), indent=2) + "\n")
-
-    def show(self, console: Console) -> None:
-        """Print the table that a person compares by."""
-        table = Table(title=f"{len(self.rows)} samples of unseen views")
-        table.add_column("")
-        table.add_column("PSNR", justify="right")
-        table.add_column("SSIM", justify="right")
-        for method in METHODS:
-            scores = f"{self.mean('psnr', method):.2f}", f"{self.mean('ssim', method):.3f}"
-            table.add_row(method.replace("_", " "), *scores)
-        console.print(table)
-        if self.held_out:
-            console.print("judged on {} of {} held-out frames".format(*self.held_out))
-        dispersions = self.summary()["dispersion_over_gaussians"]
-        console.print(
-            f"{self.gaussians} Gaussians; token dispersion over Gaussians: "
-            f"mean {dispersions['mean']['mean']:.4f}, median {dispersions['median']['median']:.4f}"
-        )
-
-    def _csv(self) -> str:
-        text = io.StringIO()
-        scores = [f"{method}_{metric}" for method in METHODS for metric in ("psnr", "ssim")]
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(
-            [
-                "scene",
-                "input_frames",
-                "target_frames",
-                *scores,
-                "dispersion_mean",
-                "dispersion_median",
-            ]
-        )
-        for row in self.rows:
-            values = [v for m in METHODS for v in (row.psnr[m], row.ssim[m])]
-            frames = [" ".join(map(str, f)) for f in (row.input_frames, row.target_frames)]
-            writer.writerow(
-                [row.scene, *frames, *values, row.dispersion_mean, row.dispersion_median]
-            )
-        return text.getvalue()
-
-
-@torch.no_grad()
-def evaluate(model: QueryGaussianModel, recipe: Recipe, step: int | None = None) -> Evaluation:
+def evaluate(
+    model: QueryGaussianModel,
+    recipe: Recipe,
+    step: int | None = None,
+    batch: int = 1,
+    observe: Observer | None = None,
+) -> Evaluation:
     """Evaluate `model` on the test views of `recipe`, on the device where the model is.
 
-    Leaves the model in the mode it was in. step: optimiser steps behind the weights.
-    Raises what the data source raises, and ValueError when it has no test sample.
+    A scene that fails is told in the result and does not end the evaluation. Samples are decoded
+    one at a time. Leaves the model in the mode it was in.
+
+    step: optimiser steps behind the weights. batch: scenes that pass through the model together;
+    tuned tokens pass alone. observe: see `Observer`.
+    Raises what opening the data source or the index raises, and ValueError when no scene at all
+    could be judged or `batch` is less than 1.
     """
+    if batch < 1:
+        raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
+    source, index = recipe.build_data(), index_of(recipe)
+    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index)
     training = model.training
     model.eval()
     try:
-        source = recipe.build_data()
-        samples = evaluation_samples(source, recipe.views, recipe.evaluation)
-        rows = [_row(model, sample) for sample in samples]
+        judge = _Judge.of(model, recipe)
+        outcomes = _observed(judge.judged(plan.samples(), batch), plan.wanted, observe)
+        scores, missing = _by_scene(plan.wanted, outcomes)
     finally:
         model.train(training)
-    if not rows:
-        raise ValueError("the data has no test scene to evaluate on; check `data` and `evaluation`")
+    if not scores:
+        first = missing[0]
+        raise ValueError(
+            f"none of {len(missing)} scenes could be judged; the first, {first.scene}: "
+            f"{first.reason}"
+        )
     return Evaluation(
-        rows,
-        model.queries.count * model.head.gaussians_per_query,
-        _held_out(source.scenes("test"), rows),
-        {name: recipe.tree[name] for name in SECTIONS if name in recipe.tree},
-        step,
+        protocol=protocol_of(recipe, index, plan.wanted),
+        scores=scores,
+        wanted=plan.wanted,
+        gaussians=model.queries.count * model.head.gaussians_per_query,
+        missing=missing,
+        null=plan.null,
+        unlisted=plan.unlisted,
+        empty=judge.empty,
+        held_out=_held_out(source.scenes("test")[: len(plan.wanted)], scores)
+        if not index
+        else None,
+        step=step,
     )
 
 
-def _held_out(scenes: Sequence[Scene], rows: Sequence[Row]) -> tuple[int, int] | None:
-    """Held-out frames that were targets, and all of them, over the scenes that were judged."""
-    judged: dict[str, set[int]] = {}
-    for row in rows:
-        judged.setdefault(row.scene, set()).update(row.target_frames)
-    count = total = 0
-    for scene in islice(scenes, len(judged)):
-        count += len(judged.get(scene.name, set()) & set(scene.held_out))
-        total += len(scene.held_out)
-    return (count, total) if total else None
+@dataclass(frozen=True)
+class _SampleScore:
+    scene: str
+    views: tuple[Frames, Frames]
+    values: Mapping[str, float]
 
 
-def _row(model: QueryGaussianModel, sample: Sample) -> Row:
-    device = next(model.parameters()).device
-    inputs, targets = sample.inputs.to(device), sample.targets.to(device)
-    gaussians = model(inputs).gaussians
-    images = {
-        "model": model.render(gaussians, targets.cameras).rgb,
-        "nearest_input": nearest_input(inputs, targets.cameras),
-        "mean_colour": mean_colour(inputs, targets.cameras),
+_Outcome = _SampleScore | SceneFailure
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Scores samples. tuner: tunes one sample's tokens; None for none. empty: see `Evaluation`."""
+
+    model: QueryGaussianModel
+    metrics: Mapping[str, Metric]
+    tuner: Callable[..., Tuning] | None
+    empty: Mapping[str, str]
+
+    @classmethod
+    def of(cls, model: QueryGaussianModel, recipe: Recipe) -> _Judge:
+        evaluation = recipe.evaluation
+        metrics: dict[str, Metric] = {"psnr": psnr, "ssim": ssim}
+        empty: dict[str, str] = {}
+        if "lpips" not in evaluation.metrics:
+            empty["lpips"] = _NOT_ASKED
+        else:
+            try:
+                metrics["lpips"] = load_lpips(evaluation.lpips_weights).to(_device(model))
+            except LpipsUnavailableError as error:
+                empty["lpips"] = str(error)
+        tuner = None
+        if evaluation.tuning_steps:
+            tuner = partial(
+                tune,
+                model,
+                loss=tuning_loss(recipe),
+                steps=evaluation.tuning_steps,
+                rate=evaluation.tuning_rate,
+            )
+        return cls(model, metrics, tuner, empty)
+
+    def judged(self, samples: Iterable[Sample | SceneFailure], batch: int) -> Iterator[_Outcome]:
+        """An outcome of every sample, up to `batch` of equal view counts at a time."""
+        waiting: list[Sample] = []
+        for sample in samples:
+            if isinstance(sample, SceneFailure):
+                yield sample
+                continue
+            alike = not waiting or _shapes(waiting[0]) == _shapes(sample)
+            if len(waiting) == batch or not alike:
+                yield from self._together(waiting)
+                waiting = []
+            waiting.append(sample)
+        yield from self._together(waiting)
+
+    @torch.no_grad()
+    def _together(self, samples: Sequence[Sample]) -> list[_Outcome]:
+        if len(samples) < 2 or self.tuner:
+            return [self._alone(sample) for sample in samples]
+        try:
+            inputs = collate(samples).inputs.to(_device(self.model))
+            gaussians = self.model(inputs).gaussians
+        except Exception:  # one of them is to blame: each again by itself, which tells whose
+            return [self._alone(sample) for sample in samples]
+        return [
+            self._safely(sample, gaussians[place : place + 1])
+            for place, sample in enumerate(samples)
+        ]
+
+    def _alone(self, sample: Sample) -> _Outcome:
+        try:
+            inputs = sample.inputs.to(_device(self.model))
+            if self.tuner is None:
+                return self._safely(sample, self.model(inputs).gaussians)
+            tuning = self.tuner(inputs)
+        except Exception as error:  # told, and never ends the other scenes
+            return SceneFailure(sample.scene, told(error))
+        before, after = TUNING
+        ends = {before: tuning.losses[0], after: tuning.losses[-1]}
+        return self._safely(sample, tuning.prediction.gaussians, ends)
+
+    def _safely(
+        self, sample: Sample, gaussians: Gaussians, more: Mapping[str, float] | None = None
+    ) -> _Outcome:
+        try:
+            values = {**self._values(sample, gaussians), **(more or {})}
+        except Exception as error:  # told, and never ends the other scenes
+            return SceneFailure(sample.scene, told(error))
+        broken = [name for name, value in values.items() if not math.isfinite(value)]
+        if broken:
+            return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
+        return _SampleScore(sample.scene, (sample.input_frames, sample.target_frames), values)
+
+    def _values(self, sample: Sample, gaussians: Gaussians) -> dict[str, float]:
+        """Everything measured on the Gaussians (1, G) of `sample`."""
+        device = _device(self.model)
+        inputs, targets = sample.inputs.to(device), sample.targets.to(device)
+        images = {
+            "model": self.model.render(gaussians, targets.cameras).rgb,
+            "nearest_input": nearest_input(inputs, targets.cameras),
+            "mean_colour": mean_colour(inputs, targets.cameras),
+        }
+        distances = token_dispersion(gaussians.means, self.model.head.gaussians_per_query)
+        return {
+            **{
+                column(method, metric): float(score(rgb, targets.images).double().mean())
+                for method, rgb in images.items()
+                for metric, score in self.metrics.items()
+            },
+            "dispersion_mean": float(distances.double().mean()),
+            "dispersion_median": float(median(distances)),
+            "gaussians_used": float(gaussians_used(gaussians.opacities)),
+        }
+
+
+def _by_scene(
+    wanted: Sequence[str], outcomes: Iterable[_Outcome]
+) -> tuple[list[SceneScore], list[SceneFailure]]:
+    """Scores and failures in the order of `wanted`; one failed sample fails its scene."""
+    samples: dict[str, list[_SampleScore]] = {}
+    failures: dict[str, SceneFailure] = {}
+    for outcome in outcomes:
+        if isinstance(outcome, SceneFailure):
+            failures.setdefault(outcome.scene, outcome)
+        else:
+            samples.setdefault(outcome.scene, []).append(outcome)
+    scores = [_merged(samples[name]) for name in wanted if name in samples and name not in failures]
+    return scores, [failures[name] for name in wanted if name in failures]
+
+
+def _merged(samples: Sequence[_SampleScore]) -> SceneScore:
+    values = {
+        name: sum(sample.values[name] for sample in samples) / len(samples)
+        for name in samples[0].values
     }
-    distances = token_dispersion(gaussians.means, model.head.gaussians_per_query)
+    return SceneScore(samples[0].scene, [sample.views for sample in samples], values)
 
-    def scores(metric) -> dict[str, float]:
-        return {name: float(metric(rgb, targets.images).mean()) for name, rgb in images.items()}
 
-    return Row(
-        scene=sample.scene,
-        input_frames=tuple(sample.input_frames),
-        target_frames=tuple(sample.target_frames),
-        psnr=scores(psnr),
-        ssim=scores(ssim),
-        dispersion_mean=float(distances.mean()),
-        dispersion_median=float(median(distances)),
-    )
+def _observed(
+    outcomes: Iterable[_Outcome], wanted: Sequence[str], observe: Observer | None
+) -> Iterator[_Outcome]:
+    seen: set[str] = set()
+    for outcome in outcomes:
+        yield outcome
+        seen.add(outcome.scene)
+        if observe:
+            observe(len(seen), len(wanted))
+
+
+def _held_out(scenes: Sequence[Scene], scores: Sequence[SceneScore]) -> tuple[int, int] | None:
+    """Held-out frames that were targets, and all of them, over the scenes that were judged."""
+    judged = {
+        score.scene: {frame for _, targets in score.views for frame in targets} for score in scores
+    }
+    held = [(scene.name, set(scene.held_out)) for scene in scenes if scene.name in judged]
+    total = sum(len(frames) for _, frames in held)
+    return (sum(len(judged[name] & frames) for name, frames in held), total) if total else None
+
+
+def _shapes(sample: Sample) -> tuple[torch.Size, torch.Size]:
+    return sample.inputs.images.shape, sample.targets.images.shape
+
+
+def _device(model: QueryGaussianModel) -> torch.device:
+    return next(model.parameters()).device

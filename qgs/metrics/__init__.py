@@ -2,10 +2,13 @@
 
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.metrics.dispersion import Spread, spread, token_dispersion
+from qgs.metrics.gaussians import OPACITY_USED, gaussians_used
 from qgs.metrics.images import psnr, ssim
 
 __all__ = [
+    "OPACITY_USED",
     "Spread",
+    "gaussians_used",
     "mean_colour",
     "nearest_input",
     "psnr",

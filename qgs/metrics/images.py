@@ -11,6 +11,13 @@ _WINDOW = 11
 _MSE_FLOOR = 1e-10
 """Identical images get 100 dB."""
 
+IMAGE_METRICS = {
+    "psnr": "dB of images clipped to [0, 1], mean over views, then over scenes",
+    "ssim": "scikit-image: Gaussian window of 11, sigma 1.5, data range 1, borders left out",
+    "lpips": "VGG-16, version 0.1, images in [-1, 1]",
+}
+"""What each metric is, in words that are part of an evaluation protocol."""
+
 
 @full_precision
 def psnr(images: Tensor, truth: Tensor) -> Tensor:

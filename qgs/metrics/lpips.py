@@ -43,12 +43,15 @@ class Lpips(nn.Module):
     def __init__(self, vgg: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(
-            nn.ModuleList(_convolution(vgg, number) for number in block) for block in _BLOCKS
+            nn.Sequential(*(_convolution(vgg, number) for number in block)) for block in _BLOCKS
         )
-        for index in range(len(_BLOCKS)):
-            self.register_buffer(f"linear{index}", linear[f"lin{index}.model.1.weight"].float())
+        weights = [linear[f"lin{index}.model.1.weight"].float() for index in range(len(_BLOCKS))]
+        self.linear = nn.ParameterList(weights).requires_grad_(False)
         self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
         self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
+
+    shift: Tensor
+    scale: Tensor
 
     @full_precision
     @torch.no_grad()
@@ -69,13 +72,11 @@ class Lpips(nn.Module):
         x = torch.stack([image, truth]).clamp(0, 1) * 2 - 1
         x = (x - self.shift) / self.scale
         total = x.new_zeros(())
-        for index, block in enumerate(self.blocks):
-            x = F.max_pool2d(x, 2) if index else x
-            for convolution in block:
-                x = convolution(x).relu()
+        for index, (block, weight) in enumerate(zip(self.blocks, self.linear, strict=True)):
+            x = block(F.max_pool2d(x, 2) if index else x)
             unit = x / (x.norm(dim=1, keepdim=True) + _EPS)
             apart = (unit[:1] - unit[1:]).square()
-            total = total + F.conv2d(apart, getattr(self, f"linear{index}")).mean()
+            total = total + F.conv2d(apart, weight).mean()
         return total
 
 
@@ -106,11 +107,11 @@ def load_lpips(weights: str | None = None) -> Lpips:
         ) from error
 
 
-def _convolution(vgg: Mapping[str, Tensor], number: int) -> nn.Conv2d:
+def _convolution(vgg: Mapping[str, Tensor], number: int) -> nn.Sequential:
     weight, bias = vgg[f"features.{number}.weight"], vgg[f"features.{number}.bias"]
     convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
     convolution.load_state_dict({"weight": weight, "bias": bias})
-    return convolution.requires_grad_(False)
+    return nn.Sequential(convolution.requires_grad_(False), nn.ReLU(inplace=True))
 
 
 def _read(path: Path) -> Mapping[str, Tensor]:

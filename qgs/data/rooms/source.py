@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from importlib.util import find_spec
-from typing import overload
+from typing import ClassVar, overload
 
 import numpy as np
 import torch
@@ -34,6 +34,8 @@ class RoomsConfig(SceneSource.Config):
     view, degrees. seed: all rooms follow from it. cache_mb: megabytes of images kept in memory,
     0 for none.
     """
+
+    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {"cache_mb"}
 
     scenes: int = Field(default=2000, ge=1)
     test_scenes: int = Field(default=32, ge=1)
