@@ -101,3 +101,13 @@ def test_a_step_holds_weights_gradients_and_two_moments() -> None:
     weights = sum(p.numel() for p in recipe.build_model("meta").parameters()) * 4
     peak = peak_memory(recipe, "step", MODEST, threads=1)
     assert peak.peak_bytes - peak.idle_bytes > 4 * weights
+
+
+@pytest.mark.slow
+def test_the_published_locusgs_runs_on_a_cpu_within_12_gb() -> None:
+    recipe = resolve(RECIPES / "locus/dl3dv_4096_4views.yaml")
+    model, workload = recipe.build_model("meta"), workload_of(recipe)
+    assert model.queries.count * model.head.gaussians_per_query == 262_144
+    assert (workload.views, workload.size, workload.precision) == (4, (256, 448), "float32")
+    peak = peak_memory(recipe, "forward", workload, torch.get_num_threads())
+    assert 4 * 241_462_544 < peak.peak_bytes < 12e9

@@ -57,7 +57,8 @@ def _render(model: QueryGaussianModel, workload: Workload) -> Task:
 
 
 def _step(recipe: Recipe, model: QueryGaussianModel, workload: Workload) -> Task:
-    objective = Objective(model, recipe.build_losses()).to(workload.device)
+    losses, render_views = recipe.build_losses(), recipe.training.render_views
+    objective = Objective(model, losses, render_views).to(workload.device)
     optimizer = make_optimizer(objective, recipe.training)
     inputs, targets = workload.inputs(), workload.supervision()
 
