@@ -1,145 +1,56 @@
-"""`qgs/photos`: a folder of photos with a nerfstudio `transforms.json`."""
+"""`qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
 
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-import torch
-from PIL import Image
 from pydantic import Field
-from torch import Tensor
+from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.images import CropResize, open_rgb, to_tensor
-from qgs.data.transforms_json import PhotoFrame, read_transforms
-from qgs.data.undistortion import undistorted
+from qgs.data.cache import BoundedCache
+from qgs.data.frames import PhotoFrame
+from qgs.data.paths import opened_path
+from qgs.data.photo_scene import Development, PhotoScene, pixel_cache
+from qgs.data.readers import Format, formats_of, read_listing
+from qgs.data.readers.listing import Listing, existing
+from qgs.data.validation import require_sound
 from qgs.types import Cameras, Views
 
 _log = logging.getLogger(__name__)
-_CACHE_BYTES = 512 * 2**20
-_SAME_ASPECT = 0.01  # relative difference between the file's and the JSON's aspect ratio
+_OPEN_SCENES = 64
 
 
 class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`.
 
-    path: folder that holds transforms.json, absolute or relative to the working directory.
-    holdout: every n-th frame is kept for evaluation, from frame n // 2 on; 0 for none. max_frames:
-    only the first frames of the file, 0 for all. background: RGB behind transparent pixels.
+    path: folder of one scene, or of folders of scenes, or with such folders in train and test; an
+    absolute path, one relative to the working directory, or an fsspec URL. format: how cameras are
+    listed; auto takes the first that a folder holds of nerfstudio (transforms.json), blender
+    (transforms_train.json), colmap (a sparse model) and llff (poses_bounds.npy). images: folder of
+    photos to read instead of the listed one, such as images_4. holdout: every n-th frame is kept
+    for evaluation, from frame n // 2 on; 0 for none; a listing's own split goes first. max_frames:
+    only the first frames of a listing, 0 for all. background: RGB behind transparent pixels.
+    depth_unit: world units per number of a depth map (nerfstudio: 0.001, for millimetres).
     """
 
     path: str
+    format: Format = "auto"
+    images: str | None = None
     holdout: int = Field(default=8, ge=0)
     max_frames: int = Field(default=0, ge=0)
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-class PhotoScene(Scene):
-    """The photos of one folder, in the file's order. World: that of the file's poses."""
-
-    def __init__(
-        self,
-        name: str,
-        frames: Sequence[PhotoFrame],
-        image_size: tuple[int, int],
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        holdout: int = 0,
-    ) -> None:
-        self.name = name
-        self.held_out = tuple(range(holdout // 2, len(frames), holdout)) if holdout else ()
-        self._frames, self._background = frames, background
-        self._sizes = [_file_size(frame) for frame in frames]
-        self._crops = [CropResize(size, image_size) for size in self._sizes]
-        self._cache: OrderedDict[int, np.ndarray] = OrderedDict()
-        self._kept = max(_CACHE_BYTES // (3 * image_size[0] * image_size[1]), 1)
-        intrinsics = [
-            crop.intrinsics(torch.tensor(_at_size(frame, size), dtype=torch.float64))
-            for frame, size, crop in zip(frames, self._sizes, self._crops, strict=True)
-        ]
-        c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames])).float()
-        self._cameras = Cameras(c2w, torch.stack(intrinsics).float(), image_size)
-
-    @property
-    def cameras(self) -> Cameras:
-        """See `Scene`."""
-        return self._cameras
-
-    def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`. Raises ValueError for a file that cannot be decoded."""
-        return to_tensor(np.stack([self._image(frame) for frame in frames]))
-
-    def _image(self, index: int) -> np.ndarray:
-        if index in self._cache:
-            return self._cache[index]
-        frame = self._frames[index]
-        image: Image.Image = open_rgb(frame.path, self._background)
-        if any(frame.distortion):
-            image = undistorted(image, _at_size(frame, self._sizes[index]), frame.distortion)
-        pixels = self._crops[index].image(image)
-        self._cache[index] = pixels
-        if len(self._cache) > self._kept:
-            self._cache.popitem(last=False)
-        return pixels
-
-
-def _file_size(frame: PhotoFrame) -> tuple[int, int]:
-    """(H, W) of the image file, which may be a smaller or larger copy of what the JSON says."""
-    try:
-        with Image.open(frame.path) as image:
-            width, height = image.size
-    except OSError as error:
-        raise ValueError(
-            f"{frame.path} cannot be read as an image ({error}): replace the file, or remove its "
-            "frame from transforms.json"
-        ) from error
-    if frame.size is not None:
-        said_height, said_width = frame.size
-        if abs(width * said_height / (height * said_width) - 1) > _SAME_ASPECT:
-            raise ValueError(
-                f"{frame.path} is {width} x {height} pixels, but transforms.json says "
-                f"{said_width} x {said_height}, another aspect ratio: the intrinsics cannot be "
-                "scaled. Give the original images, or correct 'w' and 'h'"
-            )
-    return height, width
-
-
-def _at_size(frame: PhotoFrame, size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Intrinsics in pixels of the image file of `size`, scaled from the JSON's size."""
-    height, width = frame.size or size
-    x, y = size[1] / width, size[0] / height
-    fx, fy, cx, cy = frame.intrinsics
-    return fx * x, fy * y, cx * x, cy * y
-
-
-def present_frames(folder: Path) -> tuple[list[PhotoFrame], list[str]]:
-    """The frames whose image files exist, and the paths of the others, which are also logged.
-
-    Raises FileNotFoundError when fewer than two images exist.
-    """
-    frames = read_transforms(folder)
-    present = [frame for frame in frames if frame.path.is_file()]
-    missing = [str(frame.path) for frame in frames if not frame.path.is_file()]
-    if len(present) < 2:
-        raise FileNotFoundError(
-            f"{folder}/transforms.json names {len(frames)} images, of which {len(present)} exist "
-            f"and 2 are needed; the first missing one is {missing[0] if missing else 'none'}"
-        )
-    if missing:
-        _log.warning(
-            "%d of %d images of %s are missing: %s", len(missing), len(frames), folder,
-            ", ".join(missing),
-        )  # fmt: skip
-    return present, missing
+    depth_unit: float = Field(default=1e-3, gt=0)
 
 
 class PhotosSource(SceneSource):
-    """One folder of photos; both splits are the same scene, with held-out frames.
+    """Photos of one scene or of many; both splits are the same scenes, with held-out frames.
 
-    missing: paths of the images that transforms.json names and that do not exist.
+    Only where the folder has scenes in `train` and `test`, the splits are those. A single scene is
+    opened at once; of many, each is when it is asked for. Poses and intrinsics that cannot be meant
+    are refused, photos that do not exist are left out, counted and named in a warning.
     """
 
     name = "photos"
@@ -147,35 +58,169 @@ class PhotosSource(SceneSource):
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)
-        folder = Path(config.path).expanduser()
-        frames, self.missing = present_frames(folder)
-        frames = frames[: config.max_frames or None]
-        self._scenes = (
-            PhotoScene(
-                folder.resolve().name, frames, config.image_size, config.background, config.holdout
-            ),
-        )
+        self._scenes = _scenes(config, opened_path(config.path))
+        single = self._scenes["train"]
+        if self._scenes["test"] is single and len(single) == 1:
+            _ = single[0].cameras
+
+    @property
+    def missing(self) -> list[str]:
+        """Photos that a listing names and that do not exist, of the scenes opened so far."""
+        scenes = dict.fromkeys(self._scenes.values())
+        return [path for opened in scenes for paths in opened.missing.values() for path in paths]
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`."""
-        return self._scenes
+        return self._scenes[split]
+
+
+class PhotoScenes(Sequence[Scene]):
+    """Scenes by folder, opened when asked for; the last ones stay open.
+
+    missing: by folder that was opened, the listed photos that do not exist.
+    """
+
+    def __init__(self, folders: Mapping[str, UPath], config: PhotosConfig) -> None:
+        self._folders, self._config = list(folders.items()), config
+        self._opened: BoundedCache[PhotoScene] = BoundedCache(_OPEN_SCENES, _one)
+        self._pixels = pixel_cache()
+        self.missing: dict[str, list[str]] = {}
+
+    def __len__(self) -> int:
+        return len(self._folders)
+
+    def __getitem__(self, index: int) -> Scene:  # pyright: ignore[reportIncompatibleMethodOverride]
+        name, folder = self._folders[index]
+        return self._opened.get(name, lambda: self._open(name, folder))
+
+    def _open(self, name: str, folder: UPath) -> PhotoScene:
+        config = self._config
+        frames, self.missing[name] = present_frames(folder, config.format, config.images)
+        frames = frames[: config.max_frames or None]
+        development = Development(config.image_size, config.background, config.depth_unit)
+        held_out = held_out_frames(frames, config.holdout)
+        return PhotoScene(name, frames, development, held_out, self._pixels)
+
+
+def _one(scene: PhotoScene) -> int:
+    return 1
+
+
+def _scenes(config: PhotosConfig, root: UPath) -> Mapping[Split, PhotoScenes]:
+    """The scenes of both splits; raises FileNotFoundError when `root` holds none."""
+    if root.is_dir() and not formats_of(root):
+        train, test = (_folders(root / part, config) for part in ("train", "test"))
+        if train and test:
+            return {"train": PhotoScenes(train, config), "test": PhotoScenes(test, config)}
+        inside = _folders(root, config)
+        if inside:
+            scenes = PhotoScenes(inside, config)
+            return {"train": scenes, "test": scenes}
+    single = PhotoScenes({folder_name(root): root}, config)
+    return {"train": single, "test": single}
+
+
+def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
+    """The folders in `root` that hold a scene in the wanted format, by name."""
+    if not root.is_dir():
+        return {}
+    inside = sorted((item for item in root.iterdir() if item.is_dir()), key=lambda item: item.name)
+    held = {folder.name: formats_of(folder) for folder in inside}
+    wanted = [
+        folder for folder in inside
+        if (config.format in held[folder.name] if config.format != "auto" else held[folder.name])
+    ]  # fmt: skip
+    left = [folder.name for folder in inside if folder not in wanted]
+    if wanted and left:
+        _log.warning(
+            "%d of %d folders in %s hold no photos with cameras and are left out: %s",
+            len(left), len(inside), root, ", ".join(left),
+        )  # fmt: skip
+    return {folder.name: folder for folder in wanted}
+
+
+def folder_name(folder: UPath) -> str:
+    """The name of the scene in `folder`."""
+    return folder.resolve().name or "photos"
+
+
+def held_out_frames(frames: Sequence[PhotoFrame], holdout: int) -> tuple[int, ...]:
+    """The frames that a listing's split keeps from training; else every `holdout`-th one."""
+    if any(frame.split for frame in frames):
+        return tuple(i for i, frame in enumerate(frames) if frame.split == "test")
+    return tuple(range(holdout // 2, len(frames), holdout)) if holdout else ()
+
+
+def present_frames(
+    folder: UPath, format: Format = "auto", images: str | None = None
+) -> tuple[list[PhotoFrame], list[str]]:
+    """The frames whose image files exist, and the paths of the others, which are also logged.
+
+    Frames that belong to none of the listing's splits are left out, which is logged too.
+    Raises FileNotFoundError when fewer than two images or a mask do not exist, ValueError for
+    poses and intrinsics that cannot be meant.
+    """
+    listing = read_listing(folder, format, images)
+    require_sound(listing.file, listing.frames)
+    frames = _used(listing)
+    there = existing(frame.path for frame in frames)
+    present = [frame for frame in frames if frame.path in there]
+    missing = [str(frame.path) for frame in frames if frame.path not in there]
+    if len(present) < 2:
+        raise FileNotFoundError(
+            f"{listing.file} names {len(frames)} images, of which {len(present)} exist "
+            f"and 2 are needed; the first missing one is {missing[0] if missing else 'none'}"
+        )
+    if missing:
+        _log.warning(
+            "%d of %d images of %s are missing: %s", len(missing), len(frames), folder,
+            ", ".join(missing),
+        )  # fmt: skip
+    _require_masks(listing.file, present)
+    return present, missing
+
+
+def _used(listing: Listing) -> list[PhotoFrame]:
+    used = [frame for frame in listing.frames if frame.split != "unused"]
+    if len(used) < len(listing.frames):
+        _log.warning(
+            "%d of %d frames of %s are in none of its splits and are left out",
+            len(listing.frames) - len(used), len(listing.frames), listing.file,
+        )  # fmt: skip
+    return used
+
+
+def _require_masks(file: UPath, frames: Sequence[PhotoFrame]) -> None:
+    masks = [frame.mask for frame in frames if frame.mask is not None]
+    there = existing(masks)
+    missing = [mask for mask in masks if mask not in there]
+    if missing:
+        raise FileNotFoundError(
+            f"{file} names {len(masks)} masks, of which {len(missing)} do not exist, the first "
+            f"being {missing[0]}: add them, or remove their 'mask_path'"
+        )
 
 
 def read_photos(
-    path: str | Path, image_size: tuple[int, int], frames: Sequence[int] | None = None
+    path: str | Path | UPath,
+    image_size: tuple[int, int],
+    frames: Sequence[int] | None = None,
+    format: Format = "auto",
 ) -> Views:
     """Views (1, V) of a photo folder, in the world of its poses; all frames unless some are named.
 
     Raises FileNotFoundError and ValueError as `PhotosSource`, IndexError for frames out of range.
     """
-    folder = Path(path).expanduser()
-    scene = PhotoScene(folder.resolve().name, present_frames(folder)[0], image_size)
+    folder = opened_path(path)
+    listed = present_frames(folder, format)[0]
+    scene = PhotoScene(folder_name(folder), listed, Development(image_size))
     chosen = list(range(len(scene))) if frames is None else list(frames)
     outside = [frame for frame in chosen if not 0 <= frame < len(scene)]
     if outside:
         raise IndexError(f"{folder} has frames 0 to {len(scene) - 1}, asked for {outside}")
-    cameras = scene.cameras[chosen]
+    cameras, masks = scene.cameras[chosen], scene.masks(chosen)
     return Views(
         scene.images(chosen)[None],
-        Cameras(cameras.c2w[None], cameras.intrinsics[None], cameras.size),
+        Cameras(cameras.c2w[None].float(), cameras.intrinsics[None].float(), cameras.size),
+        None if masks is None else masks[None],
     )

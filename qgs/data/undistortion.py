@@ -1,45 +1,44 @@
-"""Photos with lens distortion turned into pinhole photos (OpenCV's model)."""
+"""Photos of a lens that bends rays, turned into photos of a pinhole camera."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
+from qgs.data.frames import Intrinsics
+from qgs.data.lenses import Lens
 from qgs.geometry.rays import pixel_directions
 
 
 def undistorted(
-    image: Image.Image,
-    intrinsics: tuple[float, float, float, float],
-    distortion: tuple[float, ...],
-) -> Image.Image:
+    pixels: np.ndarray,
+    intrinsics: Intrinsics,
+    lens: Lens,
+    mode: Literal["bilinear", "nearest"] = "bilinear",
+) -> np.ndarray:
     """The photo as a pinhole camera with the same intrinsics would have taken it.
 
-    distortion: k1, k2, p1, p2, k3. Pixels that the lens did not see are black.
+    pixels: (H, W) or (H, W, C), returned in the same shape and dtype. intrinsics: in pixels of it.
+    What the lens did not see is 0.
     """
-    width, height = image.size
-    focal, centre = torch.tensor(intrinsics).split(2)
-    directions = pixel_directions(torch.tensor(intrinsics), (height, width))[..., :2]
-    source = focal * distorted(directions, distortion) + centre
-    grid = source / torch.tensor([width, height]) * 2 - 1
-    pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1).float()
-    flat = F.grid_sample(pixels[None], grid[None], align_corners=False)[0]
-    return Image.fromarray(flat.round().byte().permute(1, 2, 0).numpy())
+    height, width = pixels.shape[:2]
+    grid = _source_grid(intrinsics, lens, (height, width))
+    planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
+    flat = F.grid_sample(planes[None], grid[None], mode=mode, align_corners=False)[0]
+    result = flat.permute(1, 2, 0).numpy().reshape(pixels.shape)
+    if np.issubdtype(pixels.dtype, np.integer):
+        result = result.round()
+    return result.astype(pixels.dtype)
 
 
-def distorted(points: Tensor, distortion: tuple[float, ...]) -> Tensor:
-    """Where the lens puts points (..., 2) of the plane z = 1 (OpenCV's radial-tangential model)."""
-    k1, k2, p1, p2, k3 = distortion
-    x, y = points.unbind(-1)
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return torch.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
-    )
+def _source_grid(intrinsics: Intrinsics, lens: Lens, size: tuple[int, int]) -> Tensor:
+    """(H, W, 2): where in the photo, from -1 to 1 across it, each pinhole pixel is to be found."""
+    camera = torch.tensor(intrinsics)
+    focal, centre = camera.split(2)
+    directions = pixel_directions(camera, size)[..., :2]
+    source = focal * lens.distorted(directions) + centre
+    return source / torch.tensor(size[::-1]) * 2 - 1

@@ -10,7 +10,7 @@ from PIL import Image
 
 from qgs.data import PhotosSource, read_photos
 from qgs.data.images import CropResize
-from qgs.data.undistortion import distorted
+from qgs.data.lenses import RadialTangential
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
@@ -89,9 +89,12 @@ def test_missing_images_are_counted_and_named(tmp_path, caplog):
         ({"transform_matrix": np.diag([2, 1, 1, 1]).tolist()}, {}, "frame 1 .*not rigid"),
         ({"transform_matrix": np.diag([-1, 1, 1, 1]).tolist()}, {}, "frame 1 .*not rigid"),
         ({"transform_matrix": [1, 2]}, {}, "frame 1 .*4 x 4"),
-        ({"file_path": None}, {}, "frame 1 has no 'file_path'"),
+        ({"file_path": None}, {}, "frame 1: it has no 'file_path'"),
         ({}, {"fl_x": None}, "no focal length"),
-        ({}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE.*undistort"),
+        ({}, {"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR.*undistort"),
+        ({}, {"camera_model": "OPENCV_FISHEYE", "k5": 0.1}, "'k5' is set"),
+        ({}, {"fl_x": 1.2, "fl_y": 1.3, "cx": 0.5, "cy": 0.5}, "frame 0 .*normalised.*in pixels"),
+        ({}, {"w": 48, "h": 64}, "swapped"),
         ({}, {"k4": 0.1}, "k4"),
         ({"k6": 1e-3}, {}, "frame 1 .*'k6' is set"),
         ({}, {"s1": 1e-3}, "'s1' is set"),
@@ -135,12 +138,6 @@ def test_lens_distortion_is_undone(tmp_path):
     assert image[24, 60].item() == pytest.approx(4 * expected, abs=2)
 
 
-def test_masks_that_are_not_used_are_told_once(tmp_path, caplog):
-    opened(folder(tmp_path, frame={"mask_path": "masks/1.png"}))
-    (told,) = [record.message for record in caplog.records if "mask" in record.message]
-    assert told.startswith("1 of 10 frames")
-
-
 @pytest.mark.parametrize("place", range(5))
 def test_each_coefficient_bends_rays_as_opencv_writes_it(place):
     coefficients = [0.0] * 5
@@ -153,7 +150,7 @@ def test_each_coefficient_bends_rays_as_opencv_writes_it(place):
             x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
             y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
         )
-        bent = distorted(torch.tensor([x, y], dtype=torch.float64), tuple(coefficients))
+        bent = RadialTangential(*coefficients).distorted(torch.tensor([x, y]).double())
         assert bent.tolist() == pytest.approx(expected)
         assert bent.tolist() != pytest.approx((x, y))
 

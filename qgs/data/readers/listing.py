@@ -1,0 +1,71 @@
+"""What every reader returns, and finding image files without asking for each of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+from upath import UPath
+
+from qgs.data.frames import PhotoFrame, Size
+from qgs.data.photo_files import image_size
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+_COPY = re.compile(r"images(_\d+)?")
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The photos of a folder. file: what lists them. frames: in the order of the listing."""
+
+    file: UPath
+    frames: Sequence[PhotoFrame]
+
+
+def existing(paths: Iterable[UPath]) -> set[UPath]:
+    """Those of `paths` that exist; each folder is listed once, which object stores need."""
+    wanted = set(paths)
+    held: set[UPath] = set()
+    for folder in {path.parent for path in wanted}:
+        names = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
+        held |= {path for path in wanted if path.parent == folder and path.name in names}
+    return held
+
+
+def image_folder(folder: UPath, wanted: str | None) -> UPath:
+    """The folder of photos: `wanted`, else images, else its least reduced copy, such as images_4.
+
+    Raises FileNotFoundError when there is none.
+    """
+    if wanted is not None:
+        if not (folder / wanted).is_dir():
+            raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
+        return folder / wanted
+    copies = [item for item in folder.iterdir() if _COPY.fullmatch(item.name) and item.is_dir()]
+    if not copies:
+        raise FileNotFoundError(
+            f"{folder} has neither a folder `images` nor a scaled copy such as images_4: name the "
+            "folder of photos as `images`"
+        )
+    return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
+
+
+def with_images(frames: Sequence[PhotoFrame], folder: UPath, wanted: str) -> list[PhotoFrame]:
+    """`frames` with their photos taken from `folder`/`wanted` instead of their first folder."""
+    image_folder(folder, wanted)
+
+    def moved(frame: PhotoFrame) -> PhotoFrame:
+        parts = PurePosixPath(frame.name).parts
+        name = str(PurePosixPath(wanted, *(parts[1:] or parts)))
+        mask = folder / name if frame.mask == frame.path else frame.mask
+        return replace(frame, name=name, path=folder / name, mask=mask)
+
+    return [moved(frame) if frame.name else frame for frame in frames]
+
+
+def first_size(paths: Sequence[UPath]) -> Size | None:
+    """(H, W) of the first of `paths` that exists; None where none does."""
+    present = existing(paths)
+    return next((image_size(path) for path in paths if path in present), None)
