@@ -10,9 +10,9 @@ from torch import Tensor
 
 from published.files import GoldenFile, GoldenFileError
 from published.recording import model_tensors
-from published.weights import renamed
 from qgs.components.released import tokengs_recipe
-from qgs.composer import compose
+from qgs.composer import Recipe, resolve
+from qgs.io.published import from_published
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
@@ -30,8 +30,7 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
     for options that no recipe stands for.
     """
-    model = compose(recipe_of(golden)).eval()
-    _install(model, golden.weights())
+    model = _filled(resolve(recipe_of(golden)), golden.weights())
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
     return model_tensors(model, Views(golden.input("rgb"), cameras))
 
@@ -61,8 +60,11 @@ def _expect_agreement(golden: GoldenFile, name: str, from_options: Any) -> None:
         )
 
 
-def _install(model: QueryGaussianModel, weights: dict[str, Tensor]) -> None:
+def _filled(recipe: Recipe, weights: dict[str, Tensor]) -> QueryGaussianModel:
+    """The model of `recipe` with published weights; raises ValueError for ones that do not fit."""
+    model = recipe.build_model().eval()
     try:
-        model.load_state_dict(renamed(weights), strict=True)
+        model.load_state_dict(from_published(weights, recipe), strict=True)
     except RuntimeError as error:
         raise GoldenFileError(f"the weights do not fit the options: {error}") from error
+    return model

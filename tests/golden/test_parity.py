@@ -1,0 +1,192 @@
+"""The comparison on files of other sizes and options, and on files with something wrong."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import parity
+import pytest
+import torch
+from golden.dumped import GOLDEN, Sizes, metadata, save, write
+from published.files import read_golden
+from torch import Tensor
+
+from qgs.contracts.released import ReleasedOptionError
+
+BIGGER = {
+    "enc_embed_dim": 48, "enc_num_heads": 3, "enc_depth": 2, "dec_depth": 4, "mlp_ratio": 3,
+    "patch_size": 4, "img_size": [12, 20], "num_gs_tokens": 7, "gaussian_scale_cap": 0.2,
+}  # fmt: skip
+VARIANTS = list(
+    itertools.product(
+        ("geometric_positional", "content_only"),
+        ("learned_positional", "content_only"),
+        ("free_center", "anchor_offset", "radius_scaled_offset"),
+    )
+)
+
+
+def problems(path: Path) -> dict[str, str]:
+    return {row.name: row.problem for row in parity.rows_of(path) if row.problem}
+
+
+def changed(path: Path, change: Any, source: str = "locus_full_a") -> Path:
+    """A golden file after `change(tensors, config)`, at `path`."""
+    golden = read_golden(GOLDEN / f"{source}.safetensors")
+    change(golden.tensors, golden.config)
+    save(path, golden.tensors, golden.config)
+    return path
+
+
+@pytest.mark.parametrize("saturation", [1.0, 10.0, 300.0])
+@pytest.mark.parametrize("sizes", [(1, 1), (3, 4)], ids=str)
+def test_tokengs_of_another_size(tmp_path: Path, sizes: tuple[int, int], saturation: float) -> None:
+    config = metadata("tokengs", **BIGGER, dec_patch_size=3, gaussian_z_offset=0.5, opacity_bias=1)
+    write(tmp_path / "file", config, Sizes(*sizes, saturation))
+    assert problems(tmp_path / "file") == {}
+
+
+@pytest.mark.parametrize("saturation", [1.0, 10.0])
+@pytest.mark.parametrize("layers", [[4], [1, 3, 4], [1, 2, 3, 4]], ids=str)
+def test_locusgs_of_another_size(tmp_path: Path, layers: list[int], saturation: float) -> None:
+    config = metadata(
+        "locusgs", **BIGGER, num_gaussians_per_token=5, anchor_radius_init=0.2,
+        anchor_radius_min=0.05, anchor_supervision_layers=layers,
+    )  # fmt: skip
+    write(tmp_path / "file", config, Sizes(2, 3, saturation))
+    assert problems(tmp_path / "file") == {}
+
+
+@pytest.mark.parametrize(("cross", "own", "centers"), VARIANTS)
+@pytest.mark.parametrize("radius", ["refined", "static", "aside"])
+def test_every_combination_of_variants(
+    tmp_path: Path, cross: str, own: str, centers: str, radius: str
+) -> None:
+    config = metadata(
+        "locusgs", cross_attn_variant=cross, self_attn_variant=own, gaussian_center_variant=centers,
+        anchor_radius_refinement=radius == "refined", anchor_radius_affects_bias=radius != "aside",
+    )  # fmt: skip
+    write(tmp_path / "file", config, Sizes())
+    assert problems(tmp_path / "file") == {}
+
+
+@pytest.mark.parametrize("source", ["locus_full_a", "tokengs_a", "loss_a"])
+def test_each_altered_tensor_fails_by_name(tmp_path: Path, source: str) -> None:
+    golden = read_golden(GOLDEN / f"{source}.safetensors")
+    names = [row.name for row in parity.rows_of(GOLDEN / f"{source}.safetensors")]
+
+    def alter(tensors: dict[str, Tensor], config: dict[str, Any]) -> None:
+        for name in names:
+            finite = tensors[name].isfinite().nonzero()[-1]
+            tensors[name][tuple(finite)] += 1e-3 + 1e-3 * golden.tensors[name].abs()[tuple(finite)]
+
+    assert set(problems(changed(tmp_path / "file", alter, source))) == set(names)
+
+
+def test_infinities_and_nan_must_be_where_they_were(tmp_path: Path) -> None:
+    def alter(tensors: dict[str, Tensor], config: dict[str, Any]) -> None:
+        pixels = tensors["expected.tokengs.means2d"]
+        pixels[pixels.isinf()] *= -1
+
+    path = changed(tmp_path / "file", alter, "loss_a")
+    assert problems(path) == {"expected.tokengs.means2d": "4 of 480 beyond tolerance"}
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("locus_full_a", "tokens.3"),
+        ("locus_full_a", "expected"),
+        ("tokengs_a", "anchor_center.0"),
+        ("loss_a", "expected.tokengs.nossim.loss_lpips"),
+    ],
+)
+def test_a_tensor_without_counterpart_fails_by_name(tmp_path: Path, source: str, name: str) -> None:
+    def add(tensors: dict[str, Tensor], config: dict[str, Any]) -> None:
+        tensors[name] = torch.zeros(2)
+
+    found = problems(changed(tmp_path / "file", add, source))
+    assert found == {name: "not compared: nothing here has this name"}
+
+
+def test_a_tensor_that_the_metadata_promises_and_the_file_lacks(tmp_path: Path) -> None:
+    path = changed(tmp_path / "file", lambda tensors, config: tensors.pop("geo_bias.1"))
+    assert problems(path) == {"geo_bias.1": "listed in the metadata, missing in the file"}
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("locus_full_a", "weights.gs_anchor_xyz_raw"),
+        ("tokengs_a", "weights.enc_dec_backbone.kv_proj.bias"),
+        ("tokengs_a", "c2w"),
+        ("loss_a", "has_mask"),
+    ],
+)
+def test_a_missing_input_is_named(tmp_path: Path, source: str, name: str) -> None:
+    path = changed(tmp_path / "file", lambda tensors, config: tensors.pop(name), source)
+    with pytest.raises(ValueError, match=name.removeprefix("weights.")):
+        parity.rows_of(path)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("cross_attn_variant", "epipolar"), ("self_attn_variant", None),
+        ("gaussian_center_variant", "ray"), ("use_anchor_radius", 1),
+        ("geo_sparse_sampling_k", 8), ("time_embedding", True), ("num_dynamic_gs_tokens", 4),
+        ("token_dim", 32), ("gaussian_z_offset", "far"),
+    ],
+)  # fmt: skip
+def test_an_option_that_is_not_understood_is_named(tmp_path: Path, option: str, value: Any) -> None:
+    path = changed(tmp_path / "file", lambda _, config: config["options"].update({option: value}))
+    with pytest.raises(ValueError, match=option):
+        parity.rows_of(path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gaussian_scale_cap": 0.08}, {"anchor_radius_min": 0.5}, {"enc_depth": 2},
+        {"patch_size": 4}, {"enc_num_heads": 2}, {"anchor_radius_affects_bias": False},
+        {"anchor_radius_refinement": False}, {"gaussian_center_variant": "anchor_offset"},
+        {"self_attn_variant": "content_only"}, {"num_gaussians_per_token": 2},
+        {"num_gs_tokens": 6}, {"mlp_ratio": 2}, {"img_size": [24, 16]},
+    ],
+    ids=lambda options: next(iter(options)),
+)  # fmt: skip
+def test_a_wrong_option_does_not_pass(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = changed(tmp_path / "file", lambda _, config: config["options"].update(options))
+    assert parity.report(path) is False
+
+
+def test_unreadable_files_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = (GOLDEN / "loss_a.safetensors").read_bytes()
+    (tmp_path / "truncated").write_bytes(whole[:5000])
+    save(tmp_path / "nothing", {"rgb": torch.zeros(1)}, {"kind": "nerf"})
+    for name, reason in [
+        ("truncated", "not a readable safetensors file"),
+        ("absent", "not a readable safetensors file"),
+        ("nothing", "the kind of model is 'nerf'; known are tokengs, locusgs"),
+    ]:
+        assert parity.report(tmp_path / name) is False
+        assert reason in capsys.readouterr().out
+
+
+def test_exit_status_counts_all_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = str(GOLDEN / "tokengs_a.safetensors")
+    monkeypatch.setattr("sys.argv", ["parity.py", good])
+    assert parity.main() == 0
+    monkeypatch.setattr("sys.argv", ["parity.py", str(tmp_path / "absent"), good])
+    assert parity.main() == 1
+    assert "1 of 2 files pass" in capsys.readouterr().out
+
+
+def test_a_file_without_options_is_refused(tmp_path: Path) -> None:
+    path = changed(tmp_path / "file", lambda _, config: config.pop("options"))
+    with pytest.raises(ReleasedOptionError, match="enc_embed_dim is missing"):
+        parity.rows_of(path)
