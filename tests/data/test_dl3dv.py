@@ -1,0 +1,259 @@
+import io
+import json
+import pickle  # noqa: TID251  as multiprocessing does
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from upath import UPath
+
+from qgs.data import archives
+from qgs.data.archives import ArchivePath
+from qgs.data.dl3dv import Dl3dvSource
+from qgs.data.images import CropResize
+from qgs.data.scene_lists import read_scene_list
+
+LENS = {"camera_model": "OPENCV", "k1": -0.5, "k2": 0.01, "p1": 1e-3, "p2": -2e-3}
+
+
+def photo(number: int, size=(32, 18)) -> bytes:
+    """A PNG whose red channel is 10 times its number, with a blue gradient."""
+    pixels = np.zeros((size[1], size[0], 3), np.uint8)
+    pixels[..., 0] = 10 * number
+    pixels[..., 2] = np.linspace(0, 255, size[0])
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def listing(frames: int = 4, **top) -> str:
+    poses = []
+    for i in range(frames):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        poses.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    given = {"w": 128, "h": 72, "fl_x": 100.0, "fl_y": 101.0, "cx": 60.0, "cy": 37.0}
+    return json.dumps({**given, **top, "frames": poses})
+
+
+def scene_files(inside: str = "", images: str = "images_4", **top) -> dict[str, bytes]:
+    files = {f"{inside}{images}/{i}.png": photo(i) for i in range(4)}
+    return {f"{inside}transforms.json": listing(**top).encode(), **files}
+
+
+def archive(path, files: dict[str, bytes]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file, zipfile.ZipFile(file, "w") as zipped:
+        for name, data in files.items():
+            zipped.writestr(name, data)
+
+
+def folder(path, files: dict[str, bytes]) -> None:
+    for name, data in files.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(data)
+
+
+def opened(path, **options) -> Dl3dvSource:
+    return Dl3dvSource(Dl3dvSource.Config(path=str(path), **{"image_size": (9, 16), **options}))
+
+
+LAYOUTS = {
+    "archive": lambda path: archive(path / "1K" / "abc.zip", scene_files("abc/")),
+    "flat archive": lambda path: archive(path / "abc.zip", scene_files()),
+    "folder": lambda path: folder(path / "2K" / "abc", scene_files()),
+    "benchmark": lambda path: folder(path / "abc", scene_files("gaussian_splat/")),
+    "archived benchmark": lambda path: archive(
+        path / "abc.zip", scene_files("abc/gaussian_splat/")
+    ),
+    "full size": lambda path: folder(path / "abc", scene_files(images="images")),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("url", ["{}", "file://{}", "memory://dl3dv{}"])
+def test_layouts_read_alike(tmp_path, layout, url):
+    root = UPath(url.format(tmp_path / layout.replace(" ", "_")))
+    LAYOUTS[layout](root)
+    (scene,) = opened(root).scenes("train")
+    assert scene.name == "abc"
+    assert len(scene) == 4
+    opengl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    opengl[0, 3] = 2
+    assert torch.equal(scene.cameras.c2w[2], opengl)
+    # an eighth of the listed 128 x 72, whatever the size of the photos
+    assert scene.cameras.intrinsics[0].tolist() == pytest.approx([12.5, 12.625, 7.5, 4.625])
+    assert scene.images([3, 1])[:, 0, 4, 4].mul(255).round().tolist() == [30, 10]
+
+
+def test_reduced_photos_are_chosen(tmp_path):
+    files = {**scene_files(images="images_8"), **scene_files(images="images_4")}
+    folder(tmp_path / "abc", {**files, "images_8/0.png": photo(9, (16, 9))})
+    image = opened(tmp_path, images="images_8").scenes("train")[0].images([0])
+    assert image[0, 0, 0, 0] * 255 == pytest.approx(90)
+    assert opened(tmp_path).scenes("train")[0].images([0])[0, 0, 0, 0] == 0
+    with pytest.raises(FileNotFoundError, match="images_2"):
+        opened(tmp_path, images="images_2").scenes("train")[0]
+
+
+def test_distortion_is_undone(tmp_path):
+    folder(tmp_path / "abc", scene_files(**LENS))
+    folder(tmp_path / "pinhole", scene_files())
+    bent, straight = opened(tmp_path).scenes("train")
+    assert torch.equal(bent.cameras.intrinsics, straight.cameras.intrinsics)
+    difference = (bent.images([0]) - straight.images([0]))[0, 2].abs()
+    assert difference[3:6, 7:9].max() < 0.01 < difference[:, 13].min()
+
+
+def test_photos_of_another_aspect_are_refused(tmp_path):
+    files = scene_files()
+    files["images_4/0.png"] = photo(0, (18, 32))
+    folder(tmp_path / "abc", files)
+    with pytest.raises(ValueError, match=r"0\.png.*swapped"):
+        opened(tmp_path).scenes("train")[0].cameras  # noqa: B018
+
+
+def test_missing_photos_are_counted_and_named(tmp_path, caplog):
+    files = scene_files("abc/")
+    del files["abc/images_4/2.png"]
+    archive(tmp_path / "abc.zip", files)
+    assert len(opened(tmp_path).scenes("train")[0]) == 3
+    assert "1 of 4 images" in caplog.text
+    assert "abc.zip/abc/images_4/2.png" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["../a.png", "/etc/passwd", "abc/../../a", "C:\\a", "..\\a"])
+def test_archives_that_lead_outside_are_refused_by_name(tmp_path, name):
+    archive(tmp_path / "abc.zip", {**scene_files("abc/"), name: b""})
+    told = name.replace("\\", "/") if name.startswith("..\\") else name
+    with pytest.raises(ValueError, match="leads outside the archive") as error:
+        opened(tmp_path).scenes("train")[0]
+    assert "abc.zip" in str(error.value)
+    assert repr(name) in str(error.value) or repr(told) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"abc/images_4/0.png": b""}, r"abc\.zip holds no transforms\.json"),
+        ({**scene_files("a/"), **scene_files("b/")}, "holds 2 scenes, a and b"),
+        ({"abc/transforms.json": b"{"}, r"abc\.zip/abc/transforms\.json is not valid JSON"),
+        ({"abc/transforms.json": listing().encode()}, "4 images, of which 0 exist"),
+    ],
+)
+def test_incomplete_archives_are_told(tmp_path, files, message):
+    archive(tmp_path / "abc.zip", files)
+    with pytest.raises((ValueError, OSError), match=message):
+        opened(tmp_path).scenes("train")[0]
+
+
+def test_broken_archives_are_told(tmp_path):
+    (tmp_path / "abc.zip").write_bytes(b"PK nothing")
+    source = opened(tmp_path)  # listed without being opened
+    with pytest.raises(ValueError, match=r"abc\.zip is no zip archive or is cut off"):
+        source.scenes("train")[0]
+
+
+def test_a_damaged_photo_names_archive_and_file(tmp_path):
+    archive(tmp_path / "abc.zip", scene_files("abc/"))
+    data = bytearray((tmp_path / "abc.zip").read_bytes())
+    data[data.index(photo(1)) + 60] ^= 255
+    (tmp_path / "abc.zip").write_bytes(data)
+    scene = opened(tmp_path).scenes("train")[0]
+    with pytest.raises(ValueError, match=r"abc\.zip/abc/images_4/1\.png cannot be read"):
+        scene.images([1])
+
+
+def several(path, count: int = 4) -> None:
+    for i in range(count):
+        archive(path / "1K" / f"s{i}.zip", scene_files(f"s{i}/"))
+
+
+def test_test_scenes(tmp_path, caplog):
+    several(tmp_path)
+    everything = opened(tmp_path)
+    assert [scene.name for scene in everything.scenes("train")] == ["s0", "s1", "s2", "s3"]
+    assert len(everything.scenes("test")) == 0
+    index = tmp_path / "index.json"
+    index.write_text(json.dumps({"s2": None, "gone": None, "s0": None}))
+    source = opened(tmp_path, test_scenes=str(index))
+    assert [scene.name for scene in source.scenes("train")] == ["s1", "s3"]
+    assert [scene.name for scene in source.scenes("test")] == ["s2", "s0"]
+    assert source.absent == ["gone"]
+    assert "1 of 3 test scenes are not there: gone" in caplog.text
+    held_out = opened(tmp_path, holdout=3, max_scenes=2)
+    assert [scene.held_out for scene in held_out.scenes("test")] == [(1,), (1,)]
+
+
+def test_lists_of_scenes(tmp_path):
+    file = UPath(tmp_path / "list.txt")
+    file.write_text("# benchmark\ns1\n\ns2  # hard\ns1\n")
+    assert read_scene_list(file) == ["s1", "s2"]
+    (tmp_path / "list.json").write_text('["s3"]')
+    assert read_scene_list(UPath(tmp_path / "list.json")) == ["s3"]
+    (tmp_path / "list.json").write_text("3")
+    with pytest.raises(ValueError, match="must be a mapping whose keys are scenes"):
+        read_scene_list(UPath(tmp_path / "list.json"))
+    file.write_text("# none\n")
+    with pytest.raises(ValueError, match="names no scene"):
+        read_scene_list(file)
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        read_scene_list(file.with_name("gone.txt"))
+
+
+def test_a_scene_that_is_there_twice_is_told(tmp_path, caplog):
+    several(tmp_path, 1)
+    folder(tmp_path / "1K" / "s0", scene_files())
+    assert len(opened(tmp_path).scenes("train")) == 1
+    assert "1 scenes of" in caplog.text
+    assert f"s0 ({tmp_path / '1K' / 's0'})" in caplog.text
+
+
+def test_folders_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        opened(tmp_path / "nothing")
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(FileNotFoundError, match=r"no scenes of DL3DV.*found a\.txt"):
+        opened(tmp_path)
+
+
+def test_scenes_travel_to_other_processes_without_open_archives(tmp_path):
+    several(tmp_path)
+    source = opened(tmp_path)
+    scene = source.scenes("train")[0]
+    copy = pickle.loads(pickle.dumps(scene))  # noqa: S301
+    assert torch.equal(copy.images([1]), scene.images([1]))
+    assert len(pickle.loads(pickle.dumps(source)).scenes("train")) == 4  # noqa: S301
+
+
+def test_threads_share_a_bounded_number_of_open_archives(tmp_path, monkeypatch):
+    several(tmp_path, 4)
+    pool = archives._Pool(2)
+    monkeypatch.setattr(archives, "_pool", pool)
+    scenes = opened(tmp_path).scenes("train")
+    with ThreadPoolExecutor(4) as threads:
+        red = list(threads.map(lambda k: scenes[k % 4].images([k % 3])[0, 0, 0, 0], range(24)))
+    assert red == pytest.approx([10 * (k % 3) / 255 for k in range(24)])
+    assert len(pool._open) == 2
+
+
+def test_paths_inside_archives(tmp_path):
+    archive(tmp_path / "a.zip", {"top/x.txt": b"hello", "top/sub/y.txt": b""})
+    top = ArchivePath(UPath(tmp_path / "a.zip")) / "top"
+    assert [item.name for item in top.iterdir()] == ["sub", "x.txt"]
+    assert (top / "x.txt").read_text() == "hello"
+    assert (top / "x.txt").parent == top
+    assert (top / "sub").is_dir()
+    assert not (top / "sub").is_file()
+    assert str(top / "x.txt") == f"{tmp_path}/a.zip/top/x.txt"
+    with pytest.raises(FileNotFoundError, match=r"no file top/z\.txt"):
+        (top / "z.txt").read_bytes()
+
+
+def test_crops_of_photos_and_listing_agree():
+    small, large = CropResize((18, 32), (8, 8)), CropResize((72, 128), (8, 8))
+    camera = torch.tensor([100.0, 101, 60, 37])
+    assert torch.allclose(small.intrinsics(camera / 4), large.intrinsics(camera))
