@@ -62,11 +62,15 @@ def _conclude(result: TrainingResult, recipe: Recipe, console: Console) -> None:
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """`recipe` with an absolute `data.path`, so that its run can be judged from any folder."""
+    """`recipe` with an absolute `data.path`, so that its run can be judged from any folder.
+
+    A URL stays as it is.
+    """
     from qgs.composer import resolve
 
     data = recipe.tree.get("data", {})
-    if data.get("type") != "qgs/photos":
+    path = data.get("path")
+    if not isinstance(path, str) or "://" in path:
         return recipe
-    path = str(Path(data["path"]).expanduser().resolve())
-    return resolve({**recipe.tree, "data": {**data, "path": path}})
+    absolute = str(Path(path).expanduser().resolve())
+    return resolve({**recipe.tree, "data": {**data, "path": absolute}})
