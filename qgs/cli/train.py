@@ -62,15 +62,17 @@ def _conclude(result: TrainingResult, recipe: Recipe, console: Console) -> None:
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """`recipe` with an absolute `data.path`, so that its run can be judged from any folder.
-
-    A URL stays as it is.
-    """
+    """`recipe` with absolute paths in its data, so that its run can be judged from any folder."""
     from qgs.composer import resolve
+    from qgs.data.paths import is_local, opened_path
+
+    def absolute(path: str) -> str:
+        opened = opened_path(path)
+        return str(opened.resolve()) if is_local(opened) else path
 
     data = recipe.tree.get("data", {})
-    path = data.get("path")
-    if not isinstance(path, str) or "://" in path:
+    given = {key: data.get(key) for key in ("path", "test_scenes")}
+    paths = {key: absolute(path) for key, path in given.items() if isinstance(path, str)}
+    if not paths or not data["type"].startswith("qgs/"):
         return recipe
-    absolute = str(Path(path).expanduser().resolve())
-    return resolve({**recipe.tree, "data": {**data, "path": absolute}})
+    return resolve({**recipe.tree, "data": {**data, **paths}})
