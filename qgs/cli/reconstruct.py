@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.data.photos import PhotosConfig
+    from qgs.contracts import Scene
+    from qgs.data.photos import PhotosConfig, PhotosSource
 
 
 def register(app: typer.Typer) -> None:
@@ -23,7 +24,9 @@ def register(app: typer.Typer) -> None:
 
 def reconstruct(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint file, or the run folder.")],
-    photos: Annotated[Path, typer.Argument(help="Folder with a transforms.json.")],
+    photos: Annotated[
+        str, typer.Argument(help="Folder of one scene's photos and their cameras, or its URL.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
     inputs: Annotated[
         int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
@@ -64,7 +67,7 @@ def reconstruct(
     file = checkpoint_of(checkpoint)
     device = choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
-    (scene,) = PhotosSource(photos_config(recipe, photos)).scenes("test")
+    scene = only_scene(PhotosSource(photos_config(recipe, photos)), photos)
     seen = training_frames(scene) if was_trained_on(recipe, photos) else ()
     wanted = inputs or recipe.views.inputs
     span = recipe.views.gap[1] + 1
@@ -79,7 +82,15 @@ def reconstruct(
         console.print(f"wrote {path}", soft_wrap=True)
 
 
-def photos_config(recipe: Recipe, photos: Path) -> PhotosConfig:
+def only_scene(source: PhotosSource, photos: str) -> Scene:
+    """The scene of `source`. Raises ValueError when there are several."""
+    scenes = source.scenes("test")
+    if len(scenes) > 1:
+        raise ValueError(f"{photos} holds {len(scenes)} scenes: give the folder of one of them")
+    return scenes[0]
+
+
+def photos_config(recipe: Recipe, photos: str) -> PhotosConfig:
     """How to read `photos` for a model of `recipe`: at the image size that it was trained on.
 
     Held-out frames are kept when it was trained on these very photos.
@@ -94,21 +105,24 @@ def photos_config(recipe: Recipe, photos: Path) -> PhotosConfig:
     assert isinstance(trained, SceneSourceConfig)
     if was_trained_on(recipe, photos):
         assert isinstance(trained, PhotosConfig)
-        return trained.model_copy(update={"path": str(photos)})
+        return trained.model_copy(update={"path": photos})
     if isinstance(trained, PhotosConfig):
-        every = {"path": str(photos), "holdout": 0, "max_frames": 0}
-        return trained.model_copy(update=every)
-    return PhotosConfig(path=str(photos), image_size=trained.image_size, holdout=0)
+        return PhotosConfig(
+            path=photos, image_size=trained.image_size, background=trained.background, holdout=0
+        )
+    return PhotosConfig(path=photos, image_size=trained.image_size, holdout=0)
 
 
-def was_trained_on(recipe: Recipe, photos: Path) -> bool:
-    """Whether the data of `recipe` is the folder `photos`."""
+def was_trained_on(recipe: Recipe, photos: str) -> bool:
+    """Whether the data of `recipe` is the folder `photos`, or has it as a scene to train on."""
+    from qgs.data.paths import opened_path
     from qgs.data.photos import PhotosConfig
 
     data = recipe.parts["data",].config if ("data",) in recipe.parts else None
     if not isinstance(data, PhotosConfig):
         return False
-    return Path(data.path).expanduser().resolve() == photos.expanduser().resolve()
+    root, folder = opened_path(data.path).resolve(), opened_path(photos).resolve()
+    return folder in (root, root / folder.name, root / "train" / folder.name)
 
 
 def check_out(out: Path, overwrite: bool) -> None:
