@@ -1,7 +1,8 @@
-"""`qgs eval`."""
+"""`qgs eval`: judge a checkpoint, or compare what was judged."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,17 +24,55 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="Run folder or checkpoint file.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...", help="Run folder or checkpoint file; with --compare several results."
+        ),
+    ],
     overrides: Overrides = None,
+    index: Annotated[
+        str | None,
+        typer.Option(help="JSON file of scenes and frames; short for --set evaluation.index=..."),
+    ] = None,
+    tune: Annotated[
+        int | None,
+        typer.Option(min=0, help="Steps of token tuning on the input views of each scene."),
+    ] = None,
+    batch: Annotated[
+        int, typer.Option(min=1, help="Scenes that pass through the model together.")
+    ] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; default: RUN/evaluation, with --set the next RUN/evaluation-N."),
+        typer.Option(
+            help="Folder; default: RUN/evaluation, with other settings the next RUN/evaluation-N."
+        ),
     ] = None,
+    compare: Annotated[
+        bool,
+        typer.Option("--compare", help="Compare the first RUN's results with those of the others."),
+    ] = False,
+    across_protocols: Annotated[
+        bool,
+        typer.Option("--across-protocols", help="Compare results of different protocols."),
+    ] = False,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour."""
+    """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour.
+
+    With --compare RUN RUN... nothing is evaluated: results in run folders are compared scene by
+    scene.
+    """
     from rich.console import Console
+
+    settings = [*(overrides or ()), *_short_forms(index, tune)]
+    if compare:
+        _refuse_settings(settings)
+        compare_results(runs, across_protocols, out, Console())
+        return
+    if len(runs) > 1 or across_protocols:
+        raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
     from qgs.composer import resolve
     from qgs.engine.device import choose_device
@@ -41,15 +80,15 @@ def evaluate(
     from qgs.io.checkpoint import load, load_extra, load_recipe
 
     use_threads(threads)
-    _refuse_other_sections(overrides or ())
-    checkpoint = checkpoint_of(run)
+    _refuse_other_sections(settings)
+    checkpoint = checkpoint_of(runs[0])
     recipe = load_recipe(checkpoint)
-    if overrides:
-        recipe = resolve(recipe.tree, overrides)
+    if settings:
+        recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
-    folder = out or evaluation_folder(checkpoint.parent, bool(overrides))
+    folder = out or evaluation_folder(checkpoint.parent, bool(settings))
     step = load_extra(checkpoint).get("step")
-    evaluate_into(model, recipe, None if step is None else int(step), folder, Console())
+    evaluate_into(model, recipe, None if step is None else int(step), folder, Console(), batch)
 
 
 def evaluation_folder(run: Path, other: bool) -> Path:
@@ -62,18 +101,69 @@ def evaluation_folder(run: Path, other: bool) -> Path:
 
 
 def evaluate_into(
-    model: QueryGaussianModel, recipe: Recipe, step: int | None, folder: Path, console: Console
+    model: QueryGaussianModel,
+    recipe: Recipe,
+    step: int | None,
+    folder: Path,
+    console: Console,
+    batch: int = 1,
 ) -> None:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
+    from rich.progress import Progress
+
     from qgs import engine
 
-    evaluation = engine.evaluate(model, recipe, step)
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("judging scenes", total=None)
+
+        def observe(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        evaluation = engine.evaluate(model, recipe, step, batch, observe)
     evaluation.write(folder)
     evaluation.show(console)
-    console.print(f"written to {folder}")
+    console.print(f"written to {folder}", soft_wrap=True)
 
 
-def _refuse_other_sections(overrides: list[str] | tuple[str, ...]) -> None:
+def compare_results(
+    runs: Sequence[Path], across_protocols: bool, out: Path | None, console: Console
+) -> None:
+    """Compare the results in the first folder with those in each of the others.
+
+    out: folder for comparison.json and comparison.md; None writes nothing.
+    """
+    from qgs.engine.comparison import Comparisons
+    from qgs.engine.stored import read_results
+
+    results = [read_results(run) for run in runs]
+    comparisons = Comparisons.of(results, across_protocols)
+    comparisons.show(console)
+    if out is None:
+        console.print("add --out FOLDER to keep this as JSON and Markdown")
+        return
+    comparisons.write(out)
+    console.print(f"written to {out}", soft_wrap=True)
+
+
+def _short_forms(index: str | None, tune: int | None) -> list[str]:
+    settings = [] if index is None else [f"evaluation.index={_quoted(index)}"]
+    return settings if tune is None else [*settings, f"evaluation.tuning_steps={tune}"]
+
+
+def _quoted(text: str) -> str:
+    """A YAML string, whatever is in it."""
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _refuse_settings(settings: Sequence[str]) -> None:
+    if settings:
+        raise ValueError(
+            f"--compare reads results and evaluates nothing, so {settings[0]} has no effect; "
+            "evaluate each run with these settings first"
+        )
+
+
+def _refuse_other_sections(overrides: Sequence[str]) -> None:
     from qgs.engine.evaluation import SECTIONS
 
     for override in overrides:

@@ -57,7 +57,7 @@ class EvaluationPlan:
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
         names = [scene.name for scene in self._scenes]
-        self._places = {name: place for place, name in reversed(list(enumerate(names)))}
+        self._places = {name: place for place, name in enumerate(names)}
         self._count = Counter(names)
         self.wanted: tuple[str, ...] = tuple(dict.fromkeys(names[: evaluation.scenes]))
         self.null: tuple[str, ...] = ()

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -67,6 +68,7 @@ def evaluate(
         judge = _Judge.of(model, recipe)
         outcomes = _observed(judge.judged(plan.samples(), batch), plan.wanted, observe)
         scores, missing = _by_scene(plan.wanted, outcomes)
+        missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
     finally:
         model.train(training)
     if not scores:
@@ -249,6 +251,15 @@ def _held_out(scenes: Sequence[Scene], scores: Sequence[SceneScore]) -> tuple[in
     held = [(scene.name, set(scene.held_out)) for scene in scenes if scene.name in judged]
     total = sum(len(frames) for _, frames in held)
     return (sum(len(judged[name] & frames) for name, frames in held), total) if total else None
+
+
+def _without_folder(reason: str, recipe: Recipe) -> str:
+    """`reason` with files told below the data's folder, so that results do not depend on it."""
+    path = recipe.tree["data"].get("path")
+    folders = [path, str(Path(path).expanduser().resolve())] if isinstance(path, str) else []
+    for folder in folders:
+        reason = reason.replace(folder.rstrip("/") + "/", "")
+    return reason
 
 
 def _shapes(sample: Sample) -> tuple[torch.Size, torch.Size]:

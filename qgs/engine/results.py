@@ -45,7 +45,7 @@ def show(evaluation: Evaluation, console: Console) -> None:
         table.add_row(*row)
     console.print(table)
     for line in (*notes(evaluation), _about_dispersion(evaluation)):
-        console.print(escape(line), highlight=False)
+        console.print(escape(line), highlight=False, soft_wrap=True)
 
 
 def statement(evaluation: Evaluation) -> str:
@@ -115,12 +115,12 @@ def notes(evaluation: Evaluation) -> list[str]:
     lines += [f"missing {f.scene}: {f.reason}" for f in evaluation.missing[:_NAMED]]
     if len(evaluation.missing) > _NAMED:
         lines.append(f"{len(evaluation.missing) - _NAMED} more missing scenes are in scenes.csv")
-    for count, names, what in (
-        (len(evaluation.null), evaluation.null, "null entries of the index"),
-        (len(evaluation.unlisted), evaluation.unlisted, "scenes of the data not in the index"),
+    for names, what in (
+        (evaluation.null, "null entries of the index"),
+        (evaluation.unlisted, "scenes of the data that the index lacks"),
     ):
-        if count:
-            lines.append(f"{count} {what}, not judged: {listed(names)}")
+        if names:
+            lines.append(f"{what}, not judged ({len(names)}): {listed(names)}")
     lines += [f"{HEADERS[m].split()[0]} is empty: {why}" for m, why in evaluation.empty.items()]
     if evaluation.held_out:
         lines.append("judged on {} of {} held-out frames".format(*evaluation.held_out))

@@ -95,8 +95,8 @@ def load_lpips(weights: str | None = None) -> Lpips:
     vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE
     if not vgg.is_file():
         raise LpipsUnavailableError(
-            f"there are no VGG-16 weights at {vgg if weights else f'torch hub cache/{VGG_FILE}'}: "
-            f"download {VGG_FILE} of torchvision and name it in evaluation.lpips_weights"
+            f"there are no VGG-16 weights {f'at {vgg.name}' if weights else 'in the torch hub cache'}:"
+            f" download torchvision's {VGG_FILE} and name it in evaluation.lpips_weights"
         )
     try:
         return Lpips(_read(vgg), _read(linear)).eval()
