@@ -44,6 +44,26 @@ BACKBONE_RENAMES = (
 )
 """What TokenGS and its descendants name alike."""
 
+LEGIBLE = (
+    "model.width",
+    "model.heads",
+    "model.encoder.type",
+    "model.encoder.patch_size",
+    "model.encoder.depth",
+    "model.encoder.mlp_ratio",
+    "model.queries.type",
+    "model.queries.count",
+    "model.decoder.depth",
+    "model.decoder.cross_attention.type",
+    "model.decoder.self_attention.type",
+    "model.decoder.feed_forward.type",
+    "model.decoder.feed_forward.ratio",
+    "model.decoder.refinement.type",
+    "model.head.type",
+    "model.head.gaussians_per_query",
+)
+"""Options that names and shapes of their parameters tell."""
+
 
 def backbone(shapes: Shapes) -> dict[str, Any]:
     """The `model` section as far as TokenGS and its descendants share it; raises LayoutError."""
@@ -112,6 +132,7 @@ TOKENGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
     read=_read,
+    legible=LEGIBLE,
     undecided=(
         "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
         "supervised layers: the last",

@@ -54,6 +54,7 @@ class WeightLayout:
     marks: published names that files of this layout have and files of others lack.
     read: names and shapes of a whole state dict to the recipe that fits, a plain mapping with
         `recipe: 1`; raises LayoutError. What shapes leave open is as in the published model.
+    legible: dotted paths of the options that `read` takes from names and shapes.
     undecided: what shapes leave open, in words, with the choice that `read` makes.
     """
 
@@ -63,6 +64,7 @@ class WeightLayout:
     renames: tuple[Rename, ...]
     marks: tuple[str, ...]
     read: Callable[[Shapes], dict[str, Any]]
+    legible: tuple[str, ...]
     unused: tuple[Unused, ...] = ()
     undecided: tuple[str, ...] = ()
 

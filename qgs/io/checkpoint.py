@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -48,20 +49,33 @@ def save(
         raise ValueError(
             "this model was built by hand and has no recipe to save; build it with qgs.compose"
         )
-    metadata = {
-        _RECIPE: json.dumps(model.recipe),
-        _PLUGINS: json.dumps(dict(resolve(model.recipe).plugin_versions)),
-        _CONTRACT: str(CONTRACT_VERSION),
-        _FORMAT: str(FORMAT_VERSION),
-        _VERSION: qgs.__version__,
-        **{_EXTRA + key: value for key, value in (extra or {}).items()},
-    }
     tensors = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, tensor in (weights or unique_tensors(model)).items()
     }
+    write_checkpoint(path, tensors, model.recipe, extra or {})
+
+
+def write_checkpoint(
+    path: str | os.PathLike[str],
+    tensors: Mapping[str, Tensor],
+    tree: Mapping[str, Any],
+    extra: Mapping[str, str],
+) -> None:
+    """Write a checkpoint from its parts, as `save` does, without copying a tensor.
+
+    tensors: on the CPU, contiguous, named as by `unique_tensors`. tree: the resolved recipe.
+    """
+    metadata = {
+        _RECIPE: json.dumps(tree),
+        _PLUGINS: json.dumps(dict(resolve(tree).plugin_versions)),
+        _CONTRACT: str(CONTRACT_VERSION),
+        _FORMAT: str(FORMAT_VERSION),
+        _VERSION: qgs.__version__,
+        **{_EXTRA + key: value for key, value in extra.items()},
+    }
     with replacing(path) as temporary:
-        save_file(tensors, temporary, metadata)
+        save_file(dict(tensors), temporary, metadata)
 
 
 def load(

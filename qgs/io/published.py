@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 from torch import Tensor
 
@@ -13,8 +12,6 @@ from qgs.composer.registry import load_registry
 from qgs.contracts import LayoutError, WeightLayout
 from qgs.contracts.layout import Shapes
 from qgs.io.checkpoint import unique_tensors
-
-T = TypeVar("T")
 
 
 class PublishedError(ValueError):
@@ -34,10 +31,17 @@ class Names:
     unnamed: tuple[str, ...]
     unused: tuple[str, ...]
 
-    @property
-    def ours(self) -> dict[str, str]:
-        """Published name to ours."""
-        return {theirs: ours for ours, theirs in self.published.items()}
+    def mismatches(self, shapes: Shapes) -> list[str]:
+        """What stands against taking a published state dict of these `shapes`, line by line."""
+        found = [f"no published name: {name}" for name in self.unnamed]
+        found += [f"missing: {name}" for name in self.published.values() if name not in shapes]
+        known = {*self.published.values(), *self.unused}
+        found += [f"unexpected: {name}" for name in shapes if name not in known]
+        return found + [
+            f"shape of {theirs}: {shapes[theirs]} in the file, {self.shapes[ours]} in the recipe"
+            for ours, theirs in self.published.items()
+            if theirs in shapes and shapes[theirs] != self.shapes[ours]
+        ]
 
 
 def layouts_of(recipe: Recipe) -> list[WeightLayout]:
@@ -93,26 +97,22 @@ def names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     return Names(shapes, published, unnamed, tuple(unused))
 
 
-def from_published(weights: Mapping[str, T], recipe: Recipe) -> dict[str, T]:
+def from_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
     """A published state dict under our names, what the codebase never uses left out.
 
-    Raises PublishedError that lists every name that is missing or unexpected. Shapes and values are
-    not looked at.
+    Raises PublishedError that lists every name that is missing or unexpected, and every shape that
+    is another one.
     """
     names = names_in(recipe, layout_of(recipe))
-    problems = [f"no published name: {name}" for name in names.unnamed]
-    problems += [f"missing: {name}" for name in names.published.values() if name not in weights]
-    known = {*names.published.values(), *names.unused}
-    problems += [f"unexpected: {name}" for name in weights if name not in known]
-    if problems:
+    found = names.mismatches(shapes_of(weights))
+    if found:
         raise PublishedError(
-            f"the weights do not fit the recipe, {len(problems)} differences:\n  "
-            + "\n  ".join(problems)
+            f"the weights do not fit the recipe, {len(found)} differences:\n  " + "\n  ".join(found)
         )
     return {ours: weights[theirs] for ours, theirs in names.published.items()}
 
 
-def to_published(weights: Mapping[str, T], recipe: Recipe) -> dict[str, T]:
+def to_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
     """Weights under our names, as `unique_tensors` has them, under their published names.
 
     The inverse of `from_published`. Raises PublishedError for a model that no layout can hold.

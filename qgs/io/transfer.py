@@ -1,0 +1,201 @@
+"""Published weights in and out of checkpoints, every tensor accounted for."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from qgs.composer import Recipe, resolve
+from qgs.composer.show import flat
+from qgs.contracts import WeightLayout
+from qgs.io.atomic import replacing, write_text
+from qgs.io.checkpoint import CheckpointError, load_recipe, write_checkpoint
+from qgs.io.fitting import advice, fitting_recipe, recipe_text
+from qgs.io.published import (
+    Names,
+    PublishedError,
+    exact_layout_of,
+    layout_of,
+    names_in,
+    shapes_of,
+)
+from qgs.io.weight_file import WeightFile, read_weight_file
+
+LISTED = 8
+"""Tensors that a message about values names; names and shapes that differ are all listed."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What `import_weights` did.
+
+    used: parameters installed. dropped: published names that nothing reads. notes: what was made of
+    the file. recipe_file: the recipe that was written, if one was.
+    """
+
+    layout: WeightLayout
+    recipe: Recipe
+    used: int
+    dropped: tuple[str, ...]
+    notes: tuple[str, ...]
+    recipe_file: Path | None
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What `export_weights` did.
+
+    absent: parameters that the codebase stores, never reads, and finds missing in the file.
+    settings: options that the file cannot carry and in which the model differs from the published
+    one, as `path: value (published value)`.
+    """
+
+    layout: WeightLayout
+    written: int
+    absent: tuple[str, ...]
+    settings: tuple[str, ...]
+
+
+def import_weights(
+    weights: str | Path, recipe: Recipe | None, out: str | Path, *, to_float32: bool = False
+) -> Imported:
+    """Write a checkpoint of `recipe` with published weights.
+
+    recipe: None for the one that fits, which is then also written beside `out`, as .yaml.
+    to_float32: convert weights of other floating-point types instead of refusing them.
+    Raises FileNotFoundError, FileExistsError, WeightFileError and PublishedError; nothing is
+    written then.
+    """
+    out = Path(out)
+    recipe_file = out.with_suffix(".yaml") if recipe is None else None
+    for target in filter(None, (out, recipe_file)):
+        refuse_taken(target)
+    file = read_weight_file(weights)
+    text = ""
+    if recipe is None:
+        layout, tree = fitting_recipe(shapes_of(file.tensors), str(weights))
+        text = recipe_text(tree, layout, Path(weights).name)
+        recipe = resolve(tree)
+    layout, names = _fitting_names(file, recipe)
+    tensors = {ours: file.tensors[theirs] for ours, theirs in names.published.items()}
+    tensors, converted = _as_float32(tensors, names, file.path, to_float32)
+    _refuse_nonfinite(tensors, names, file.path)
+    origin = {"imported": f"{layout.name} weights {file.path.name}"}
+    write_checkpoint(out, tensors, recipe.tree, origin)
+    if recipe_file:
+        write_text(recipe_file, text)
+    dropped = tuple(name for name in names.unused if name in file.tensors)
+    return Imported(layout, recipe, len(tensors), dropped, (*file.notes, *converted), recipe_file)
+
+
+def export_weights(checkpoint: str | Path, out: str | Path) -> Exported:
+    """Write the weights of a checkpoint under their published names.
+
+    out: a new .safetensors file. Raises FileNotFoundError, FileExistsError, CheckpointError,
+    ValueError for another suffix, and PublishedError for a model that no published layout can hold;
+    nothing is written then.
+    """
+    out = Path(out)
+    if out.suffix.lower() != ".safetensors":
+        raise ValueError(f"{out}: weights are written as safetensors; name it .safetensors")
+    refuse_taken(out)
+    recipe = load_recipe(checkpoint)
+    layout = exact_layout_of(recipe)
+    names = names_in(recipe, layout)
+    with safe_open(checkpoint, "pt") as file:
+        stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if shapes_of(stored) != names.shapes:
+        raise CheckpointError(f"{checkpoint} does not fit the model of its recipe; see qgs.load")
+    published = {theirs: stored[ours] for ours, theirs in names.published.items()}
+    with replacing(out) as temporary:
+        save_file(published, temporary, {"format": "pt"})
+    return Exported(layout, len(published), names.unused, _settings(recipe, layout, published))
+
+
+def refuse_taken(path: Path) -> None:
+    """Raise FileExistsError for a path at which something lies already."""
+    if path.exists():
+        raise FileExistsError(f"{path} exists and is never overwritten; choose another name")
+
+
+def _fitting_names(file: WeightFile, recipe: Recipe) -> tuple[WeightLayout, Names]:
+    """The layout and names of a recipe's model; raises PublishedError where the file differs."""
+    shapes = shapes_of(file.tensors)
+    try:
+        layout = layout_of(recipe)
+    except PublishedError as error:
+        help_ = "".join(f"\n  {line}" for line in advice(recipe, None, shapes))
+        raise PublishedError(f"{file.path} does not fit the recipe: {error}{help_}") from error
+    names = names_in(recipe, layout)
+    found = names.mismatches(shapes)
+    if found:
+        counts = Counter(line.partition(":")[0].partition(" of ")[0] for line in found)
+        told = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        lines = [*advice(recipe, layout, shapes), f"the differences ({told}):"]
+        lines += [f"  {line}" for line in found]
+        raise PublishedError(
+            f"{file.path} does not fit the recipe, whose model is a {layout.name}; nothing is "
+            "written" + "".join(f"\n  {line}" for line in lines)
+        )
+    return layout, names
+
+
+def _as_float32(
+    tensors: Mapping[str, Tensor], names: Names, path: Path, allowed: bool
+) -> tuple[dict[str, Tensor], list[str]]:
+    """Contiguous float32 tensors, and what was converted."""
+    others = {name: t.dtype for name, t in tensors.items() if t.dtype != torch.float32}
+    kinds = Counter(str(dtype).removeprefix("torch.") for dtype in others.values())
+    told = ", ".join(f"{count} of {len(tensors)} are {kind}" for kind, count in kinds.items())
+    strange = [name for name, dtype in others.items() if not dtype.is_floating_point]
+    if strange:
+        listed = _listed(names.published[name] for name in strange)
+        raise PublishedError(f"{path} holds weights that are no real numbers: {listed} ({told})")
+    if others and not allowed:
+        raise PublishedError(
+            f"{path} holds weights that are not float32 ({told}); half precision has lost digits "
+            "that no conversion brings back. Take the float32 file, or convert with --to-float32"
+        )
+    notes = [f"converted to float32: {told}"] if others else []
+    return {name: t.to(torch.float32).contiguous() for name, t in tensors.items()}, notes
+
+
+def _refuse_nonfinite(tensors: Mapping[str, Tensor], names: Names, path: Path) -> None:
+    broken = [names.published[name] for name, t in tensors.items() if not t.isfinite().all()]
+    if broken:
+        raise PublishedError(
+            f"{path} holds NaN or infinite values in {len(broken)} tensors: {_listed(broken)}; the "
+            "training that wrote it had diverged, or the file is damaged"
+        )
+
+
+def _settings(
+    recipe: Recipe, layout: WeightLayout, published: Mapping[str, Tensor]
+) -> tuple[str, ...]:
+    """Options of the model, initial values aside, in which it differs from the published one."""
+    own = flat(recipe.tree["model"])
+    theirs = flat(resolve(layout.read(shapes_of(published))).tree["model"])
+    elsewhere = re.compile(r"^(supervision|renderer)\.|(\b|_)(init|std|layer_scale)(\b|_)")
+    return tuple(
+        f"{path}: {_word(own, path)} ({layout.name}: {_word(theirs, path)})"
+        for path in dict.fromkeys([*own, *theirs])
+        if own.get(path) != theirs.get(path) and not elsewhere.search(path)
+    )
+
+
+def _word(options: Mapping[str, object], path: str) -> str:
+    return str(options[path]) if path in options else "-"
+
+
+def _listed(names: Iterable[str]) -> str:
+    every = list(names)
+    more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
+    return ", ".join(every[:LISTED]) + more
