@@ -94,9 +94,10 @@ def load_lpips(weights: str | None = None) -> Lpips:
     linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
     vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE
     if not vgg.is_file():
+        place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
         raise LpipsUnavailableError(
-            f"there are no VGG-16 weights {f'at {vgg.name}' if weights else 'in the torch hub cache'}:"
-            f" download torchvision's {VGG_FILE} and name it in evaluation.lpips_weights"
+            f"there are no VGG-16 weights {place}: download torchvision's {VGG_FILE} and name it in "
+            "evaluation.lpips_weights"
         )
     try:
         return Lpips(_read(vgg), _read(linear)).eval()
