@@ -96,8 +96,8 @@ def load_lpips(weights: str | None = None) -> Lpips:
     if not vgg.is_file():
         place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
         raise LpipsUnavailableError(
-            f"there are no VGG-16 weights {place}: download torchvision's {VGG_FILE} and name it in "
-            "evaluation.lpips_weights"
+            f"there are no VGG-16 weights {place}: download torchvision's {VGG_FILE} and name it "
+            "in evaluation.lpips_weights"
         )
     try:
         return Lpips(_read(vgg), _read(linear)).eval()

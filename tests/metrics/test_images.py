@@ -62,3 +62,22 @@ def test_identical_images() -> None:
 def test_images_smaller_than_the_window_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 11 pixels a side, got 10x20"):
         ssim(*pair(0.1, (10, 20)))
+
+
+@pytest.mark.parametrize("size", [(11, 11), (11, 40), (13, 17), (64, 33)])
+def test_ssim_equals_scikit_image_at_odd_sizes(size: tuple[int, int]) -> None:
+    images, truth = pair(0.1, size)
+    expected = [
+        structural_similarity(
+            a.clamp(0, 1).double().numpy(),
+            b.double().numpy(),
+            channel_axis=0,
+            data_range=1.0,
+            gaussian_weights=True,
+            use_sample_covariance=False,
+        )
+        for a, b in zip(images, truth, strict=True)
+    ]
+    torch.testing.assert_close(
+        ssim(images, truth).double(), torch.tensor(expected), rtol=0, atol=1e-5
+    )

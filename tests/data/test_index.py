@@ -1,0 +1,140 @@
+"""Evaluation indices: what is read, what is refused, which samples they name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.data.evaluation import EvaluationPlan, SceneFailure, evaluation_samples
+from qgs.data.index import IndexEntry, read_index
+from qgs.data.sampling import Sample
+from qgs.types import Cameras
+
+VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
+
+
+class Strip(Scene):
+    """Frame f is an image of the value f / 10; cameras along a line. Counts what it decodes."""
+
+    def __init__(self, name: str, frames: int = 8, broken: Exception | None = None) -> None:
+        self.name, self.frames, self.broken, self.decoded = name, frames, broken, 0
+
+    @property
+    def cameras(self) -> Cameras:
+        c2w = torch.eye(4).repeat(self.frames, 1, 1)
+        c2w[:, 0, 3] = torch.arange(self.frames)
+        return Cameras(c2w, torch.tensor([8.0, 8, 8, 8]).expand(self.frames, 4), (16, 16))
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        if self.broken:
+            raise self.broken
+        self.decoded += 1
+        return torch.tensor(list(frames))[:, None, None, None] / 10 + torch.zeros(3, 16, 16)
+
+
+class Strips(SceneSource):
+    name = "strips"
+
+    def __init__(self, *scenes: Scene) -> None:
+        super().__init__(SceneSourceConfig(image_size=(16, 16)))
+        self._scenes = scenes
+
+    def scenes(self, split: str) -> Sequence[Scene]:
+        return self._scenes if split == "test" else ()
+
+
+def entry(context: Sequence[int], target: Sequence[int]) -> IndexEntry:
+    return IndexEntry(context=list(context), target=list(target))
+
+
+def test_a_published_index_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "index.json"
+    told = {"a": {"context": [0, 12], "target": [3, 6], "overlap": 0.5}, "b": None}
+    file.write_text(json.dumps(told))
+    assert read_index(str(file)) == {"a": entry([0, 12], [3, 6]), "b": None}
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"a": {"context": [0]}}', "a.target: Field required"),
+        ('{"a": {"context": [], "target": [1]}}', "a.context: List should have at least 1 item"),
+        (
+            '{"a": {"context": ["0"], "target": [1]}}',
+            "a.context.0: Input should be a valid integer",
+        ),
+        (
+            '{"a": {"context": [0.5], "target": [1]}}',
+            "a.context.0: Input should be a valid integer",
+        ),
+        ('["a"]', "file: Input should be a valid dictionary"),
+        ('{"a": null}', "names no scene to judge"),
+        ('{"a": null, "a": {"context": [0], "target": [1]}}', "written twice: a"),
+        ('{"a": ', "Expecting value"),
+    ],
+)
+def test_other_files_are_refused_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
+    file = tmp_path / "index.json"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=reason):
+        read_index(str(file))
+
+
+def test_a_missing_index_is_told_with_its_path() -> None:
+    with pytest.raises(FileNotFoundError, match=r"no evaluation index at nowhere/index\.json"):
+        read_index("nowhere/index.json")
+
+
+def test_samples_are_those_of_the_index_in_its_order() -> None:
+    source = Strips(Strip("one"), Strip("two"), Strip("three"))
+    index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
+    samples = evaluation_samples(source, VIEWS, EvaluationConfig(scenes=1), index)
+    assert [s.scene for s in samples] == ["three", "one"]
+    first = samples[0]
+    assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
+    assert first.targets.images[0, :, 0, 0, 0].tolist() == pytest.approx([0.2, 0.3, 0.2])
+    assert first.inputs.cameras.c2w[0, 0].tolist() == torch.eye(4).tolist()
+
+
+def test_what_is_not_judged_is_named() -> None:
+    source = Strips(Strip("good"), Strip("short", 4), Strip("spare"), Strip("twin"), Strip("twin"))
+    index = {
+        "gone": entry([0, 1], [2]),
+        "good": entry([0, 2], [1]),
+        "nil": None,
+        "short": entry([0, 4], [-1]),
+        "twin": entry([0, 2], [1]),
+    }
+    plan = EvaluationPlan(source, VIEWS, EvaluationConfig(), index)
+    assert plan.wanted == ("gone", "good", "short", "twin")
+    assert plan.null == ("nil",)
+    assert plan.unlisted == ("spare",)
+    failures = {s.scene: s.reason for s in plan.samples() if isinstance(s, SceneFailure)}
+    assert failures == {
+        "gone": "not among the test scenes of the data",
+        "short": "frames 4, -1 are out of range, it has frames 0 to 3",
+        "twin": "2 test scenes of the data have this name",
+    }
+
+
+def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on() -> None:
+    broken = Strip("broken", broken=OSError("truncated file"))
+    plan = EvaluationPlan(Strips(broken, Strip("good")), VIEWS, EvaluationConfig())
+    failure, sample = plan.samples()
+    assert failure == SceneFailure("broken", "OSError: truncated file")
+    assert isinstance(sample, Sample)
+    assert sample.scene == "good"
+
+
+def test_scenes_are_decoded_one_at_a_time() -> None:
+    scenes = [Strip(f"scene{n}") for n in range(4)]
+    samples = EvaluationPlan(Strips(*scenes), VIEWS, EvaluationConfig()).samples()
+    for number in range(4):
+        next(samples)
+        assert [scene.decoded for scene in scenes] == [1] * (number + 1) + [0] * (3 - number)

@@ -1,0 +1,153 @@
+"""LPIPS: the published arithmetic, and why it may be unavailable."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from qgs.metrics.lpips import LpipsUnavailableError, load_lpips
+
+CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0)
+"""VGG-16's convolutions; 0 is a pooling."""
+
+
+def vgg16(pretrained: bool = False) -> nn.Module:
+    """torchvision's VGG-16 without its classifier, random."""
+    layers: list[nn.Module] = []
+    width = 3
+    for channels in CHANNELS:
+        if channels:
+            layers += [nn.Conv2d(width, channels, 3, padding=1), nn.ReLU()]
+            width = channels
+        else:
+            layers.append(nn.MaxPool2d(2))
+    model = nn.Module()
+    model.features = nn.Sequential(*layers)
+    return model
+
+
+@pytest.fixture(scope="module")
+def weights() -> dict[str, Tensor]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return dict(vgg16().state_dict())
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Tensor]:
+    """A package that holds weights where `lpips` does, and cannot be imported."""
+    folder = tmp_path / "packages" / "lpips"
+    (folder / "weights" / "v0.1").mkdir(parents=True)
+    (folder / "__init__.py").write_text("raise RuntimeError('torchvision does not fit')")
+    generator = torch.Generator().manual_seed(1)
+    linear = {
+        f"lin{n}.model.1.weight": torch.rand(1, width, 1, 1, generator=generator)
+        for n, width in enumerate((64, 128, 256, 512, 512))
+    }
+    torch.save(linear, folder / "weights" / "v0.1" / "vgg.pth")
+    monkeypatch.syspath_prepend(folder.parent)
+    return linear
+
+
+def images(*shape: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
+
+
+def by_the_formula(
+    vgg: dict[str, Tensor], linear: dict[str, Tensor], image: Tensor, truth: Tensor
+) -> float:
+    """Zhang et al., 2018, equation 1, on relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3."""
+    trunk = vgg16().features
+    trunk.load_state_dict({k.removeprefix("features."): v for k, v in vgg.items()})
+    shift = torch.tensor([-0.030, -0.088, -0.188])[:, None, None]
+    scale = torch.tensor([0.458, 0.448, 0.450])[:, None, None]
+    total = 0.0
+    x, y = (((i * 2 - 1) - shift) / scale for i in (image[None], truth[None]))
+    taps = {3: 0, 8: 1, 15: 2, 22: 3, 29: 4}
+    for place, layer in enumerate(trunk):
+        x, y = layer(x), layer(y)
+        if place in taps:
+            unit = [f / f.square().sum(1, keepdim=True).sqrt() for f in (x, y)]
+            weighted = linear[f"lin{taps[place]}.model.1.weight"] * (unit[0] - unit[1]) ** 2
+            total += float(weighted.sum(1).mean())
+    return total
+
+
+@pytest.mark.parametrize("form", ["safetensors", "pth"])
+def test_lpips_is_the_published_formula(
+    tmp_path: Path, weights: dict[str, Tensor], package: dict[str, Tensor], form: str
+) -> None:
+    file = tmp_path / f"vgg.{form}"
+    save_file(weights, file) if form == "safetensors" else torch.save(weights, file)
+    lpips = load_lpips(str(file))
+    image, truth = images(2, 2, 3, 33, 40)
+    values = lpips(image, truth)
+    assert values.shape == (2, 2)
+    with torch.no_grad():
+        expected = by_the_formula(weights, package, image[1, 0], truth[1, 0])
+    assert float(values[1, 0]) == pytest.approx(expected, rel=1e-5)
+    assert torch.equal(lpips(truth, truth), torch.zeros(2, 2))
+    assert torch.equal(lpips(image[:1, :1], truth[:1, :1])[0, 0], values[0, 0])
+    assert not any(parameter.requires_grad for parameter in lpips.parameters())
+
+
+@pytest.mark.skipif(find_spec("lpips") is None, reason="the lpips extra is not installed")
+def test_lpips_equals_the_package(
+    tmp_path: Path, weights: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torchvision, models = ModuleType("torchvision"), ModuleType("torchvision.models")
+    torchvision.models, models.vgg16 = models, vgg16
+    monkeypatch.setitem(__import__("sys").modules, "torchvision", torchvision)
+    monkeypatch.setitem(__import__("sys").modules, "torchvision.models", models)
+    import lpips
+
+    theirs = lpips.LPIPS(net="vgg", pnet_rand=True, verbose=False)
+    trunk = {f"features.{k.split('.', 1)[1]}": v for k, v in theirs.net.state_dict().items()}
+    save_file({k: v.contiguous() for k, v in trunk.items()}, tmp_path / "vgg.safetensors")
+    image, truth = images(2, 3, 48, 37)
+    with torch.no_grad():
+        expected = theirs(image * 2 - 1, truth * 2 - 1).flatten()
+    ours = load_lpips(str(tmp_path / "vgg.safetensors"))(image, truth)
+    torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_images_are_clipped_and_small_ones_refused(
+    tmp_path: Path, weights: dict[str, Tensor], package: dict[str, Tensor]
+) -> None:
+    save_file(weights, tmp_path / "vgg.safetensors")
+    lpips = load_lpips(str(tmp_path / "vgg.safetensors"))
+    image, truth = images(1, 3, 16, 16)
+    assert torch.equal(lpips(image * 3 - 1, truth), lpips((image * 3 - 1).clamp(0, 1), truth))
+    with pytest.raises(ValueError, match="at least 16 pixels a side, got 15x16"):
+        lpips(image[..., :15, :], truth[..., :15, :])
+
+
+def test_without_the_package_the_reason_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("qgs.metrics.lpips.find_spec", lambda name: None)
+    with pytest.raises(LpipsUnavailableError, match=r"not installed: pip install 'qgs\[lpips\]'"):
+        load_lpips()
+
+
+@pytest.mark.usefixtures("package")
+def test_without_weights_the_reason_says_what_to_download(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    with pytest.raises(LpipsUnavailableError, match=r"no VGG-16 weights in the cache of torch.hub"):
+        load_lpips()
+    with pytest.raises(LpipsUnavailableError, match=r"no VGG-16 weights at mine\.pth"):
+        load_lpips("mine.pth")
+
+
+@pytest.mark.usefixtures("package")
+def test_other_weights_are_told(tmp_path: Path) -> None:
+    save_file({"conv1.weight": torch.zeros(1)}, tmp_path / "resnet.safetensors")
+    with pytest.raises(LpipsUnavailableError, match=r"resnet\.safetensors or vgg\.pth does not"):
+        load_lpips(str(tmp_path / "resnet.safetensors"))
