@@ -17,7 +17,7 @@ class EncodedFrame:
 
     data, mask: bytes of image files; mask None for a frame without one. c2w: (4, 4) float64, OpenCV
     axes. intrinsics: fx, fy, cx, cy in pixels of the stored photo, whose size is (H, W).
-    lens: None for a pinhole.
+    lens: None for a pinhole. background: RGB in [0, 1] behind transparent pixels.
     """
 
     name: str
@@ -27,6 +27,7 @@ class EncodedFrame:
     size: tuple[int, int]
     lens: Lens | None = None
     mask: bytes | None = None
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 class EncodedScene(Scene):

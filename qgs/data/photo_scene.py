@@ -123,6 +123,7 @@ class PhotoScene(EncodedScene):
         return EncodedFrame(
             self.frame_name(frame), listed.path.read_bytes(), listed.c2w, listed.at_size(size),
             size, listed.lens, None if listed.mask is None else _png(_full_mask(listed)),
+            self._development.background,
         )  # fmt: skip
 
     def _kept(self, kind: str, make: Callable[[PhotoFrame], np.ndarray], index: int) -> np.ndarray:
