@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar
+
+import torch
+from torch import Tensor
 
 from qgs.contracts.component import ModelComponent
 from qgs.types import QueryState, SpatialSupport
+
+GROWTH_NOISE = 0.01
+"""Standard deviation by which a new query differs from the one it copies (LocusGS release)."""
 
 
 class Queries(ModelComponent):
@@ -27,6 +34,32 @@ class Queries(ModelComponent):
     def forward(self, batch_size: int) -> QueryState:
         """The initial state, expanded to `batch_size` scenes."""
 
+    def resized(
+        self, learned: Mapping[str, Tensor], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Parameters for these queries, made of those `learned` by another number of them.
+
+        learned: named as in this component's state dict, on the CPU; sizes differ in the
+            leading dimension alone, where one item belongs to one query.
+        Fewer queries are the first. Of more, the first are the learned ones and query i copies
+        query i modulo their number, all its parameters plus noise of N(0, 0.01) (LocusGS release,
+        finetuning). Shapes that agree are kept as they are.
+        """
+        own = {name: values.shape for name, values in self.state_dict().items()}
+        return {
+            name: values if values.shape == own[name] else _resized(values, own[name][0], generator)
+            for name, values in learned.items()
+        }
+
     def support(self, state: QueryState) -> SpatialSupport | None:
         """Where each query of `state` looks; None for queries without a place in space."""
         return None
+
+
+def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """The first `count` items of `values`, or all of them and noisy copies, in turn."""
+    if count <= len(values):
+        return values[:count]
+    copied = values[torch.arange(len(values), count) % len(values)]
+    noise = torch.randn(copied.shape, generator=generator, dtype=copied.dtype)
+    return torch.cat([values, copied + GROWTH_NOISE * noise])
