@@ -85,7 +85,7 @@ def in_own_process(views: int, render_views: int, device: str) -> dict[str, floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--views", type=int, nargs=2, default=[2, 16], metavar=("FEW", "MANY"))
     parser.add_argument("--render-views", type=int, default=2)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
