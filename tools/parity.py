@@ -38,7 +38,7 @@ def report(path: Path) -> bool:
     print(path)
     try:
         rows = rows_of(path)
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         print(f"FAIL  {error}\n")
         return False
     failed = sum(bool(row.problem) for row in rows)

@@ -19,13 +19,14 @@ BIGGER = {
     "enc_embed_dim": 48, "enc_num_heads": 3, "enc_depth": 2, "dec_depth": 4, "mlp_ratio": 3,
     "patch_size": 4, "img_size": [12, 20], "num_gs_tokens": 7, "gaussian_scale_cap": 0.2,
 }  # fmt: skip
-VARIANTS = list(
-    itertools.product(
-        ("geometric_positional", "content_only"),
-        ("learned_positional", "content_only"),
-        ("free_center", "anchor_offset", "radius_scaled_offset"),
-    )
-)
+CROSS = ("geometric_positional", "content_only")
+OWN = ("learned_positional", "content_only")
+CENTERS = ("free_center", "anchor_offset", "radius_scaled_offset")
+VARIANTS = [
+    *itertools.product(CROSS, OWN, CENTERS, ("refined",)),
+    *itertools.product(CROSS[:1], OWN[:1], CENTERS, ("static", "aside")),
+    *itertools.product(CROSS, OWN[:1], CENTERS[:2], ("none",)),
+]
 
 
 def problems(path: Path) -> dict[str, str]:
@@ -59,14 +60,14 @@ def test_locusgs_of_another_size(tmp_path: Path, layers: list[int], saturation: 
     assert problems(tmp_path / "file") == {}
 
 
-@pytest.mark.parametrize(("cross", "own", "centers"), VARIANTS)
-@pytest.mark.parametrize("radius", ["refined", "static", "aside"])
-def test_every_combination_of_variants(
+@pytest.mark.parametrize(("cross", "own", "centers", "radius"), VARIANTS)
+def test_combinations_of_variants(
     tmp_path: Path, cross: str, own: str, centers: str, radius: str
 ) -> None:
     config = metadata(
         "locusgs", cross_attn_variant=cross, self_attn_variant=own, gaussian_center_variant=centers,
-        anchor_radius_refinement=radius == "refined", anchor_radius_affects_bias=radius != "aside",
+        use_anchor_radius=radius != "none", anchor_radius_refinement=radius == "refined",
+        anchor_radius_affects_bias=radius in ("refined", "static"),
     )  # fmt: skip
     write(tmp_path / "file", config, Sizes())
     assert problems(tmp_path / "file") == {}
