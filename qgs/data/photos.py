@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import overload
 
 from pydantic import Field
 from upath import UPath
@@ -89,7 +90,13 @@ class PhotoScenes(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._folders)
 
-    def __getitem__(self, index: int) -> Scene:  # pyright: ignore[reportIncompatibleMethodOverride]
+    @overload
+    def __getitem__(self, index: int) -> Scene: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
+    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
         name, folder = self._folders[index]
         return self._opened.get(name, lambda: self._open(name, folder))
 

@@ -1,0 +1,191 @@
+"""The same photos through every format: the same pixels, intrinsics and poses."""
+
+import os
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from photo_formats import (
+    PhotoSet,
+    centred,
+    synthetic,
+    write_blender,
+    write_colmap,
+    write_llff,
+    write_nerfstudio,
+)
+from PIL import Image
+from upath import UPath
+
+from qgs.data import PhotosSource, read_photos
+from qgs.data.photo_scene import PhotoScene
+
+PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
+REAL = ("mary_rose", "office_walk", "desk")
+
+
+def scene(path: Path, size=(30, 40), **options) -> PhotoScene:
+    config = {"path": str(path), "image_size": size, **options}
+    opened = PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
+    assert isinstance(opened, PhotoScene)
+    return opened
+
+
+def variants(folder: Path, photos: PhotoSet) -> dict[str, PhotoScene]:
+    """The set at its own size: of a centred pinhole in formats that know no other, or in others."""
+    if photos.intrinsics == centred(photos).intrinsics:
+        some = {
+            "llff": write_llff(folder / "llff", photos),
+            "blender": write_blender(folder / "blender", photos, len(photos.files)),
+        }
+        return {name: scene(path, photos.size) for name, path in some.items()}
+    some = {
+        "nerfstudio": write_nerfstudio(folder / "nerfstudio", photos),
+        "colmap text": write_colmap(folder / "text", photos, "text"),
+        "colmap binary": write_colmap(folder / "binary", photos, "binary", model="sparse"),
+    }
+    return {name: scene(path, photos.size) for name, path in some.items()}
+
+
+def assert_same(read: PhotoScene, photos: PhotoSet, poses: float = 1e-9) -> None:
+    assert read.cameras.c2w.dtype == torch.float64
+    np.testing.assert_allclose(read.cameras.c2w, photos.c2w, rtol=0, atol=poses)
+    expected = np.tile(photos.intrinsics, (len(photos.files), 1))
+    np.testing.assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
+    for i, file in enumerate(photos.files):
+        assert Path(read.frame_name(i)).stem == file.stem
+        pixels = read.images([i])[0].mul(255).round().byte().permute(1, 2, 0)
+        assert np.array_equal(pixels, np.asarray(Image.open(file).convert("RGB")))
+
+
+def test_a_synthetic_set(tmp_path):
+    given = synthetic(tmp_path / "photos")
+    for photos in (given, centred(given)):
+        for read in variants(tmp_path / str(photos.intrinsics[1]), photos).values():
+            assert_same(read, photos)
+
+
+def real(name: str) -> PhotoScene:
+    path = PHOTOS / name
+    if not path.is_dir():
+        pytest.skip(f"{path} is missing; set QGS_PHOTOS to the folder of real photos")
+    with Image.open(next((path / "images").iterdir())) as image:
+        return scene(path, (image.height, image.width))
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_photos_written_in_every_format(name, tmp_path):
+    """Some poses are written with six digits, so that their rotations are not quite rotations."""
+    given = real(name)
+    every = range(0, len(given), max(len(given) // 2, 1))
+    files = tuple(PHOTOS / name / given.frame_name(i) for i in every)
+    camera = tuple(given.cameras.intrinsics[0].tolist())
+    poses = given.cameras.c2w[every].numpy()
+    photos = PhotoSet(files, poses, camera, given.cameras.size)  # pyright: ignore[reportArgumentType]
+    for read in variants(tmp_path / "own", photos).values():
+        assert_same(read, photos, poses=1e-5)
+    for read in variants(tmp_path / "centred", centred(photos)).values():
+        assert_same(read, centred(photos), poses=1e-5)
+
+
+def test_real_photos_in_both_of_their_formats(caplog):
+    given = real("mary_rose")
+    assert "2 formats (nerfstudio: transforms.json, llff: poses_bounds.npy)" in caplog.text
+    other = scene(PHOTOS / "mary_rose", given.cameras.size, format="llff")
+    torch.testing.assert_close(other.cameras.c2w, given.cameras.c2w, rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        other.cameras.intrinsics, given.cameras.intrinsics, rtol=0, atol=1e-9
+    )
+    every = range(len(given))
+    assert [other.frame_name(i) for i in every] == [given.frame_name(i) for i in every]
+    for i in (0, 30, 68):
+        assert torch.equal(other.images([i]), given.images([i]))
+
+
+def test_what_a_folder_holds_most_is_read_in_a_told_order(tmp_path, caplog):
+    photos = centred(synthetic(tmp_path / "photos"))
+    write_llff(tmp_path, photos)
+    assert not caplog.records
+    first = scene(tmp_path)
+    write_colmap(tmp_path, photos, "text")
+    assert_same(scene(tmp_path), photos)
+    assert "`format: llff` reads the other" in caplog.text
+    assert first.cameras.shape == (6,)
+    with pytest.raises(FileNotFoundError, match=r"transforms\.json, which nerfstudio needs.*llff"):
+        scene(tmp_path, format="nerfstudio")
+
+
+@pytest.mark.parametrize("images", [None, "images_4"])
+@pytest.mark.parametrize("write", [write_llff, write_nerfstudio, write_colmap])
+def test_scaled_copies(tmp_path, write, images):
+    """Copies are read where asked for, and where they are all there is."""
+    photos = centred(synthetic(tmp_path / "photos", size=(40, 80)))
+    write(tmp_path, photos, *(["binary"] if write is write_colmap else []))
+    (tmp_path / "images_4").mkdir()
+    for file in photos.files:
+        Image.open(file).resize((20, 10)).save(tmp_path / "images_4" / file.name)
+    read = scene(tmp_path, (10, 20), images=images)
+    folder = images or "images"
+    assert read.frame_name(2) == f"{folder}/view_002.png"
+    torch.testing.assert_close(
+        read.cameras.intrinsics[0], torch.tensor([12.5, 12.5, 10, 5]).double()
+    )
+    if images is None:
+        for file in (tmp_path / "images").iterdir():
+            file.unlink()
+        (tmp_path / "images").rmdir()
+        assert scene(tmp_path, (10, 20)).frame_name(2) == "images_4/view_002.png"
+    with pytest.raises(FileNotFoundError, match="images_3"):
+        scene(tmp_path, images="images_3")
+
+
+def test_a_folder_of_scenes(tmp_path, caplog):
+    for i, name in enumerate(("b", "a")):
+        write_nerfstudio(tmp_path / name, synthetic(tmp_path / "photos" / name, seed=i))
+    (tmp_path / "notes").mkdir()
+    source = PhotosSource(PhotosSource.Config.model_validate({"path": str(tmp_path)}))
+    assert [s.name for s in source.scenes("train")] == ["a", "b"]
+    assert [s.name for s in source.scenes("test")[1:]] == ["b"]
+    assert "left out: notes, photos" in caplog.text
+    assert source.scenes("test")[0].held_out == (4,)
+    assert not torch.equal(*(s.images([0]) for s in source.scenes("train")))
+
+
+def test_scenes_split_by_folder(tmp_path):
+    for part, name in (("train", "a"), ("train", "b"), ("test", "c")):
+        write_llff(tmp_path / part / name, synthetic(tmp_path / "photos"))
+    (tmp_path / "train" / "b" / "images" / "view_001.png").unlink()
+    source = PhotosSource(PhotosSource.Config.model_validate({"path": str(tmp_path)}))
+    assert [len(source.scenes(split)) for split in ("train", "test")] == [2, 1]
+    assert source.scenes("test")[0].name == "c"
+    with pytest.raises(ValueError, match=r"6 poses, but .* has 5 images"):
+        _ = source.scenes("train")[1]
+
+
+def test_sources_travel_to_workers_without_their_cache(tmp_path):
+    source = PhotosSource(
+        PhotosSource.Config.model_validate(
+            {"path": str(write_llff(tmp_path / "a", synthetic(tmp_path, size=(200, 300))))}
+        )
+    )
+    images = source.scenes("train")[0].images(range(6))
+    content = ForkingPickler.dumps(source)
+    assert len(content) < 20_000
+    again = ForkingPickler.loads(content).scenes("train")[0]
+    assert torch.equal(again.images(range(6)), images)
+
+
+def test_photos_of_other_file_systems(tmp_path):
+    photos = synthetic(tmp_path / "photos")
+    write_colmap(tmp_path / "a", photos, "binary")
+    remote = UPath("memory://photos/a")
+    for file in (tmp_path / "a").rglob("*.*"):
+        target = remote / file.relative_to(tmp_path / "a").as_posix()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(file.read_bytes())
+    views = read_photos("memory://photos/a", (30, 40))
+    np.testing.assert_allclose(views.cameras.c2w[0], photos.c2w, atol=1e-6)
+    assert views.cameras.c2w.dtype == torch.float32
+    assert torch.equal(views.images[0], scene(tmp_path / "a").images(range(6)))

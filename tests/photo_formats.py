@@ -1,0 +1,188 @@
+"""One set of photos written in every format that `qgs/photos` reads, for tests.
+
+Nothing here shares code with the readers: the formats are written from their descriptions.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+Camera = tuple[str, int, tuple[float, ...]]
+"""A COLMAP camera model: its name, number and parameters."""
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Photos in files, by name, and what took them: c2w (F, 4, 4) OpenCV, one pinhole."""
+
+    files: tuple[Path, ...]
+    c2w: np.ndarray
+    intrinsics: tuple[float, float, float, float]
+    size: tuple[int, int]
+
+    @property
+    def pinhole(self) -> Camera:
+        return "PINHOLE", 1, self.intrinsics
+
+
+def synthetic(
+    folder: Path, count: int = 6, size=(30, 40), suffix: str = "png", seed: int = 0
+) -> PhotoSet:
+    """Photos of noise at random poses."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = tuple(folder / f"view_{i:03d}.{suffix}" for i in range(count))
+    for file in files:
+        Image.fromarray(rng.integers(0, 256, (*size, 3), dtype=np.uint8)).save(file)
+    rotations, _ = np.linalg.qr(rng.normal(size=(count, 3, 3)))
+    rotations *= np.sign(np.linalg.det(rotations))[:, None, None]
+    c2w = np.tile(np.eye(4), (count, 1, 1))
+    c2w[:, :3, :3], c2w[:, :3, 3] = rotations, rng.normal(size=(count, 3)) * 5
+    return PhotoSet(files, c2w, (50.0, 52.0, 19.0, 16.0), size)
+
+
+def centred(photos: PhotoSet) -> PhotoSet:
+    """The same set, taken by a camera that every format can tell."""
+    focal, (height, width) = photos.intrinsics[0], photos.size
+    return PhotoSet(photos.files, photos.c2w, (focal, focal, width / 2, height / 2), photos.size)
+
+
+def copied(photos: PhotoSet, folder: Path, names: list[str] | None = None) -> list[str]:
+    """Copy the files into `folder`; the names that they have there."""
+    names = names or [file.name for file in photos.files]
+    for file, name in zip(photos.files, names, strict=True):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, folder / name)
+    return names
+
+
+def opengl(c2w: np.ndarray) -> list[list[float]]:
+    flipped = c2w.copy()
+    flipped[:3, 1:3] *= -1
+    return flipped.tolist()
+
+
+def write_nerfstudio(folder: Path, photos: PhotoSet, **top: Any) -> Path:
+    names = copied(photos, folder / "images")
+    fx, fy, cx, cy = photos.intrinsics
+    height, width = photos.size
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": opengl(pose)}
+        for name, pose in zip(names, photos.c2w, strict=True)
+    ]
+    camera = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
+    text = json.dumps({"camera_model": "OPENCV", **camera, **top, "frames": frames})
+    (folder / "transforms.json").write_text(text)
+    return folder
+
+
+def write_blender(folder: Path, photos: PhotoSet, train: int, val: int = 0) -> Path:
+    """The first photos are for training, then `val` for validation, the rest for tests.
+
+    Square pixels and a principal point in the middle are all that the format knows.
+    """
+    parts = {"train": slice(0, train), "val": slice(train, train + val)}
+    for part, chosen in {**parts, "test": slice(train + val, None)}.items():
+        frames = []
+        for file, pose in zip(photos.files[chosen], photos.c2w[chosen], strict=True):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+            Image.open(file).save(folder / part / f"{file.stem}.png")
+            frames.append(
+                {
+                    "file_path": f"./{part}/{file.stem}",
+                    "rotation": 0.01,
+                    "transform_matrix": opengl(pose),
+                }
+            )
+        if frames:
+            angle = 2 * math.atan(photos.size[1] / 2 / photos.intrinsics[0])
+            content = {"camera_angle_x": angle, "frames": frames}
+            (folder / f"transforms_{part}.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_llff(folder: Path, photos: PhotoSet, images: str = "images") -> Path:
+    """Rows of (down, right, back, centre, (h, w, f)) as a (3, 5) matrix, then near and far."""
+    copied(photos, folder / images)
+    right, down, ahead, centre = (photos.c2w[:, :3, i] for i in range(4))
+    hwf = np.tile([*photos.size, photos.intrinsics[0]], (len(photos.files), 1))
+    matrix = np.stack([down, right, -ahead, centre, hwf], -1)
+    bounds = np.tile([0.5, 20.0], (len(photos.files), 1))
+    np.save(folder / "poses_bounds.npy", np.hstack([matrix.reshape(-1, 15), bounds]))
+    return folder
+
+
+def write_colmap(
+    folder: Path,
+    photos: PhotoSet,
+    kind: str,
+    camera: Camera | None = None,
+    model: str = "sparse/0",
+    images: str = "images",
+    names: list[str] | None = None,
+) -> Path:
+    """kind: text or binary. Images are listed backwards, with two observations each."""
+    names = copied(photos, folder / images, names)
+    (folder / model).mkdir(parents=True)
+    poses = [world_to_camera(pose) for pose in photos.c2w]
+    entries = list(zip(range(1, len(names) + 1), poses, names, strict=True))[::-1]
+    write = {"text": _write_text, "binary": _write_binary}[kind]
+    write(folder / model, entries, camera or photos.pinhole, photos.size)
+    return folder
+
+
+def world_to_camera(c2w: np.ndarray) -> tuple[float, ...]:
+    """Quaternion w, x, y, z and translation of the inverse of a pose."""
+    rotation = c2w[:3, :3].T
+    return (*quaternion(rotation), *(-rotation @ c2w[:3, 3]))
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w, x, y, z: the eigenvector of Davenport's matrix for its largest eigenvalue, 1."""
+    xx, yy, zz = np.diag(rotation)
+    xy, xz, yz = (rotation[i, j] + rotation[j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    wx, wy, wz = (rotation[i, j] - rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    davenport = np.array(
+        [
+            [xx + yy + zz, wx, wy, wz],
+            [wx, xx - yy - zz, xy, xz],
+            [wy, xy, yy - xx - zz, yz],
+            [wz, xz, yz, zz - xx - yy],
+        ]
+    )
+    return np.linalg.eigh(davenport)[1][:, -1]
+
+
+def _write_text(folder: Path, entries: list, camera: Camera, size: tuple[int, int]) -> None:
+    name, _, parameters = camera
+    numbers = " ".join(map(repr, map(float, parameters)))
+    line = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {name} {size[1]} {size[0]} {numbers}\n"
+    (folder / "cameras.txt").write_text(line)
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+    for number, pose, image in entries:
+        lines += [f"{number} {' '.join(map(repr, map(float, pose)))} 7 {image}"]
+        lines += ["3.5 4.5 11 8.0 9.0 -1"]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "points3D.txt").write_text("11 0 0 5 1 2 3 0.5 1 0 2 0\n")
+
+
+def _write_binary(folder: Path, entries: list, camera: Camera, size: tuple[int, int]) -> None:
+    _, model, parameters = camera
+    head = struct.pack("<QIiQQ", 1, 7, model, size[1], size[0])
+    (folder / "cameras.bin").write_bytes(head + struct.pack(f"<{len(parameters)}d", *parameters))
+    content = struct.pack("<Q", len(entries))
+    for number, pose, image in entries:
+        content += struct.pack("<I7dI", number, *pose, 7) + image.encode() + b"\0"
+        content += struct.pack("<QddqddQ", 2, 3.5, 4.5, 11, 8.0, 9.0, 2**64 - 1)
+    (folder / "images.bin").write_bytes(content)
+    point = struct.pack("<Q3d3BdQ2I2I", 11, 0, 0, 5, 1, 2, 3, 0.5, 2, 1, 0, 2, 0)
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point)
