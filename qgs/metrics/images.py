@@ -31,7 +31,8 @@ def ssim(images: Tensor, truth: Tensor) -> Tensor:
     """Structural similarity of images (..., 3, H, W), clipped to [0, 1] -> (...).
 
     Equals scikit-image's `structural_similarity` with gaussian_weights, sigma 1.5, data_range 1
-    and use_sample_covariance=False, which leaves out the 5 pixels at the border.
+    and use_sample_covariance=False, which leaves out the 5 pixels at the border. Computed in
+    float64: the variances of flat images are small differences of squares.
     Raises ValueError when a side is shorter than the window of 11 pixels.
     """
     if min(images.shape[-2:]) < _WINDOW:
@@ -39,6 +40,6 @@ def ssim(images: Tensor, truth: Tensor) -> Tensor:
             f"SSIM needs images of at least {_WINDOW} pixels a side, got "
             f"{images.shape[-2]}x{images.shape[-1]}"
         )
-    flat = [x.clamp(0, 1).reshape(-1, *x.shape[-3:]) for x in (images, truth)]
+    flat = [x.clamp(0, 1).double().reshape(-1, *x.shape[-3:]) for x in (images, truth)]
     similarity = kornia_ssim(*flat, window_size=_WINDOW, padding="valid", eps=0.0)
-    return similarity.mean((-3, -2, -1)).reshape(images.shape[:-3])
+    return similarity.mean((-3, -2, -1)).reshape(images.shape[:-3]).to(images.dtype)

@@ -1,35 +1,60 @@
-"""Evaluation: the same twice, and equal to the metrics it is made of."""
+"""Evaluation: the same twice, equal to the metrics it is made of, and nothing left out unsaid."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
+import io
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 import torch
 from rich.console import Console
 
+import qgs.engine.evaluation as engine_evaluation
 from qgs.composer import Recipe
-from qgs.data.loader import evaluation_samples
+from qgs.contracts import Scene
+from qgs.data.evaluation import evaluation_samples
+from qgs.data.rooms import RoomsSource
 from qgs.engine import evaluate
+from qgs.engine.scores import METHODS, Evaluation
 from qgs.metrics import mean_colour, nearest_input, psnr, ssim, token_dispersion
+from qgs.metrics.lpips import LpipsUnavailableError
+
+FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
+
+
+def write_index(folder: Path, **scenes: tuple[Sequence[int], Sequence[int]] | None) -> str:
+    file = folder / "some_index.json"
+    entries = {
+        name.replace("room", "test/00000"): {"context": frames[0], "target": frames[1]}
+        if frames
+        else None
+        for name, frames in scenes.items()
+    }
+    file.write_text(json.dumps(entries))
+    return f"evaluation.index={file}"
+
+
+def shown(evaluation: Evaluation) -> str:
+    console = Console(record=True, width=100, file=io.StringIO())
+    evaluation.show(console)
+    return console.export_text()
 
 
 def test_twice_gives_the_same_files(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
     recipe = tiny("locus")
     for name in ("a", "b"):
         evaluate(recipe.build_model(), recipe).write(tmp_path / name)
-    for file in ("summary.json", "samples.csv"):
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == FILES
+    for file in FILES:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [
-        "samples.csv",
-        "summary.json",
-    ]
 
 
-def test_rows_hold_the_metrics_of_model_and_baselines(
+def test_scores_hold_the_metrics_of_model_and_baselines(
     tiny: Callable[..., Recipe], tmp_path: Path
 ) -> None:
     recipe = tiny("tokengs")
@@ -44,20 +69,144 @@ def test_rows_hold_the_metrics_of_model_and_baselines(
         "nearest_input": nearest_input(sample.inputs, sample.targets.cameras),
         "mean_colour": mean_colour(sample.inputs, sample.targets.cameras),
     }
-    row = evaluation.rows[1]
-    truth = sample.targets.images
-    assert row.psnr == pytest.approx({k: float(psnr(v, truth).mean()) for k, v in images.items()})
-    assert row.ssim == pytest.approx({k: float(ssim(v, truth).mean()) for k, v in images.items()})
-    assert row.dispersion_mean == pytest.approx(float(token_dispersion(gaussians.means, 4).mean()))
+    score, truth = evaluation.scores[1], sample.targets.images
+    assert score.views == [(sample.input_frames, sample.target_frames)]
+    for method, image in images.items():
+        for name, metric in (("psnr", psnr), ("ssim", ssim)):
+            expected = float(metric(image, truth).mean())
+            assert score.values[f"{method}_{name}"] == pytest.approx(expected, rel=1e-6)
+    dispersion = float(token_dispersion(gaussians.means, 4).mean())
+    assert score.values["dispersion_mean"] == pytest.approx(dispersion, rel=1e-6)
+    assert score.values["gaussians_used"] == int((gaussians.opacities > 1 / 255).sum())
 
     evaluation.write(tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    rows = list(csv.DictReader((tmp_path / "samples.csv").open()))
-    assert summary["samples"] == len(rows) == 2
+    rows = list(csv.DictReader((tmp_path / "scenes.csv").open()))
+    assert [row["scene"] for row in rows] == ["test/000000", "test/000001"]
+    assert summary["scenes"] == summary["samples"] == len(rows) == 2
     assert summary["gaussians"] == gaussians.count
-    for method in images:
+    for method in METHODS:
         mean = sum(float(r[f"{method}_psnr"]) for r in rows) / len(rows)
         assert summary[method]["psnr"] == pytest.approx(mean)
+        assert summary[method]["lpips"] is None
+
+
+@pytest.mark.parametrize("name", ["tokengs", "locus"])
+def test_batches_change_no_score(tiny: Callable[..., Recipe], name: str) -> None:
+    recipe = tiny(name, "evaluation.scenes=5", "evaluation.samples=2")
+    model = recipe.build_model()
+    alone = evaluate(model, recipe)
+    for batch in (2, 3, 16):
+        together = evaluate(model, recipe, batch=batch)
+        assert [score.scene for score in together.scores] == [s.scene for s in alone.scores]
+        for ours, theirs in zip(together.scores, alone.scores, strict=True):
+            assert ours.views == theirs.views
+            assert ours.values == pytest.approx(theirs.values, rel=0, abs=1e-6)
+
+
+def test_batches_pass_through_the_model_together(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    index = write_index(
+        tmp_path, room0=([0, 2], [1]), room1=([0, 2], [1]), room2=([0, 2, 4], [1]), room3=([1], [2])
+    )
+    recipe = tiny("tokengs", index)
+    model = recipe.build_model()
+    sizes: list[tuple[int, ...]] = []
+    model.encoder.register_forward_pre_hook(
+        lambda module, arguments: sizes.append(tuple(arguments[0].images.shape[:2]))
+    )
+    evaluate(model, recipe, batch=4)
+    assert sizes == [(2, 2), (1, 3), (1, 1)]
+
+
+def test_what_is_missing_is_told_in_the_same_line_as_the_score(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    index = write_index(
+        tmp_path, room0=([0, 3], [1, 2]), room1=([0, 99], [1]), gone=([0, 3], [1]), nil=None
+    )
+    evaluation = evaluate((recipe := tiny("tokengs", index)).build_model(), recipe)
+    assert evaluation.wanted == ("test/000000", "test/000001", "gone")
+    summary = evaluation.summary()
+    assert summary["missing"] == {
+        "test/000001": "frames 99 are out of range, it has frames 0 to 7",
+        "gone": "not among the test scenes of the data",
+    }
+    assert (summary["scenes"], summary["scenes_in_protocol"]) == (1, 3)
+    assert summary["null_entries"] == ["nil"]
+    assert len(summary["not_in_index"]) == 30
+    evaluation.write(tmp_path)
+    line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
+    table = (tmp_path / "table.md").read_text()
+    for text in (shown(evaluation), table, summary["statement"]):
+        assert line in text
+    assert all("1 of 3" in row for row in table.splitlines() if row.startswith("| model"))
+    assert "null entries of the index, not judged (1): nil" in table
+    rows = {row["scene"]: row for row in csv.DictReader((tmp_path / "scenes.csv").open())}
+    assert list(rows) == ["test/000000", "test/000001", "gone"]
+    assert rows["gone"]["problem"] == "not among the test scenes of the data"
+    assert rows["test/000000"]["input_frames"] == "0 3"
+    assert rows["test/000000"]["problem"] == ""
+
+
+def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
+    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", "evaluation.scenes=4")
+    model, forward = recipe.build_model(), type(recipe.build_model().encoder).forward
+    rooms = recipe.build_data().scenes("test")
+    victim, blank, broken = (rooms[number] for number in range(3))
+    photo = victim.images([0])[0]
+    images = type(victim).images
+
+    def decoded(scene: Scene, frames: Sequence[int]) -> torch.Tensor:
+        if scene.name == broken.name:
+            raise OSError("/data/set/truncated.png is cut off")
+        found = images(scene, frames)
+        return torch.full_like(found, math.nan) if scene.name == blank.name else found
+
+    def encoded(self, views):
+        if any(torch.equal(image, photo) for scene in views.images for image in scene):
+            raise RuntimeError("out of memory")
+        return forward(self, views)
+
+    monkeypatch.setattr(type(victim), "images", decoded)
+    monkeypatch.setattr(type(model.encoder), "forward", encoded)
+    monkeypatch.setattr(
+        "qgs.data.evaluation.draw_frames", lambda scene, views, rng: ((0, 3), (1, 2))
+    )
+    evaluation = evaluate(model, recipe, batch=4)
+    assert [score.scene for score in evaluation.scores] == ["test/000003"]
+    reasons = {failure.scene: failure.reason for failure in evaluation.missing}
+    assert reasons["test/000000"] == "RuntimeError: out of memory"
+    assert "is not finite" in reasons["test/000001"]
+    assert reasons["test/000002"] == "OSError: /data/set/truncated.png is cut off"
+
+
+def test_no_scene_at_all_is_an_error_with_the_first_reason(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs", write_index(tmp_path, a=([0], [1]), b=([0], [1])))
+    with pytest.raises(ValueError, match="none of 2 scenes could be judged; the first, a: not amo"):
+        evaluate(recipe.build_model(), recipe)
+
+
+def test_failed_samples_fail_their_scene(
+    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", "evaluation.samples=3")
+    score = engine_evaluation.psnr
+    calls = []
+
+    def failing(images: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        return score(images, truth) * (math.inf if len(calls) == 2 * len(METHODS) else 1)
+
+    monkeypatch.setattr(engine_evaluation, "psnr", failing)
+    evaluation = evaluate(recipe.build_model(), recipe)
+    assert [failure.scene for failure in evaluation.missing] == ["test/000000"]
+    assert [len(score.views) for score in evaluation.scores] == [3]
 
 
 def test_the_mode_of_the_model_is_left_alone(tiny: Callable[..., Recipe]) -> None:
@@ -67,10 +216,86 @@ def test_the_mode_of_the_model_is_left_alone(tiny: Callable[..., Recipe]) -> Non
     assert model.training
 
 
-def test_the_table_shows_all_three(tiny: Callable[..., Recipe]) -> None:
+def test_an_empty_batch_is_refused(tiny: Callable[..., Recipe]) -> None:
     recipe = tiny("tokengs")
-    console = Console(record=True, width=100, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
-    evaluate(recipe.build_model(), recipe).show(console)
-    text = console.export_text()
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        evaluate(recipe.build_model(), recipe, batch=0)
+
+
+def test_the_table_shows_all_three_and_why_a_column_is_empty(
+    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", "evaluation.metrics=[lpips]")
+
+    def unavailable(weights: str | None) -> None:
+        raise LpipsUnavailableError("there are no VGG-16 weights here")
+
+    monkeypatch.setattr(engine_evaluation, "load_lpips", unavailable)
+    text = shown(evaluate(recipe.build_model(), recipe))
     for word in ("model", "nearest input", "mean colour", "PSNR", "SSIM", "dispersion"):
         assert word in text
+    assert "LPIPS is empty: there are no VGG-16 weights here" in text
+
+
+def test_lpips_fills_its_column_where_it_can(
+    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", "evaluation.metrics=[lpips]", "evaluation.lpips_weights=mine.pth")
+    asked = []
+
+    class StandIn(torch.nn.Module):
+        def forward(self, images: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+            return (images - truth).abs().mean((-3, -2, -1))
+
+    def load(weights: str | None) -> StandIn:
+        asked.append(weights)
+        return StandIn()
+
+    monkeypatch.setattr(engine_evaluation, "load_lpips", load)
+    evaluation = evaluate(recipe.build_model(), recipe)
+    assert asked == ["mine.pth"]
+    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
+    copied = nearest_input(sample.inputs, sample.targets.cameras)
+    expected = float((copied - sample.targets.images).abs().mean())
+    assert evaluation.scores[0].values["nearest_input_lpips"] == pytest.approx(expected, rel=1e-5)
+    assert evaluation.summary()["empty"] == {}
+    assert "is empty" not in shown(evaluation)
+
+
+def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(
+    tiny: Callable[..., Recipe],
+) -> None:
+    plain, tuned = tiny("locus"), tiny("locus", "evaluation.tuning_steps=2")
+    model = plain.build_model()
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    first, second = evaluate(model, plain), evaluate(model, tuned, batch=2)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
+    assert first.protocol.sha256 != second.protocol.sha256
+    assert first.summary()["tuning"] is None
+    told = second.summary()["tuning"]
+    assert (told["steps"], told["rate"], told["optimizer"]) == (2, 1e-4, "Adam")
+    assert told["loss_after"] < told["loss_before"]
+    assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
+    assert "tokens tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)
+
+
+def test_protocol_file_hashes_to_the_protocol(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe = tiny("tokengs", "evaluation.protocol=rooms-2view")
+    evaluate(recipe.build_model(), recipe).write(tmp_path)
+    told = json.loads((tmp_path / "summary.json").read_text())["protocol"]
+    assert told["name"] == "rooms-2view"
+    content = (tmp_path / "protocol.json").read_bytes()
+    assert hashlib.sha256(content).hexdigest() == told["sha256"]
+
+
+def test_rooms_are_opened_once(
+    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs")
+    opened = []
+    scenes = RoomsSource.scenes
+    monkeypatch.setattr(
+        RoomsSource, "scenes", lambda self, split: opened.append(id(self)) or scenes(self, split)
+    )
+    evaluate(recipe.build_model(), recipe)
+    assert len(set(opened)) == 1

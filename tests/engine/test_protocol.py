@@ -1,0 +1,118 @@
+"""Protocols: their hash follows what decides the numbers, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from qgs.composer import Recipe
+from qgs.engine.protocol import Protocol, index_of, protocol_of
+
+INDEX = {"a": {"context": [0, 3], "target": [1, 2]}, "b": None}
+
+
+def indexed(tiny: Callable[..., Recipe], file: Path, *overrides: str) -> Protocol:
+    recipe = tiny("tokengs", f"evaluation.index={file}", *overrides)
+    return protocol_of(recipe, index_of(recipe))
+
+
+def drawn(tiny: Callable[..., Recipe], *overrides: str, scenes: tuple[str, ...] = ("x",)) -> str:
+    return protocol_of(tiny("tokengs", *overrides), None, scenes).sha256
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    file = tmp_path / "published.json"
+    file.write_text(json.dumps(INDEX))
+    return file
+
+
+def test_neither_place_nor_form_of_the_index_matters(
+    tiny: Callable[..., Recipe], file: Path, tmp_path: Path
+) -> None:
+    first = indexed(tiny, file)
+    assert first.name == "published"
+    copy = tmp_path / "elsewhere" / "renamed.json"
+    copy.parent.mkdir()
+    shutil.copy(file, copy)
+    assert indexed(tiny, copy).sha256 == first.sha256
+    copy.write_text(json.dumps(dict(reversed(INDEX.items())), indent=4))
+    assert indexed(tiny, copy).sha256 == first.sha256
+    assert str(tmp_path) not in first.canonical
+    named = indexed(tiny, file, "evaluation.protocol=mine")
+    assert (named.name, named.sha256) == ("mine", first.sha256)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"a": {"context": [3, 0], "target": [1, 2]}, "b": None},
+        {"a": {"context": [0, 3], "target": [1]}, "b": None},
+        {"a": {"context": [0, 3], "target": [1, 2]}},
+        {"a": {"context": [0, 3], "target": [1, 2]}, "b": {"context": [0], "target": [1]}},
+    ],
+)
+def test_the_content_of_the_index_is_hashed(
+    tiny: Callable[..., Recipe], file: Path, changed: dict
+) -> None:
+    first = indexed(tiny, file).sha256
+    file.write_text(json.dumps(changed))
+    assert indexed(tiny, file).sha256 != first
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "data.image_size=[64, 32]",
+        "views.frame=mean_cam",
+        "views.scale=distance",
+        "views.scale_factor=0.5",
+        "evaluation.metrics=[lpips]",
+        "evaluation.tuning_steps=50",
+        "data.fov=[60.0, 70.0]",
+    ],
+)
+def test_whatever_decides_the_numbers_is_hashed(
+    tiny: Callable[..., Recipe], file: Path, override: str
+) -> None:
+    assert indexed(tiny, file, override).sha256 != indexed(tiny, file).sha256
+    assert drawn(tiny, override) != drawn(tiny)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "training.steps=7",
+        "model.queries.count=48",
+        "data.cache_mb=1",
+        "views.mirror=0.25",
+        "seed=4",
+    ],
+)
+def test_nothing_else_is_hashed(tiny: Callable[..., Recipe], file: Path, override: str) -> None:
+    assert indexed(tiny, file, override).sha256 == indexed(tiny, file).sha256
+    assert drawn(tiny, override) == drawn(tiny)
+
+
+@pytest.mark.parametrize(
+    "override", ["evaluation.seed=1", "evaluation.samples=2", "views.gap=[3, 5]"]
+)
+def test_how_views_are_drawn_counts_only_where_they_are(
+    tiny: Callable[..., Recipe], file: Path, override: str
+) -> None:
+    assert indexed(tiny, file, override).sha256 == indexed(tiny, file).sha256
+    assert drawn(tiny, override) != drawn(tiny)
+
+
+def test_drawn_scenes_are_named(tiny: Callable[..., Recipe]) -> None:
+    assert drawn(tiny, scenes=("x", "y")) != drawn(tiny, scenes=("x",))
+
+
+def test_settings_tell_a_long_index_shortly(tiny: Callable[..., Recipe], file: Path) -> None:
+    views = indexed(tiny, file).settings()["views"]
+    assert views["index"]["scenes"] == 2
+    assert "a" not in views["index"]
