@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from qgs.cli import bench, demo, evaluate, inspect, reconstruct, train, weights
+from qgs.cli import bench, data, demo, evaluate, inspect, reconstruct, train, weights
 
 app = typer.Typer(
     name="qgs",
@@ -17,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _group in (inspect, train, evaluate, reconstruct, weights, bench, demo):
+for _group in (inspect, train, evaluate, reconstruct, weights, data, bench, demo):
     _group.register(app)
 
 

@@ -96,7 +96,7 @@ def test_reduced_photos_are_chosen(tmp_path):
     assert image[0, 0, 0, 0] * 255 == pytest.approx(90)
     assert opened(tmp_path).scenes("train")[0].images([0])[0, 0, 0, 0] == 0
     with pytest.raises(FileNotFoundError, match="images_2"):
-        opened(tmp_path, images="images_2").scenes("train")[0]
+        len(opened(tmp_path, images="images_2").scenes("train")[0])
 
 
 def test_distortion_is_undone(tmp_path):
@@ -130,7 +130,7 @@ def test_archives_that_lead_outside_are_refused_by_name(tmp_path, name):
     archive(tmp_path / "abc.zip", {**scene_files("abc/"), name: b""})
     told = name.replace("\\", "/") if name.startswith("..\\") else name
     with pytest.raises(ValueError, match="leads outside the archive") as error:
-        opened(tmp_path).scenes("train")[0]
+        len(opened(tmp_path).scenes("train")[0])
     assert "abc.zip" in str(error.value)
     assert repr(name) in str(error.value) or repr(told) in str(error.value)
 
@@ -147,14 +147,14 @@ def test_archives_that_lead_outside_are_refused_by_name(tmp_path, name):
 def test_incomplete_archives_are_told(tmp_path, files, message):
     archive(tmp_path / "abc.zip", files)
     with pytest.raises((ValueError, OSError), match=message):
-        opened(tmp_path).scenes("train")[0]
+        len(opened(tmp_path).scenes("train")[0])
 
 
 def test_broken_archives_are_told(tmp_path):
     (tmp_path / "abc.zip").write_bytes(b"PK nothing")
     source = opened(tmp_path)  # listed without being opened
     with pytest.raises(ValueError, match=r"abc\.zip is no zip archive or is cut off"):
-        source.scenes("train")[0]
+        len(source.scenes("train")[0])
 
 
 def test_a_damaged_photo_names_archive_and_file(tmp_path):

@@ -8,8 +8,8 @@ divided by the image's width and height, two numbers without use, and the rows o
 world-to-camera matrix.
 
 `qgs` adds keys that other readers ignore: `names` (V strings), `sizes` (V, 2), the height and width
-of every image, and `masks`, a list of V uint8 tensors with the bytes of PNG files, empty where a
-frame has none.
+of every image, `masks`, a list of V uint8 tensors with the bytes of PNG files, empty where a frame
+has none, and `held_out`, the frames that training is not to see.
 """
 
 from qgs.data.chunks.source import ChunkScene, ChunksSource

@@ -29,6 +29,7 @@ class Record:
     where: file and key, for messages. cameras: (V, 18) float32. images: V uint8 tensors with the
     bytes of image files. names: V names of frames. sizes: (V, 2) height and width, None where the
     chunk does not say. masks: V uint8 tensors, empty for a frame without one; None without masks.
+    held_out: frames that training is not to see.
     """
 
     where: str
@@ -38,6 +39,7 @@ class Record:
     names: Sequence[str]
     sizes: Tensor | None
     masks: Sequence[Tensor] | None
+    held_out: tuple[int, ...]
 
     def __len__(self) -> int:
         return len(self.images)
@@ -99,7 +101,8 @@ def parse_record(where: str, data: Any) -> Record:
     if masks is not None:
         masks = _as_many(where, "masks", _encoded(where, "masks", masks), len(images))
     names = _names(where, data, len(images))
-    return Record(where, data["key"], cameras, images, names, sizes, masks)
+    held_out = _frames(where, data.get("held_out"), len(images))
+    return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
 
 
 def _kind(data: Any) -> str:
@@ -146,6 +149,17 @@ def _names(where: str, data: Mapping[str, Any], count: int) -> Sequence[str]:
     if isinstance(stamps, Tensor) and stamps.numel() == count:
         return [str(stamp) for stamp in stamps.flatten().tolist()]
     return [str(frame) for frame in range(count)]
+
+
+def _frames(where: str, data: Any, count: int) -> tuple[int, ...]:
+    if data is None:
+        return ()
+    frames = data.tolist() if isinstance(data, Tensor) else list(data)
+    if not all(isinstance(frame, int) and 0 <= frame < count for frame in frames):
+        raise ValueError(
+            f"{where}: 'held_out' must list frames from 0 to {count - 1}, got {frames}: {_AGAIN}"
+        )
+    return tuple(frames)
 
 
 def judge_record(record: Record) -> None:

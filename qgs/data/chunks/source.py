@@ -32,9 +32,9 @@ class ChunksConfig(SceneSource.Config):
 
     path: folder or fsspec URL that holds train/ and test/, relative to the working directory.
     holdout: every n-th frame of each scene is kept for evaluation, from frame n // 2 on; 0 for
-    none. max_scenes: only the first scenes of each split, 0 for all. min_frames: scenes with fewer
-    frames are left out, which opens every chunk once at the start; 0 keeps all. background: RGB
-    behind transparent pixels.
+    those that `qgs data pack` took over from its source, none in other chunks. max_scenes: only the
+    first scenes of each split, 0 for all. min_frames: scenes with fewer frames are left out, which
+    opens every chunk once at the start; 0 keeps all. background: RGB behind transparent pixels.
     """
 
     path: str
@@ -64,9 +64,11 @@ class ChunkScene(EncodedScene):
 
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
-        """See `Scene`."""
+        """See `Scene`: as the option says, else as the chunk does."""
         every = self._config.holdout
-        return tuple(range(every // 2, len(self), every)) if every else ()
+        if not every:
+            return self._record.held_out
+        return tuple(range(every // 2, len(self), every))
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -113,6 +115,7 @@ class ChunkScene(EncodedScene):
             intrinsics=(fx * width, fy * height, cx * width, cy * height),
             size=size,
             mask=mask or None,
+            background=self._config.background,
         )
 
     def _pixels(self, record: Record, frame: int) -> np.ndarray:
@@ -189,8 +192,8 @@ class ChunkScenes(Sequence[Scene]):
 class ChunksSource(SceneSource):
     """Chunks under PATH/train and PATH/test; a folder without these is the training split.
 
-    A data set without test chunks is evaluated on the held-out frames of its training scenes, if
-    `holdout` asks for any.
+    A data set without test chunks is evaluated on the held-out frames of its training scenes,
+    where there are any.
 
     missing: keys that an index.json names and whose chunks do not exist, by split.
     """
@@ -210,17 +213,22 @@ class ChunksSource(SceneSource):
             split: ChunkScenes(store, _chosen(store, listing, config), config)
             for split, listing in listings.items()
         }
-        nothing = ChunkScenes(store, {}, config)
-        self._splits.setdefault("train", nothing)
-        self._splits.setdefault("test", self._splits["train"] if config.holdout else nothing)
+        self._nothing = ChunkScenes(store, {}, config)
+        self._splits.setdefault("train", self._nothing)
 
     def scenes(self, split: Split) -> Sequence[Scene]:
-        """See `SceneSource`."""
-        return self._splits[split]
+        """See `SceneSource`. Opens a chunk to learn whether its frames are held out."""
+        return self._split(split)
+
+    def _split(self, split: Split) -> ChunkScenes:
+        if split in self._splits:
+            return self._splits[split]
+        train = self._splits["train"]
+        return train if len(train) and train[0].held_out else self._nothing
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
         """See `SceneSource`: one group for each chunk file."""
-        return self._splits[split].groups()
+        return self._split(split).groups()
 
 
 def _folders(path: UPath) -> dict[Split, UPath]:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import overload
 
 from pydantic import Field
+from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.dl3dv.layout import Place, find_scenes, scene_folder
+from qgs.data.encoded import EncodedFrame, EncodedScene
 from qgs.data.paths import opened_path
 from qgs.data.photo_scene import Development, PhotoScene, pixel_cache
 from qgs.data.photos import held_out_frames, present_frames
 from qgs.data.scene_lists import read_scene_list
+from qgs.types import Cameras
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +57,48 @@ class Dl3dvScenes(Sequence[Scene]):
     def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
         if isinstance(index, slice):
             return [self[i] for i in range(len(self))[index]]
-        return open_scene(*self._places[index], self._config)
+        return Dl3dvScene(*self._places[index], self._config)
+
+
+class Dl3dvScene(EncodedScene):
+    """A scene that is opened when more than its name is asked for; see `open_scene`."""
+
+    def __init__(self, name: str, place: Place, config: Dl3dvConfig) -> None:
+        self.name = name
+        self._place, self._config = place, config
+
+    @cached_property
+    def _photos(self) -> PhotoScene:
+        return open_scene(self.name, self._place, self._config)
+
+    def __len__(self) -> int:
+        return len(self._photos)
+
+    @property
+    def held_out(self) -> Sequence[int]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """See `Scene`."""
+        return self._photos.held_out
+
+    @property
+    def cameras(self) -> Cameras:
+        """See `Scene`; float64."""
+        return self._photos.cameras
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`. Raises ValueError for a file that cannot be decoded."""
+        return self._photos.images(frames)
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`."""
+        return self._photos.masks(frames)
+
+    def frame_name(self, frame: int) -> str:
+        """See `Scene`: the image file, relative to the folder of transforms.json."""
+        return self._photos.frame_name(frame)
+
+    def encoded(self, frame: int) -> EncodedFrame:
+        """See `EncodedScene`."""
+        return self._photos.encoded(frame)
 
 
 def open_scene(name: str, place: Place, config: Dl3dvConfig) -> PhotoScene:

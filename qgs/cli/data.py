@@ -1,0 +1,160 @@
+"""`qgs data`: looking after data sets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from qgs.contracts import SceneSource
+    from qgs.io.packing import Packed, Splits
+
+Options = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Option of the source, such as images=images_4; repeatable."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group of commands to `app`."""
+    group = typer.Typer(no_args_is_help=True, help="Pack data sets.")
+    group.callback()(_group)
+    group.command("pack")(pack)
+    app.add_typer(group, name="data")
+
+
+def _group() -> None:
+    """Look after data sets."""
+
+
+def pack(
+    path: Annotated[str, typer.Argument(help="Data set, or recipe (.yaml) whose data to pack.")],
+    out: Annotated[str, typer.Option(help="New folder or URL for the chunks.")],
+    options: Options = None,
+    image_size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="Height and width of all images; their own by default.", min=1),
+    ] = None,
+    jpeg: Annotated[
+        int | None,
+        typer.Option(
+            help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100
+        ),
+    ] = None,
+    chunk_mb: Annotated[int, typer.Option(help="Size of a chunk, in megabytes.", min=1)] = 100,
+    test_scenes: Annotated[
+        str | None, typer.Option(help="File that names the test scenes: an index, a list.")
+    ] = None,
+    test_every: Annotated[
+        int | None, typer.Option(help="Every n-th scene is a test scene.", min=2)
+    ] = None,
+    leave_out_broken: Annotated[
+        bool, typer.Option(help="Leave out scenes that cannot be read, and name them.")
+    ] = False,
+) -> None:
+    """Turn any data set into chunks, the format that training reads fastest.
+
+    JPEG and PNG photos of pinhole cameras stay as they are; others are undistorted, resized if
+    asked to, and written as PNG. Called again, it finishes what was interrupted.
+    """
+    from rich.console import Console
+
+    from qgs.data.paths import opened_path
+    from qgs.io import packing
+
+    console = Console()
+    source, settings = _opened(path, options or [], image_size)
+    splits = _splits(source, test_scenes, test_every)
+    settings |= {"test_scenes": test_scenes, "test_every": test_every}
+    with _Progress(console, sum(map(len, splits.values()))) as progress:
+        packed = packing.pack(
+            source,
+            splits,
+            opened_path(out),
+            settings,
+            packing.Encoding(image_size is not None, jpeg),
+            chunk_bytes=chunk_mb * 2**20,
+            leave_out_broken=leave_out_broken,
+            progress=progress.scene,
+        )
+    _conclude(console, packed, out)
+
+
+def _opened(
+    path: str, options: list[str], image_size: tuple[int, int] | None
+) -> tuple[SceneSource, dict[str, Any]]:
+    """The source of scenes at `path`, and what it was asked for."""
+    from qgs.composer import resolve
+    from qgs.data.paths import opened_path
+    from qgs.data.recognition import recognised
+
+    overrides = [f"data.{option}" for option in options]
+    if Path(path).suffix in {".yaml", ".yml"}:
+        recipe = resolve(path, overrides)
+    else:
+        type_ = recognised(opened_path(path))
+        recipe = resolve({"recipe": 1, "data": {"type": type_, "path": path}}, overrides)
+    source = recipe.build_data()
+    if image_size is not None:
+        source = type(source)(source.config.model_copy(update={"image_size": image_size}))
+    return source, {"source": type(source).name, **source.config.model_dump(mode="json")}
+
+
+def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None) -> Splits:
+    from qgs.data.paths import opened_path
+    from qgs.data.scene_lists import read_scene_list
+    from qgs.io.packing import own_splits, splits_by_list, splits_by_number
+
+    if test_scenes is not None and test_every is not None:
+        raise typer.BadParameter("give --test-scenes or --test-every, not both")
+    if test_scenes is not None:
+        return splits_by_list(source, read_scene_list(opened_path(test_scenes)))
+    if test_every is not None:
+        return splits_by_number(source, test_every)
+    return own_splits(source)
+
+
+class _Progress:
+    """A bar of scenes; nothing where no terminal is."""
+
+    def __init__(self, console: Console, scenes: int) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+        from rich.progress import TimeRemainingColumn as TimeLeft
+
+        columns = (MofNCompleteColumn(), BarColumn(), TimeLeft(), TextColumn("{task.description}"))
+        self._bar = Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        )
+        self._task = self._bar.add_task("", total=scenes)
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def scene(self, name: str) -> None:
+        """A scene is dealt with."""
+        self._bar.update(self._task, advance=1, description=name)
+
+
+def _conclude(console: Console, packed: Packed, out: str) -> None:
+    scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
+    again = f", {packed.resumed} of them packed before" if packed.resumed else ""
+    written = packed.frames - packed.kept
+    console.print(
+        f"{out}: scenes {scenes}{again}; {packed.frames} images now, {packed.kept} kept as they "
+        f"were, {written} written anew",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+    if packed.left_out:
+        console.print(f"{len(packed.left_out)} scenes could not be read and are left out:")
+        for name, reason in packed.left_out.items():
+            console.print(f"  {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
