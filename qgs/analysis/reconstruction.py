@@ -13,16 +13,10 @@ from torch import Tensor
 
 from qgs.analysis.orbit import orbit
 from qgs.analysis.pictures.figures import figure_picture, grid_figure
-from qgs.analysis.pictures.images import (
-    Picture,
-    depth_picture,
-    depth_range,
-    finer,
-    rgb_picture,
-    side_by_side,
-)
+from qgs.analysis.pictures.images import finer
 from qgs.data.sampling import Sample
 from qgs.io.atomic import replacing_entries, write_text
+from qgs.io.drawing import Picture, depth_picture, depth_range, rgb_picture, side_by_side
 from qgs.io.pictures import write_gif, write_png
 from qgs.io.ply import write_ply
 from qgs.metrics import mean_colour, nearest_input, psnr

@@ -9,8 +9,9 @@ import torch
 from PIL import Image, ImageDraw
 
 from qgs.analysis.pictures.ellipses import Ellipses, project_support
-from qgs.analysis.pictures.images import Picture, washed
+from qgs.analysis.pictures.images import washed
 from qgs.analysis.pictures.palette import INK, Color
+from qgs.io.drawing import Picture
 from qgs.types import Cameras, SpatialSupport
 
 OVERSAMPLING = 3

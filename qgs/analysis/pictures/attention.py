@@ -6,8 +6,9 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from qgs.analysis.pictures.images import Picture, washed
+from qgs.analysis.pictures.images import washed
 from qgs.analysis.pictures.palette import ATTENTION_MAP
+from qgs.io.drawing import Picture
 
 
 def patch_maps(row_M: Tensor, grid: tuple[int, int, int]) -> np.ndarray:

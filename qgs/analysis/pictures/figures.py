@@ -9,14 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qgs.analysis.pictures.images import Picture
-from qgs.analysis.pictures.palette import (
-    DEPTH_MAP,
-    MUTED,
-    categorical,
-    figure_style,
-    hex_color,
-)
+from qgs.analysis.pictures.palette import MUTED, categorical, figure_style, hex_color
+from qgs.io.drawing import DEPTH_MAP, Picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from qgs.io.drawing import NOTHING
+
 Color = tuple[int, int, int]
 
 CATEGORICAL: tuple[Color, ...] = (
@@ -21,10 +23,6 @@ CATEGORICAL: tuple[Color, ...] = (
 INK: Color = (32, 36, 42)
 MUTED: Color = (122, 128, 136)
 PAPER: Color = (255, 255, 255)
-NOTHING: Color = (232, 233, 235)
-"""Where there is nothing to show: no depth, no attention."""
-
-DEPTH_MAP = "viridis_r"
 ATTENTION_MAP = "magma"
 
 

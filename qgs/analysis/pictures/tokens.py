@@ -11,9 +11,10 @@ from einops import rearrange
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from qgs.analysis.pictures.images import Picture, rgb_picture, washed
+from qgs.analysis.pictures.images import washed
 from qgs.analysis.pictures.palette import INK, Color, categorical
 from qgs.geometry.projection import to_camera, to_pixels
+from qgs.io.drawing import Picture, rgb_picture
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians
 

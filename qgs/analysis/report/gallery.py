@@ -9,20 +9,13 @@ import torch
 
 from qgs.analysis.pictures.anchors import support_picture
 from qgs.analysis.pictures.attention import attention_pictures, patch_maps
-from qgs.analysis.pictures.images import (
-    Picture,
-    depth_picture,
-    depth_range,
-    enlarged,
-    finer,
-    rgb_picture,
-    side_by_side,
-)
+from qgs.analysis.pictures.images import enlarged, finer
 from qgs.analysis.pictures.tokens import Token, notable_tokens, token_picture
 from qgs.analysis.reconstruction import orbit_path
 from qgs.analysis.report.contents import Contender
 from qgs.analysis.trace import trace
 from qgs.data.sampling import Sample
+from qgs.io.drawing import Picture, depth_picture, depth_range, rgb_picture, side_by_side
 from qgs.metrics import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction, Rendering

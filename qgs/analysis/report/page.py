@@ -11,10 +11,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from qgs.analysis.pictures.figures import curves_figure, figure_picture
-from qgs.analysis.pictures.images import Picture
 from qgs.analysis.pictures.palette import hex_color
 from qgs.analysis.report import gallery
 from qgs.analysis.report.contents import Report
+from qgs.io.drawing import Picture
 from qgs.io.pictures import png_bytes
 
 
