@@ -1,0 +1,149 @@
+"""Published state dicts under our names and back; what no layout can hold is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from qgs.components import TOKENGS
+from qgs.composer import Recipe, resolve
+from qgs.io.published import (
+    PublishedError,
+    exact_layout_of,
+    from_published,
+    layout_of,
+    names_in,
+    shapes_of,
+    to_published,
+)
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "model.decoder.depth=2")
+TOKENGS_MODEL: dict[str, Any] = {"recipe": 1}
+LOCUS_MODEL: dict[str, Any] = {
+    "recipe": 1,
+    "plugins": ["locus"],
+    "model": {
+        "queries": {"type": "locus/anchored"},
+        "decoder": {
+            "cross_attention": {"type": "locus/ray_biased"},
+            "self_attention": {"type": "locus/anchor_aware"},
+            "refinement": {"type": "locus/refine"},
+        },
+        "centers": {"type": "locus/radius_scaled"},
+    },
+}
+
+Published = Callable[[str], dict[str, Tensor]]
+
+
+def small(tree: dict[str, Any], *overrides: str) -> Recipe:
+    return resolve(tree, [*SMALL, "model.supervision.layers=[2]", *overrides])
+
+
+def test_names_survive_both_ways(published: Published) -> None:
+    weights = published("tokengs_a")
+    recipe = resolve(TOKENGS.read(shapes_of(weights)))
+    ours = from_published(weights, recipe)
+    back = to_published(ours, recipe)
+    assert back.keys() == weights.keys()
+    assert all(back[name] is weights[name] for name in weights)
+
+
+@pytest.mark.parametrize("recipe", sorted(RECIPES.glob("ablations/*.yaml")), ids=lambda p: p.stem)
+def test_every_ablation_has_a_published_name_for_each_parameter(recipe: Path) -> None:
+    resolved = resolve(recipe)
+    names = names_in(resolved, exact_layout_of(resolved))
+    assert not names.unnamed
+    assert names.published.keys() == names.shapes.keys()
+    assert not names.mismatches({t: names.shapes[o] for o, t in names.published.items()})
+    assert not set(names.unused) & set(names.published.values())
+
+
+def test_the_published_size_counts_its_unused_parameters() -> None:
+    recipe = resolve(RECIPES / "locus/dl3dv_4096_4views.yaml")
+    names = names_in(recipe, layout_of(recipe))
+    width, head, layers = 1024, 64, 12
+    sizes = {"_pos_norm": head, "anchor_norm": width, "plucker_norm": width, "tau_sample": 1}
+    unused = sum(size for n in names.unused for part, size in sizes.items() if part in n)
+    assert unused == layers * (2 * 2 * width + 2 * 2 * head + 1) == 52_236
+
+
+def test_every_difference_is_listed_at_once(published: Published) -> None:
+    weights = published("tokengs_a")
+    recipe = resolve(TOKENGS.read(shapes_of(weights)))
+    del weights["gs_tokens"], weights["patch_embed.norm.bias"]
+    weights["activation_head.deconv.bias"] = torch.zeros(3)
+    weights["stranger"] = torch.zeros(1)
+    with pytest.raises(PublishedError) as caught:
+        from_published(weights, recipe)
+    for words in (
+        "4 differences",
+        "missing: gs_tokens",
+        "missing: patch_embed.norm.bias",
+        "unexpected: stranger",
+        "shape of activation_head.deconv.bias: (3,) in the file, (56,) in the recipe",
+    ):
+        assert words in str(caught.value)
+
+
+def test_a_tokengs_recipe_accepts_no_key_of_an_anchor(published: Published) -> None:
+    weights = published("tokengs_a")
+    recipe = resolve(TOKENGS.read(shapes_of(weights)))
+    stray = ("gs_anchor_xyz_raw", "enc_dec_backbone.decoder_blocks.0.gs_cross_attn.tau_sample")
+    with pytest.raises(PublishedError, match="2 differences") as caught:
+        from_published(weights | {name: torch.zeros(1) for name in stray}, recipe)
+    assert all(f"unexpected: {name}" in str(caught.value) for name in stray)
+
+
+@pytest.mark.parametrize(
+    ("tree", "overrides", "words"),
+    [
+        (TOKENGS_MODEL, ["model.head.norm=true"], ["head.norm.weight", "no such parameter"]),
+        (
+            LOCUS_MODEL,
+            ["model.decoder.refinement.center=false"],
+            ["refinements.0.center_mlp.fc1.weight", "this model has no such parameter"],
+        ),
+        (
+            LOCUS_MODEL,
+            ["model.decoder.layers={1: {refinement: {zero_init: true}}}"],
+            ["refinements.1.center_mlp.fc1.weight: LocusGS has no such parameter"],
+        ),
+        (
+            LOCUS_MODEL,
+            ["model.decoder.layers={0: {self_attention: {type: qgs/content}}}"],
+            ["TokenGS: model.queries is locus/anchored", "layers differ in their self_attention"],
+        ),
+        (
+            {
+                **TOKENGS_MODEL,
+                "model": {"decoder": {"layers": {1: {"feed_forward": {"ratio": 2}}}}},
+            },
+            [],
+            ["decoder.1.feed_forward.mlp.fc1.weight", "(64, 16), this model has (32, 16)"],
+        ),
+    ],
+)
+def test_models_that_no_layout_holds_are_refused(
+    tree: dict[str, Any], overrides: list[str], words: list[str]
+) -> None:
+    with pytest.raises(PublishedError) as caught:
+        exact_layout_of(small(tree, *overrides))
+    for part in words:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["tokengs", "locus"])
+def test_tiny_models_leave_and_come_back(name: str) -> None:
+    recipe = resolve(RECIPES / f"tiny/{name}.yaml", ["model.head.norm=false", *SMALL[:3]])
+    model = recipe.build_model()
+    weights = dict(model.state_dict())
+    back = from_published(to_published(weights, recipe), recipe)
+    assert back.keys() == weights.keys()
+    assert all(back[key] is weights[key] for key in weights)
