@@ -70,12 +70,14 @@ class _ClampedProduct(torch.autograd.Function):
     def forward(ctx: Any, left: Tensor, right: Tensor, lower: Tensor, dtype: torch.dtype) -> Tensor:
         (batch, count, _), tokens = left.shape, right.shape[-1]
         product = left.new_empty(batch, count, tokens, dtype=dtype)
-        # Number bounds are twice as fast as tensor ones, but reading them would stall a GPU.
-        bounds = (lower, torch.zeros_like(lower)) if lower.is_cuda else (lower.item(), 0.0)
         rows = max(BLOCK.get(left.device.type, BLOCK["cuda"]) // max(batch * tokens, 1), 1)
         for start in range(0, count, rows):
-            block = left[:, start : start + rows] @ right
-            product[:, start : start + rows] = block.clamp_(*bounds)
+            product[:, start : start + rows] = left[:, start : start + rows] @ right
+        # Number bounds are twice as fast as tensor ones, but reading them would stall a GPU.
+        if lower.is_cuda:
+            product.clamp_(lower, torch.zeros_like(lower))
+        else:
+            product.clamp_(lower.item(), 0.0)
         ctx.save_for_backward(left, right, lower, product)
         return product
 
