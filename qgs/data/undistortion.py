@@ -28,7 +28,10 @@ def undistorted(
     height, width = pixels.shape[:2]
     grid = _source_grid(intrinsics, lens, (height, width))
     planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
-    flat = F.grid_sample(planes[None], grid[None], mode=mode, align_corners=False)[0]
+    flat = F.grid_sample(
+        planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
+    )[0]
+    flat = flat * (grid.abs() <= 1).all(-1)
     result = flat.permute(1, 2, 0).numpy().reshape(pixels.shape)
     if np.issubdtype(pixels.dtype, np.integer):
         result = result.round()

@@ -1,0 +1,218 @@
+"""COLMAP models: camera models, lenses, names, and models that are broken."""
+
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from photo_formats import synthetic, world_to_camera, write_colmap, write_nerfstudio
+from PIL import Image
+
+from qgs.contracts.extras import MissingExtraError
+from qgs.data import PhotosSource
+from qgs.data.frames import PhotoFrame
+from qgs.data.paths import opened_path
+from qgs.data.photo_scene import PhotoScene
+from qgs.data.readers import formats_of, read_listing
+from qgs.data.validation import frame_faults
+
+pycolmap = pytest.importorskip("pycolmap")
+
+SIZE = (60, 80)
+CAMERAS = [
+    ("SIMPLE_PINHOLE", 0, (60.0, 41.0, 29.0)),
+    ("PINHOLE", 1, (60.0, 62.0, 41.0, 29.0)),
+    ("SIMPLE_RADIAL", 2, (60.0, 41.0, 29.0, -0.15)),
+    ("RADIAL", 3, (60.0, 41.0, 29.0, -0.12, 0.05)),
+    ("OPENCV", 4, (60.0, 62.0, 41.0, 29.0, -0.1, 0.03, 0.01, -0.02)),
+    ("OPENCV_FISHEYE", 5, (50.0, 52.0, 41.0, 29.0, 0.05, -0.02, 0.01, -0.003)),
+    ("SIMPLE_RADIAL_FISHEYE", 8, (50.0, 41.0, 29.0, 0.05)),
+    ("RADIAL_FISHEYE", 9, (50.0, 41.0, 29.0, 0.05, -0.02)),
+]
+
+
+def read(folder: Path, size=SIZE, **options) -> PhotoScene:
+    config = {"path": str(folder), "image_size": size, **options}
+    return PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
+
+
+def frames(folder: Path) -> list[PhotoFrame]:
+    return list(read_listing(opened_path(folder)).frames)
+
+
+def colours(directions: np.ndarray) -> np.ndarray:
+    """What a far wall shows in directions (..., 2) of the plane z = 1, as 8-bit RGB."""
+    x, y = np.moveaxis(directions, -1, 0)
+    levels = 128 + 80 * np.stack([np.sin(2 * x), np.cos(3 * y), np.sin(2 * x - y)], -1)
+    return levels.round().clip(1, 255).astype(np.uint8)
+
+
+def pixel_centres() -> np.ndarray:
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    return np.stack([u, v], -1)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=[name for name, *_ in CAMERAS])
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera, kind):
+    """pycolmap says in which direction each pixel of the lens looks."""
+    name, number, parameters = camera
+    lens = pycolmap.Camera(model=name, width=SIZE[1], height=SIZE[0], params=parameters)
+    directions = lens.cam_from_img(pixel_centres().reshape(-1, 2)).reshape(*SIZE, 2)
+    photos = synthetic(tmp_path / "photos", 2, SIZE)
+    for file in photos.files:
+        Image.fromarray(colours(directions)).save(file)
+    scene = read(write_colmap(tmp_path, photos, kind, camera))
+    fx, fy, cx, cy = scene.cameras.intrinsics[0].tolist()
+    assert [fx, fy, cx, cy] == [lens.focal_length_x, lens.focal_length_y, 41, 29]
+    pixels = scene.images([1])[0].mul(255).permute(1, 2, 0).numpy()
+    expected = colours((pixel_centres() - [cx, cy]) / [fx, fy])
+    seen = (pixels > 0).all(-1)
+    assert seen.mean() > 0.9
+    error = np.abs(pixels - expected)[seen]
+    assert error.max() < (1e-4 if number < 2 else 3)
+    assert error.mean() < 0.5
+
+
+@pytest.mark.parametrize("camera", CAMERAS[2:], ids=[name for name, *_ in CAMERAS[2:]])
+def test_lenses_bend_as_pycolmap_bends(tmp_path, camera):
+    lens = frames(write_colmap(tmp_path, synthetic(tmp_path / "p", 2), "text", camera))[0].lens
+    assert lens is not None
+    model = pycolmap.Camera(model=camera[0], width=80, height=60, params=camera[2])
+    points = torch.tensor([[0.0, 0.0], [0.3, -0.2], [-0.5, 0.4], [0.01, 0.6]]).double()
+    expected = model.img_from_cam(np.column_stack([points, np.ones(4)]))
+    focal = np.array([model.focal_length_x, model.focal_length_y])
+    bent = lens.distorted(points).numpy() * focal + [41, 29]
+    np.testing.assert_allclose(bent, expected, atol=1e-9)
+
+
+def test_other_camera_models_are_refused_and_listed(tmp_path):
+    camera = ("FOV", 7, (50.0, 50.0, 20.0, 15.0, 0.9))
+    folder = write_colmap(tmp_path, synthetic(tmp_path / "p", 2), "binary", camera)
+    with pytest.raises(ValueError, match=r"view_000\.png.*FOV is not known.*image_undistorter"):
+        read(folder)
+    listed = frames(folder)
+    assert len(listed) == 2
+    assert [fault.fatal for fault in frame_faults(listed[1])] == [True]
+    assert np.isfinite(listed[1].c2w).all()
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_names_in_folders_are_read_in_their_order(tmp_path, kind, model):
+    photos = synthetic(tmp_path / "photos", 3)
+    names = ["right/1 a.png", "left/2.png", "left/10.png"]
+    if model == ".":
+        write_colmap(tmp_path, photos, kind, model="model", names=names)
+        for file in (tmp_path / "model").iterdir():
+            file.rename(tmp_path / file.name)
+    else:
+        write_colmap(tmp_path, photos, kind, model=model, names=names)
+    scene = read(tmp_path, (30, 40))
+    ordered = ["left/10.png", "left/2.png", "right/1 a.png"]
+    assert [scene.frame_name(i) for i in range(3)] == [f"images/{name}" for name in ordered]
+    np.testing.assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)
+
+
+def test_models_that_pycolmap_writes(tmp_path):
+    """Its files hold rigs and frames besides, which older versions did not know."""
+    photos = synthetic(tmp_path / "photos", 3)
+    folder = write_colmap(tmp_path / "a", photos, "text")
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    for kind in ("text", "binary"):
+        copy = tmp_path / kind / "sparse"
+        copy.mkdir(parents=True)
+        getattr(model, f"write_{kind}")(str(copy))
+        (folder / "images").rename(copy.parent / "images")
+        assert (copy / f"rigs.{'txt' if kind == 'text' else 'bin'}").is_file()
+        np.testing.assert_allclose(read(copy.parent).cameras.c2w, photos.c2w, atol=1e-9)
+        folder = copy.parent
+
+
+def test_quaternions_of_any_length_and_no_rotation_at_all(tmp_path):
+    photos = synthetic(tmp_path / "photos", 2)
+    folder = write_colmap(tmp_path, photos, "text")
+    file = folder / "sparse" / "0" / "images.txt"
+    pose = world_to_camera(photos.c2w[0])
+    longer = [3 * q for q in pose[:4]] + list(pose[4:])
+    file.write_text(f"1 {' '.join(map(str, longer))} 7 view_000.png\n\n2 0 0 0 0 1 2 3 7 b.png\n\n")
+    first, second = frames(folder)[::-1]
+    np.testing.assert_allclose(first.c2w, photos.c2w[0], atol=1e-9)
+    assert [fault.reason for fault in frame_faults(second)] == [
+        "the pose has NaN or infinite numbers"
+    ]
+
+
+def cut(file: Path, size: int) -> None:
+    file.write_bytes(file.read_bytes()[:size])
+
+
+BROKEN = {
+    "no count": lambda model: cut(model / "images.bin", 4),
+    "a pose cut off": lambda model: cut(model / "images.bin", 60),
+    "a name cut off": lambda model: cut(model / "images.bin", 76),
+    "points cut off": lambda model: cut(model / "images.bin", 110),
+    "an image cut off": lambda model: cut(model / "images.bin", 200),
+    "a camera cut off": lambda model: cut(model / "cameras.bin", 40),
+    "an unknown camera": lambda model: (model / "cameras.bin").write_bytes(
+        struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)
+    ),
+    "no camera": lambda model: (model / "cameras.bin").write_bytes(struct.pack("<Q", 0)),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_broken_binary_models_are_told(tmp_path, what):
+    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "binary")
+    BROKEN[what](folder / "sparse" / "0")
+    with pytest.raises(ValueError, match=r"COLMAP model .*sparse/0 .*cannot be read: .*again"):
+        read(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 1 0 0 0 0 0 1 a.png", "where an image was expected"),
+        ("one 1 0 0 0 0 0 1 7 a.png", "where an image was expected"),
+        ("1 1 0 0 0 zero 0 1 7 a.png", "cannot be read"),
+        ("1 1 0 0 0 0 0 1 8 a.png", "cannot be read"),
+    ],
+)
+def test_broken_text_models_are_told(tmp_path, line, message):
+    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "text")
+    (folder / "sparse" / "0" / "images.txt").write_text(f"{line}\n\n")
+    with pytest.raises(ValueError, match=message):
+        read(folder)
+
+
+def test_photos_beside_the_model_are_needed(tmp_path):
+    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "text", images="pictures")
+    with pytest.raises(FileNotFoundError, match="neither a folder `images` nor a scaled copy"):
+        read(folder)
+    assert read(folder, images="pictures").frame_name(1) == "pictures/view_001.png"
+
+
+def test_a_missing_package_is_told(tmp_path, monkeypatch):
+    photos = synthetic(tmp_path / "photos", 2)
+    folder = write_colmap(tmp_path, photos, "text")
+    monkeypatch.setattr("qgs.data.readers.colmap_model.find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"pip install qgs\[colmap\]"):
+        read(folder)
+    assert formats_of(opened_path(folder)) == ["colmap"]
+    write_nerfstudio(folder, replace(photos, intrinsics=(50.0, 50.0, 20.0, 15.0)))
+    assert len(read(folder)) == 2
+
+
+def test_pycolmap_is_imported_for_models_alone(tmp_path):
+    import subprocess
+
+    folder = write_nerfstudio(tmp_path, synthetic(tmp_path / "photos", 2))
+    code = (
+        "import sys; from qgs.data import read_photos;"
+        f"read_photos({str(folder)!r}, (8, 8)); print('pycolmap' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
