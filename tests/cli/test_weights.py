@@ -1,0 +1,142 @@
+"""`qgs import` and `qgs export`: what is told, and exit code 2 for wrong files."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+import qgs
+from qgs.cli import main
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """`run("import", ..., code=0)`: what the command tells; the exit code is checked."""
+
+    def call(*words: object, code: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", ["qgs", *map(str, words)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        assert (stopped.value.code or 0) == code
+        told = capsys.readouterr()
+        return told.err if code else told.out
+
+    return call
+
+
+def weights_of(name: str) -> dict[str, Tensor]:
+    with safe_open(GOLDEN / f"{name}.safetensors", "pt") as file:
+        names = [name for name in file.keys() if name.startswith("weights.")]  # noqa: SIM118
+        return {name.removeprefix("weights."): file.get_tensor(name) for name in names}
+
+
+@pytest.fixture
+def locus(tmp_path: Path) -> Path:
+    save_file(weights_of("locus_full_a"), tmp_path / "locus.safetensors")
+    return tmp_path / "locus.safetensors"
+
+
+def test_there_and_back(run: Callable[..., str], locus: Path, tmp_path: Path) -> None:
+    out, back = tmp_path / "c.safetensors", tmp_path / "back.safetensors"
+    told = run("import", locus, "--recipe", "auto", "--out", out)
+    assert "LocusGS (leo-frank/LocusGS): 109 tensors used" in told
+    assert "  enc_dec_backbone.decoder_blocks.1.gs_cross_attn.tau_sample\n" in told
+    assert "bandwidth of the ray bias" in told
+    assert "# " in out.with_suffix(".yaml").read_text(encoding="utf-8")
+    assert qgs.load(out).depth == 2
+    told = run("export", out, "--layout", "published", "--out", back)
+    assert "109 tensors written" in told
+    assert "strict=False" in told
+    again = tmp_path / "again.safetensors"
+    run("import", back, "--recipe", out.with_suffix(".yaml"), "--out", again)
+    assert "knowingly dropped" not in told
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(qgs.load(out).parameters(), qgs.load(again).parameters(), strict=True)
+    )
+
+
+def test_set_changes_the_recipe(run: Callable[..., str], locus: Path, tmp_path: Path) -> None:
+    run("import", locus, "--recipe", "auto", "--out", tmp_path / "c.safetensors")
+    options = ("--recipe", tmp_path / "c.yaml", "--out", tmp_path / "d.safetensors")
+    told = run("import", locus, *options, "--set", "model.head.gaussians_per_query=5", code=2)
+    assert "model.head.gaussians_per_query: 4 (the recipe has 5)" in told
+    assert "shape of activation_head.deconv.weight: (56, 64) in the file, (70, 64)" in told
+    run("import", locus, *options, "--set", "model.head.scale_cap=0.1")
+    recipe = qgs.load(tmp_path / "d.safetensors").recipe
+    assert recipe is not None
+    assert recipe["model"]["head"]["scale_cap"] == 0.1
+
+
+def half(path: Path) -> None:
+    save_file({name: tensor.half() for name, tensor in weights_of("locus_full_a").items()}, path)
+
+
+def tokengs(path: Path) -> None:
+    save_file(weights_of("tokengs_a"), path)
+
+
+def extra(path: Path) -> None:
+    save_file(weights_of("locus_full_a") | {"extra.bias": torch.zeros(4)}, path)
+
+
+def renamed_pickle(path: Path) -> None:
+    torch.save(weights_of("locus_full_a"), path)
+
+
+def truncated(path: Path) -> None:
+    save_file(weights_of("locus_full_a"), path)
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (half, "float16"),
+        (tokengs, "weights of TokenGS"),
+        (extra, "unexpected: extra.bias"),
+        (renamed_pickle, "PyTorch (zip) file"),
+        (truncated, "not a whole safetensors file"),
+        (Path.touch, "is empty"),
+        (Path.mkdir, "is a folder"),
+    ],
+)
+def test_wrong_files_end_with_one_error_and_leave_nothing(
+    run: Callable[..., str], locus: Path, tmp_path: Path, make: Callable[[Path], None], words: str
+) -> None:
+    run("import", locus, "--recipe", "auto", "--out", tmp_path / "c.safetensors")
+    make(tmp_path / "wrong.safetensors")
+    before = sorted(tmp_path.iterdir())
+    out = tmp_path / "new" / "x.safetensors"
+    told = run(
+        "import", tmp_path / "wrong.safetensors", "--recipe", tmp_path / "c.yaml", "--out", out,
+        code=2,
+    )  # fmt: skip
+    assert told.count("error:") == 1
+    assert words in told
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_half_precision_on_demand(run: Callable[..., str], tmp_path: Path) -> None:
+    half(tmp_path / "h.safetensors")
+    told = run(
+        "import", tmp_path / "h.safetensors", "--recipe", "auto", "--to-float32",
+        "--out", tmp_path / "c.safetensors",
+    )  # fmt: skip
+    assert "converted to float32: 109 of 109 are float16" in told
+
+
+def test_auto_takes_no_overrides(run: Callable[..., str], locus: Path, tmp_path: Path) -> None:
+    out = tmp_path / "c.safetensors"
+    told = run("import", locus, "--recipe", "auto", "--out", out, "--set", "seed=1", code=2)
+    assert "--recipe auto" in told
+    assert not out.exists()
