@@ -27,6 +27,7 @@ class TrainingProgress:
         )
         self._task = self._bar.add_task("training", total=1.0, step=0, line="")
         self._next = 0.0
+        self._start: tuple[int, float, float] | None = None
         self._interval = _REFRESH_SECONDS if console.is_terminal else _LOG_SECONDS
 
     def __enter__(self) -> TrainingProgress:
@@ -42,14 +43,19 @@ class TrainingProgress:
     ) -> bool:
         """Show a step, unless the last one was shown a moment ago; returns whether it did.
 
-        images: seen so far. used: fraction of the budget.
+        images, seconds: of the whole run so far. used: fraction of the budget. Speed and time left
+        are those of this session, which began with the first step that this is told.
         """
+        if self._start is None:
+            self._start = images, seconds, used
         now = time.monotonic()
         if now < self._next:
             return False
         self._next = now + self._interval
-        rate = images / seconds if seconds else 0.0
-        left = str(timedelta(seconds=round(seconds * (1 - used) / used))) if used else "?"
+        done, spent = images - self._start[0], seconds - self._start[1]
+        gained = used - self._start[2]
+        rate = done / spent if spent else 0.0
+        left = str(timedelta(seconds=round(spent * (1 - used) / gained))) if gained else "?"
         line = f"loss {loss:.4f}  PSNR {psnr:5.2f}  {rate:.0f} images/s  {left} left"
         if self._console.is_terminal:
             self._bar.update(self._task, completed=used, step=step, line=line, refresh=True)
