@@ -1,0 +1,134 @@
+"""Blender's splits and alpha; LLFF's rows and what goes wrong with them."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from photo_formats import PhotoSet, centred, synthetic, write_blender, write_llff
+from PIL import Image
+
+from qgs.data import PhotosSource
+from qgs.data.photo_scene import PhotoScene
+
+
+def read(folder: Path, size=(30, 40), **options) -> PhotoScene:
+    config = {"path": str(folder), "image_size": size, **options}
+    return PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
+
+
+@pytest.fixture
+def photos(tmp_path) -> PhotoSet:
+    return centred(synthetic(tmp_path / "photos"))
+
+
+def test_splits_come_from_the_files(tmp_path, photos):
+    scene = read(write_blender(tmp_path, photos, train=3, val=1), holdout=2)
+    assert len(scene) == 6
+    assert scene.held_out == (3, 4, 5)
+    names = [scene.frame_name(i) for i in range(6)]
+    parts = ["train", "train", "train", "val", "test", "test"]
+    assert names == [f"{part}/view_{i:03d}.png" for i, part in enumerate(parts)]
+    np.testing.assert_allclose(scene.cameras.c2w, photos.c2w, atol=1e-12)
+    expected = torch.tensor(photos.intrinsics).double().expand(6, 4)
+    torch.testing.assert_close(scene.cameras.intrinsics, expected)
+
+
+def test_a_training_file_alone(tmp_path, photos):
+    scene = read(write_blender(tmp_path, photos, train=6), holdout=3)
+    assert len(scene) == 6
+    assert scene.held_out == ()
+
+
+def test_alpha_is_the_mask_and_shows_the_background(tmp_path, photos):
+    write_blender(tmp_path, photos, train=6)
+    alpha = np.zeros((30, 40, 4), np.uint8)
+    alpha[:, :20] = [10, 20, 30, 255]
+    alpha[:, 20:] = [90, 90, 90, 102]
+    Image.fromarray(alpha).save(tmp_path / "train" / "view_001.png")
+    scene = read(tmp_path, background=(0.0, 1.0, 0.0))
+    masks = scene.masks([1, 2])
+    assert masks is not None
+    assert masks.shape == (2, 1, 30, 40)
+    assert masks[0, 0, 5, [3, 35]].tolist() == pytest.approx([1, 0.4])
+    assert (masks[1] == 1).all(), "a photo without alpha has nothing to hide"
+    shown = scene.images([1])[0, :, 5].mul(255).round()
+    assert shown[:, 3].tolist() == [10, 20, 30]
+    assert shown[:, 35].tolist() == [36, 189, 36]
+
+
+def test_the_angle_of_view_goes_with_the_images(tmp_path, photos):
+    write_blender(tmp_path, photos, train=6)
+    for file in (tmp_path / "train").iterdir():
+        Image.open(file).resize((80, 60)).save(file)
+    scene = read(tmp_path, (60, 80))
+    assert scene.cameras.intrinsics[0].tolist() == pytest.approx([100, 100, 40, 30])
+
+
+def test_images_cannot_be_replaced(tmp_path, photos):
+    with pytest.raises(ValueError, match="leave `images` out"):
+        read(write_blender(tmp_path, photos, train=6), images="images_2")
+
+
+def test_no_image_and_no_size(tmp_path):
+    frames = [{"file_path": f"train/{i}", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
+    content = {"camera_angle_x": math.pi / 2, "frames": frames}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"train/0\.png\): there is no focal length"):
+        read(tmp_path)
+
+
+def test_the_published_axes(tmp_path):
+    """A camera at (1, 2, 3) that looks along world +x with world +z up: down is -z, right is -y."""
+    row = np.zeros((2, 17))
+    matrix = [[0, 0, -1, 1, 30], [0, -1, 0, 2, 40], [-1, 0, 0, 3, 50]]
+    row[:, :15] = np.ravel(matrix)
+    np.save(tmp_path / "poses_bounds.npy", row)
+    (tmp_path / "images").mkdir()
+    for name in ("b.JPG", "a.JPG"):
+        Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
+    scene = read(tmp_path)
+    assert [scene.frame_name(i) for i in range(2)] == ["images/a.JPG", "images/b.JPG"]
+    right, down, ahead, centre = scene.cameras.c2w[0, :3].unbind(-1)
+    assert right.tolist() == [0, -1, 0]
+    assert down.tolist() == [0, 0, -1]
+    assert ahead.tolist() == [1, 0, 0]
+    assert centre.tolist() == [1, 2, 3]
+    assert scene.cameras.intrinsics[0].tolist() == [50, 50, 20, 15]
+
+
+def test_rows_and_images_must_agree(tmp_path, photos):
+    write_llff(tmp_path, photos)
+    (tmp_path / "images" / "view_003.png").unlink()
+    with pytest.raises(ValueError, match=r"6 poses, but .*images has 5 images"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (np.zeros((3, 15)), r"must have shape \(N, 17\), got \(3, 15\)"),
+        (np.zeros(17), r"must have shape \(N, 17\), got \(17,\)"),
+        (np.array([["a"] * 17]), r"must have shape \(N, 17\)"),
+        (np.array([[None] * 17]), "no NumPy file.*again"),
+        (b"hello", "no NumPy file.*again"),
+        (b"", "no NumPy file.*again"),
+    ],
+)
+def test_files_that_are_no_rows_are_told(tmp_path, photos, content, message):
+    write_llff(tmp_path, photos)
+    file = tmp_path / "poses_bounds.npy"
+    file.write_bytes(content) if isinstance(content, bytes) else np.save(file, content)
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path)
+
+
+def test_a_row_of_nan_names_its_photo(tmp_path, photos):
+    write_llff(tmp_path, photos)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    rows[2, 3] = np.nan
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    with pytest.raises(ValueError, match=r"frame 2 \(images/view_002\.png\): the pose has NaN"):
+        read(tmp_path)

@@ -1,0 +1,29 @@
+from multiprocessing.reduction import ForkingPickler
+
+import numpy as np
+
+from qgs.data.cache import BoundedCache
+
+
+def test_what_was_used_last_is_kept():
+    made: list[str] = []
+    cache: BoundedCache[str] = BoundedCache(6, len)
+
+    def get(key: str) -> str:
+        return cache.get(key, lambda: made.append(key) or key)
+
+    for key in ("aaa", "bbb", "aaa", "ccc", "aaa", "bbb"):
+        assert get(key) == key
+    assert made == ["aaa", "bbb", "ccc", "bbb"]
+    assert get("longer than all") == "longer than all"
+    assert made[-1] == "longer than all"
+    get("aaa")
+    assert made[-1] == "aaa"
+
+
+def test_copies_start_empty():
+    cache: BoundedCache[np.ndarray] = BoundedCache(10**6, len)
+    cache.get("a", lambda: np.zeros(10**5))
+    content = ForkingPickler.dumps(cache)
+    assert len(content) < 1000
+    assert ForkingPickler.loads(content).get("a", lambda: "made again") == "made again"

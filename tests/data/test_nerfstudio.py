@@ -1,0 +1,206 @@
+"""nerfstudio's masks, depth maps, splits, lenses and scaled copies."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from photo_formats import synthetic, write_nerfstudio
+from PIL import Image
+
+from qgs.contracts import ViewsConfig
+from qgs.data import PhotosSource, read_photos
+from qgs.data.lenses import Fisheye, RadialTangential
+from qgs.data.paths import opened_path
+from qgs.data.photo_scene import PhotoScene
+from qgs.data.sampling import make_sample
+from qgs.data.transforms_json import load_transforms, parse_transforms
+from qgs.data.validation import frame_faults, intrinsics_faults, pose_faults, size_faults
+
+
+def read(folder: Path, size=(30, 40), **options) -> PhotoScene:
+    config = {"path": str(folder), "image_size": size, **options}
+    return PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return write_nerfstudio(tmp_path, synthetic(tmp_path / "photos"))
+
+
+def change(folder: Path, frame: int | None = None, **values: Any) -> None:
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    (content if frame is None else content["frames"][frame]).update(values)
+    file.write_text(json.dumps(content))
+
+
+def save_mask(folder: Path, values: np.ndarray, frame: int = 1) -> None:
+    (folder / "masks").mkdir(exist_ok=True)
+    Image.fromarray(values).save(folder / "masks" / "m.png")
+    change(folder, frame, mask_path="masks/m.png")
+
+
+@pytest.mark.parametrize("value", [255, 1, True])
+def test_masks_are_read_at_the_delivered_size(folder, value):
+    mask = np.zeros((30, 40), np.uint8 if value is not True else bool)
+    mask[:, :20] = value
+    save_mask(folder, mask)
+    masks = read(folder, (15, 20)).masks([1, 2])
+    assert masks is not None
+    assert masks.shape == (2, 1, 15, 20)
+    assert masks[0, 0, 7, [2, 17]].tolist() == [1, 0]
+    assert (masks[1] == 1).all()
+
+
+def test_masks_reach_samples_and_views(folder):
+    mask = np.zeros((30, 40), np.uint8)
+    mask[:, :20] = 255
+    save_mask(folder, mask)
+    sample = make_sample(read(folder), (1, 3), (2,), ViewsConfig(inputs=2), mirror=True)
+    assert sample.inputs.masks is not None
+    assert sample.inputs.masks[0, :, 0, 5, 3].tolist() == [0, 1]
+    views = read_photos(folder, (30, 40), frames=[1])
+    assert views.masks is not None
+    assert views.masks[0, 0, 0, 5, [3, 30]].tolist() == [1, 0]
+
+
+def test_without_masks_there_are_none(folder):
+    assert read(folder).masks([0]) is None
+    assert read_photos(folder, (30, 40)).masks is None
+
+
+def test_masks_that_do_not_exist_or_do_not_fit_are_told(folder):
+    change(folder, 1, mask_path="masks/none.png")
+    with pytest.raises(FileNotFoundError, match=r"names 1 masks, of which 1 do not exist.*none"):
+        read(folder)
+    save_mask(folder, np.zeros((30, 30), np.uint8))
+    scene = read(folder)
+    with pytest.raises(ValueError, match=r"m\.png: the image is 30 x 30 pixels, but listed as 40"):
+        scene.masks([1])
+    (folder / "masks" / "m.png").write_text("no image")
+    with pytest.raises(ValueError, match=r"m\.png cannot be read as the mask"):
+        read(folder).masks([1])
+
+
+@pytest.mark.parametrize("suffix", ["png", "npy"])
+def test_depth_maps(folder, suffix):
+    depth = (1000 + 10 * np.arange(30 * 40).reshape(30, 40)).astype(np.uint16)
+    depth[0, 0] = 0
+    for i in (1, 2):
+        file = folder / f"depth_{i}.{suffix}"
+        Image.fromarray(depth).save(file) if suffix == "png" else np.save(file, depth)
+        change(folder, i, depth_file_path=file.name)
+    scene = read(folder)
+    depths = scene.depths([1, 2])
+    assert depths is not None
+    assert depths.shape == (2, 1, 30, 40)
+    np.testing.assert_allclose(depths[0, 0], depth * 1e-3, rtol=1e-6)
+    assert scene.depths([0, 1]) is None
+    halved = read(folder, (15, 20), depth_unit=2.0).depths([1])
+    assert halved is not None
+    assert set(halved.flatten().tolist()) <= set((2.0 * depth).ravel().tolist())
+
+
+def test_depth_that_is_not_finite_is_unknown(folder):
+    depth = np.full((30, 40, 1), 2000.0)
+    depth[3, 4], depth[5, 6] = np.nan, np.inf
+    np.save(folder / "depth.npy", depth)
+    change(folder, 0, depth_file_path="depth.npy")
+    depths = read(folder).depths([0])
+    assert depths is not None
+    assert depths[0, 0, [3, 5, 7], [4, 6, 8]].tolist() == [0, 0, 2]
+    np.save(folder / "depth.npy", np.zeros((30, 40, 3)))
+    with pytest.raises(ValueError, match="one number for each pixel"):
+        read(folder).depths([0])
+
+
+NAMES = [f"images/view_{i:03d}.png" for i in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("splits", "count", "held_out"),
+    [
+        ({"train_filenames": NAMES[:4]}, 6, (4, 5)),
+        ({"test_filenames": [f"./{NAMES[2]}"]}, 6, (2,)),
+        ({"train_filenames": NAMES[:3], "test_filenames": NAMES[4:]}, 5, (3, 4)),
+        ({"train_filenames": NAMES[:2], "val_filenames": NAMES[2:]}, 6, (2, 3, 4, 5)),
+    ],
+)
+def test_splits(folder, splits, count, held_out, caplog):
+    change(folder, **splits)
+    scene = read(folder, holdout=2)
+    assert (len(scene), scene.held_out) == (count, held_out)
+    assert ("in none of its splits" in caplog.text) == (count == 5)
+
+
+def test_a_split_that_names_no_frame_is_told(folder):
+    change(folder, train_filenames=["images/other.png"])
+    with pytest.raises(ValueError, match=r"transforms\.json: 'train_filenames' names .*other\.png"):
+        read(folder)
+
+
+def parsed(folder: Path):
+    location = opened_path(folder)
+    return parse_transforms(load_transforms(location / "transforms.json"), location)
+
+
+def test_lenses(folder):
+    change(folder, k1=0.1, p2=0.01, k3=0.002)
+    change(folder, 1, camera_model="OPENCV_FISHEYE", k3=0.0, p2=0.0, k4=0.3)
+    change(folder, 2, k1=0, p2=0, k3=None)
+    lenses = [frame.lens for frame in parsed(folder)[:3]]
+    assert lenses == [RadialTangential(0.1, p2=0.01, k3=0.002), Fisheye(0.1, k4=0.3), None]
+
+
+def test_the_world_is_that_of_the_poses(folder):
+    before = read(folder).cameras.c2w
+    change(folder, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]], applied_scale=3)
+    assert torch.equal(read(folder).cameras.c2w, before)
+
+
+def test_poses_keep_their_digits(folder):
+    pose = np.eye(4)
+    pose[0, 3] = 4_500_000.123456
+    change(folder, 1, transform_matrix=pose.tolist())
+    assert read(folder).cameras.c2w[1, 0, 3].item() == 4_500_000.123456
+
+
+def test_images_of_another_size_are_told_when_decoded(folder):
+    Image.new("RGB", (40, 40)).save(folder / NAMES[3])
+    scene = read(folder)
+    with pytest.raises(ValueError, match=r"view_003\.png: the image is 40 x 40 pixels, but listed"):
+        scene.images([3])
+
+
+def test_parsing_tells_all_and_raises_nothing(folder):
+    change(folder, 0, transform_matrix="none", fl_x="wide", k1=float("nan"))
+    change(folder, 1, transform_matrix=np.full((4, 4), np.nan).tolist(), cx=50.0)
+    change(folder, 2, file_path=None)
+    frames = parsed(folder)
+    assert len(frames) == 6
+    reasons = [[fault.reason for fault in frame_faults(frame)] for frame in frames]
+    assert [reason.split(" ")[0] for reason in reasons[0]] == [
+        "'transform_matrix'", "there", "the"
+    ]  # fmt: skip
+    assert reasons[1][0].startswith("the pose has NaN")
+    assert "principal point lies off the image" in reasons[1][1]
+    assert reasons[2] == ["it has no 'file_path'"]
+    assert reasons[3:] == [[], [], []]
+
+
+def test_judgements():
+    mirrored, scaled = np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1])
+    assert "mirrors" in str(*pose_faults(mirrored))
+    assert "not rigid" in str(*pose_faults(scaled))
+    assert not list(pose_faults(np.eye(4)))
+    assert not list(intrinsics_faults((50, 50, 20, 15), (30, 40)))
+    assert "normalised" in str(*intrinsics_faults((1.2, 1.6, 0.5, 0.5), (30, 40)))
+    (off,) = intrinsics_faults((50, 50, 20, 35), (30, 40))
+    (wide,) = intrinsics_faults((2000, 2000, 20, 15), (30, 40))
+    assert not off.fatal
+    assert not wide.fatal
+    assert "swapped" in str(*size_faults((40, 30), (30, 40)))
+    assert not list(size_faults((15, 20), (30, 40)))
