@@ -217,14 +217,18 @@ class ChunksSource(SceneSource):
         self._splits.setdefault("train", self._nothing)
 
     def scenes(self, split: Split) -> Sequence[Scene]:
-        """See `SceneSource`. Opens a chunk to learn whether its frames are held out."""
+        """See `SceneSource`.
+
+        Without test chunks, the first training chunk is opened to see whether it holds out frames.
+        """
         return self._split(split)
 
     def _split(self, split: Split) -> ChunkScenes:
         if split in self._splits:
             return self._splits[split]
         train = self._splits["train"]
-        return train if len(train) and train[0].held_out else self._nothing
+        first = next(iter(train.groups()), [])
+        return train if any(train[index].held_out for index in first) else self._nothing
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
         """See `SceneSource`: one group for each chunk file."""
