@@ -1,0 +1,187 @@
+"""`init_from`: queries grow and shrink by the published rule, all else is taken as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from safetensors.torch import load_file, save_file
+
+from qgs.composer import Recipe, resolve
+from qgs.contracts.queries import GROWTH_NOISE
+from qgs.engine import train
+from qgs.engine.initial import initialise
+from qgs.io.checkpoint import CheckpointError, save
+from qgs.io.published import to_published
+from qgs.io.transfer import import_weights
+from qgs.model import QueryGaussianModel
+
+Tiny = Callable[..., Recipe]
+COUNT = 24
+PER_QUERY = {"tokengs": ["features"], "locus": ["features", "center", "raw_radius"]}
+
+
+@pytest.fixture
+def learned(tiny: Tiny, tmp_path: Path) -> Callable[[str], Path]:
+    """`learned("locus")`: a checkpoint of that tiny model, of another seed than the recipe's."""
+
+    def make(name: str) -> Path:
+        path = tmp_path / f"{name}.safetensors"
+        save(tiny(name, "seed=7").build_model(), path)
+        return path
+
+    return make
+
+
+def started(recipe: Recipe) -> tuple[QueryGaussianModel, list[str]]:
+    model = recipe.build_model()
+    return model, initialise(model, recipe)
+
+
+@pytest.mark.parametrize("name", ["tokengs", "locus"])
+@pytest.mark.parametrize("count", [25, 60, 96])
+def test_old_queries_stay_and_new_ones_are_noisy_copies(
+    tiny: Tiny, learned: Callable[[str], Path], name: str, count: int
+) -> None:
+    path = learned(name)
+    recipe = tiny(name, f"model.queries.count={count}", f"init_from={path}")
+    model, told = started(recipe)
+    old = load_file(path)
+    copied = torch.arange(COUNT, count) % COUNT
+    for parameter in PER_QUERY[name]:
+        before = old[f"queries.{parameter}"]
+        after = model.queries.get_parameter(parameter).detach()
+        assert len(after) == count
+        assert torch.equal(after[:COUNT], before)
+        noise = (after[COUNT:] - before[copied]) / GROWTH_NOISE
+        assert noise.abs().max() < 6
+        assert noise.abs().min() > 0
+        if noise.numel() > 1000:
+            assert noise.std() == pytest.approx(1, abs=0.1)
+            assert noise.mean() == pytest.approx(0, abs=0.1)
+        line = (
+            f"queries.{parameter}: {COUNT} -> {count}, {COUNT} kept, {count - COUNT} noisy copies"
+        )
+        assert sum(one.startswith(line) for one in told) == 1
+    assert len(told) == 1 + len(PER_QUERY[name])
+    rest = {key: t for key, t in model.state_dict().items() if not key.startswith("queries.")}
+    assert rest
+    assert all(torch.equal(tensor, old[key]) for key, tensor in rest.items())
+
+
+@pytest.mark.parametrize("name", ["tokengs", "locus"])
+def test_shrinking_keeps_the_first(tiny: Tiny, learned: Callable[[str], Path], name: str) -> None:
+    path = learned(name)
+    model, told = started(tiny(name, "model.queries.count=10", f"init_from={path}"))
+    for parameter in PER_QUERY[name]:
+        after = model.queries.get_parameter(parameter)
+        assert torch.equal(after, load_file(path)[f"queries.{parameter}"][:10])
+    assert "queries.features: 24 -> 10, the first are kept" in told
+
+
+def test_the_same_size_is_taken_as_it_is(tiny: Tiny, learned: Callable[[str], Path]) -> None:
+    path = learned("locus")
+    model, told = started(tiny("locus", f"init_from={path}"))
+    own, old = model.state_dict(), load_file(path)
+    assert own.keys() == old.keys()
+    assert all(torch.equal(own[key], old[key]) for key in own)
+    assert told == [f"weights start from {path}"]
+
+
+def test_the_recipes_seed_decides_the_noise(tiny: Tiny, learned: Callable[[str], Path]) -> None:
+    path = learned("tokengs")
+
+    def features(seed: int) -> torch.Tensor:
+        torch.rand(seed)  # the global random state plays no part
+        options = ("model.queries.count=30", f"init_from={path}", f"seed={seed}")
+        return started(tiny("tokengs", *options))[0].queries.get_parameter("features").detach()
+
+    assert torch.equal(features(1), features(1))
+    assert not torch.equal(features(1), features(2))
+    assert torch.equal(features(1)[:COUNT], features(2)[:COUNT])
+
+
+def test_a_recipe_without_it_starts_from_its_own_seed(tiny: Tiny) -> None:
+    recipe = tiny("tokengs")
+    model, told = started(recipe)
+    fresh = recipe.build_model().state_dict()
+    assert told == []
+    assert all(torch.equal(tensor, fresh[key]) for key, tensor in model.state_dict().items())
+
+
+def test_every_difference_is_told_with_the_options_that_fit(
+    tiny: Tiny, learned: Callable[[str], Path]
+) -> None:
+    path = learned("tokengs")
+    recipe = tiny("tokengs", f"init_from={path}", "model.head.gaussians_per_query=5",
+                  "model.queries.count=48", "model.head.norm=false")  # fmt: skip
+    model = recipe.build_model()
+    before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
+    with pytest.raises(CheckpointError) as caught:
+        initialise(model, recipe)
+    for words in (
+        "init_from",
+        "shape of head.linear.weight: (56, 32) in the checkpoint, (70, 32) here",
+        "shape of head.linear.bias: (56,) in the checkpoint, (70,) here",
+        "unexpected: head.norm.weight",
+        "model.head.gaussians_per_query: 4 (here 5)",
+        "model.head.norm: True (here False)",
+    ):
+        assert words in str(caught.value)
+    assert "queries" not in str(caught.value).split("only the number of queries may differ")[1]
+    assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
+
+
+def test_another_width_is_no_other_number_of_queries(
+    tiny: Tiny, learned: Callable[[str], Path]
+) -> None:
+    path = learned("tokengs")
+    recipe = tiny("tokengs", f"init_from={path}", "model.width=64", "model.queries.count=48")
+    with pytest.raises(CheckpointError, match=r"queries\.features: \(24, 32\).*\(48, 64\) here"):
+        initialise(recipe.build_model(), recipe)
+
+
+def test_anchors_are_not_taken_from_a_model_without(
+    tiny: Tiny, learned: Callable[[str], Path]
+) -> None:
+    recipe = tiny("locus", f"init_from={learned('tokengs')}")
+    with pytest.raises(CheckpointError, match=r"missing: queries\.center"):
+        initialise(recipe.build_model(), recipe)
+
+
+def test_a_missing_checkpoint_is_named(tiny: Tiny, tmp_path: Path) -> None:
+    recipe = tiny("tokengs", f"init_from={tmp_path / 'gone'}")
+    with pytest.raises(FileNotFoundError, match="gone"):
+        initialise(recipe.build_model(), recipe)
+
+
+def test_imported_weights_grow_too(tmp_path: Path) -> None:
+    small = {"width": 16, "heads": 2, "queries": {"count": 6}, "decoder": {"depth": 1},
+             "supervision": {"layers": [1]}}  # fmt: skip
+    recipe = resolve({"recipe": 1, "model": small})
+    weights = to_published(recipe.build_model().state_dict(), recipe)
+    save_file(weights, tmp_path / "w.safetensors")
+    import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
+    grown = resolve(
+        {"recipe": 1, "model": small, "init_from": str(tmp_path / "c.safetensors")},
+        ["model.queries.count=9"],
+    )
+    model, _ = started(grown)
+    assert torch.equal(model.queries.get_parameter("features")[:6], weights["gs_tokens"])
+
+
+def test_training_starts_from_a_run(tiny: Tiny, tmp_path: Path) -> None:
+    base = train(tiny("locus"), tmp_path / "base", device="cpu")
+    still = ("training.learning_rate=1e-9", "training.weight_decay=0.0")
+    grown = tiny("locus", "model.queries.count=32", f"init_from={tmp_path / 'base'}", *still)
+    console = Console(file=StringIO(), width=300)
+    result = train(grown, tmp_path / "grown", device="cpu", console=console)
+    before = base.model.queries.get_parameter("center")
+    after = result.model.queries.get_parameter("center")
+    torch.testing.assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
+    assert isinstance(console.file, StringIO)
+    assert "queries.center: 24 -> 32" in console.file.getvalue()
