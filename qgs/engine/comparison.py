@@ -204,19 +204,20 @@ def _difference(metric: str, first: np.ndarray, second: np.ndarray) -> Differenc
 
 
 def _title(pair: Comparison) -> str:
-    return f"{pair.first} against {pair.second}"
+    count = pair.differences[0].scenes
+    return f"{pair.first} against {pair.second}, {count} scene{'s' if count > 1 else ''}"
 
 
 def _rows(pair: Comparison) -> list[list[str]]:
     percent = f"{100 * CONFIDENCE:.0f} % interval"
-    rows = [["metric", "first", "second", "difference", percent, "won : lost", "scenes"]]
+    rows = [["metric", "first", "second", "difference", percent, "won : lost"]]
     for d in pair.differences:
         header, _, digits = COLUMNS[d.metric]
         interval = "–"
         if d.low is not None and d.high is not None:
             interval = f"[{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
         numbers = f"{d.first:.{digits}f}", f"{d.second:.{digits}f}", f"{d.difference:+.{digits}f}"
-        rows.append([header, *numbers, interval, f"{d.wins} : {d.losses}", str(d.scenes)])
+        rows.append([header, *numbers, interval, f"{d.wins} : {d.losses}"])
     return rows
 
 

@@ -1,0 +1,136 @@
+"""`qgs eval` as a user types it: indices, tuning, batches, comparisons."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+import qgs
+from qgs.cli import app
+
+RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
+SMALL = (
+    "model.width=16",
+    "model.heads=2",
+    "model.queries.count=8",
+    "data.image_size=[32, 32]",
+    "views.targets=2",
+    "evaluation.scenes=3",
+)
+
+
+def evaluated(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, ["eval", *(str(word) for word in words)])
+
+
+def summary(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two untrained models, evaluated alike."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("locus", "tokengs"):
+        model = qgs.compose(RECIPES / f"{name}.yaml", overrides=SMALL)
+        qgs.save(model, folder / name / "checkpoint.safetensors")
+        result = evaluated(folder / name)
+        assert result.exit_code == 0, result.output
+    return folder
+
+
+@pytest.fixture
+def index(tmp_path: Path) -> Path:
+    file = tmp_path / "two_rooms.json"
+    entry = {"context": [0, 3], "target": [1, 2]}
+    file.write_text(json.dumps({"test/000001": entry, "test/000002": entry, "absent": entry}))
+    return file
+
+
+def test_an_index_becomes_a_protocol_of_its_name(runs: Path, index: Path, tmp_path: Path) -> None:
+    result = evaluated(runs / "locus", "--index", index, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    told = summary(tmp_path / "out")
+    assert told["protocol"]["name"] == "two_rooms"
+    assert told["protocol"]["settings"]["views"]["index"]["scenes"] == 3
+    assert "over 2 of 3 scenes; missing: absent" in result.output
+    assert str(tmp_path) not in (tmp_path / "out" / "summary.json").read_text()
+
+
+def test_batches_and_repetitions_give_the_same_json(runs: Path, tmp_path: Path) -> None:
+    for name, batch in (("a", 1), ("b", 1), ("c", 3)):
+        result = evaluated(runs / "tokengs", "--batch", batch, "--out", tmp_path / name)
+        assert result.exit_code == 0, result.output
+    first, again, batched = (summary(tmp_path / name) for name in ("a", "b", "c"))
+    same = (tmp_path / name / "summary.json" for name in ("a", "b"))
+    assert len({file.read_bytes() for file in same}) == 1
+    assert first == again
+    for metric in ("psnr", "ssim"):
+        assert batched["model"][metric] == pytest.approx(first["model"][metric], rel=0, abs=1e-6)
+
+
+def test_tuning_goes_into_a_folder_of_its_own_and_is_told(runs: Path) -> None:
+    before = (runs / "locus" / "evaluation" / "summary.json").read_bytes()
+    weights = (runs / "locus" / "checkpoint.safetensors").read_bytes()
+    result = evaluated(runs / "locus", "--tune", 2)
+    assert result.exit_code == 0, result.output
+    assert "tokens tuned on the input views: 2 steps of Adam" in result.output
+    assert summary(runs / "locus" / "evaluation-2")["tuning"]["steps"] == 2
+    assert (runs / "locus" / "evaluation" / "summary.json").read_bytes() == before
+    assert (runs / "locus" / "checkpoint.safetensors").read_bytes() == weights
+
+
+def test_two_runs_compare_scene_by_scene(runs: Path, tmp_path: Path) -> None:
+    first, second = runs / "locus", runs / "tokengs"
+    result = evaluated("--compare", first, second, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert "…" not in result.output
+    assert "3 scenes" in result.output
+    record = json.loads((tmp_path / "comparison.json").read_text())
+    psnr = record["pairs"][0]["differences"][0]
+    means = [summary(run / "evaluation")["model"]["psnr"] for run in (first, second)]
+    assert psnr["metric"] == "model_psnr"
+    assert psnr["difference"] == pytest.approx(means[0] - means[1])
+    assert psnr["low"] <= psnr["difference"] <= psnr["high"]
+    assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 3
+    assert "| PSNR ↑" in (tmp_path / "comparison.md").read_text()
+
+
+def test_different_protocols_compare_only_when_told(
+    runs: Path, index: Path, tmp_path: Path
+) -> None:
+    assert evaluated(runs / "tokengs", "--index", index, "--out", tmp_path / "b").exit_code == 0
+    pair = (runs / "locus" / "evaluation", tmp_path / "b")
+    refused = evaluated("--compare", *pair)
+    assert isinstance(refused.exception, ValueError)
+    for word in ("two_rooms", "which differ in", "views", "--across-protocols"):
+        assert word in str(refused.exception)
+    allowed = evaluated("--compare", *pair, "--across-protocols")
+    assert allowed.exit_code == 0, allowed.output
+    assert "the protocols differ" in allowed.output
+    assert "test/000000" in allowed.output
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["RUN", "RUN"], "one RUN is evaluated at a time; add --compare"),
+        (["RUN", "--across-protocols"], "add --compare"),
+        (["--compare", "RUN"], "takes two or more different results"),
+        (["--compare", "RUN", "RUN", "--tune", "3"], "evaluation.tuning_steps=3 has no effect"),
+        (["RUN", "--set", "training.steps=1"], "would change the trained model"),
+    ],
+)
+def test_words_without_effect_are_refused(runs: Path, words: list[str], reason: str) -> None:
+    result = evaluated(*(str(runs / "locus") if word == "RUN" else word for word in words))
+    assert isinstance(result.exception, ValueError)
+    assert reason in str(result.exception)
+
+
+def test_a_missing_index_is_told(runs: Path, tmp_path: Path) -> None:
+    result = evaluated(runs / "locus", "--index", tmp_path / "it's not there.json")
+    assert isinstance(result.exception, FileNotFoundError)
+    assert "it's not there.json" in str(result.exception)

@@ -1,0 +1,99 @@
+"""Paired comparisons of results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from qgs.engine.comparison import Comparisons, paired_interval
+from qgs.engine.stored import StoredResults, read_results
+
+HASHES = {"rooms": "a" * 64, "halls": "b" * 64}
+
+
+def results(name: str, protocol: str = "rooms", **psnr: float) -> StoredResults:
+    scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
+    content = {"format": 1, "views": protocol}
+    return StoredResults(name, protocol, HASHES[protocol], content, scenes, {})
+
+
+def test_the_interval_is_that_of_scipy() -> None:
+    bootstrap = pytest.importorskip("scipy.stats").bootstrap
+    differences = np.random.default_rng(1).normal(0.3, 1.0, 60)
+    expected = bootstrap(
+        (differences,), np.mean, method="percentile", n_resamples=10_000, rng=0
+    ).confidence_interval
+    low, high = paired_interval(differences) or (np.nan, np.nan)
+    assert low == pytest.approx(expected.low, abs=0.02)
+    assert high == pytest.approx(expected.high, abs=0.02)
+
+
+def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(2)
+    intervals = [paired_interval(rng.normal(1.0, 2.0, 40)) or (9.0, 9.0) for _ in range(100)]
+    covered = sum(low <= 1.0 <= high for low, high in intervals)
+    assert 86 <= covered <= 100
+
+
+def test_the_interval_is_the_same_each_time_and_none_for_one_scene() -> None:
+    differences = np.linspace(-1, 2, 7)
+    assert paired_interval(differences) == paired_interval(differences.copy())
+    assert paired_interval(differences[:1]) is None
+
+
+def test_scenes_pair_by_name_and_lower_is_better_for_lpips() -> None:
+    first = results("first", a=10.0, b=12.0, c=11.0, only=50.0)
+    second = results("second", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
+    (pair,) = Comparisons.of([first, second]).pairs
+    psnr, lpips = pair.differences
+    assert (psnr.first, psnr.second, psnr.scenes) == (11.0, 10.0, 3)
+    assert psnr.difference == pytest.approx(1.0)
+    assert (psnr.wins, psnr.losses) == (2, 0)
+    assert (lpips.wins, lpips.losses) == (0, 2)
+    assert (list(pair.only_first), list(pair.only_second)) == (["only"], ["other", "another"])
+    text = Comparisons.of([first, second]).markdown()
+    assert "1 scenes only in first, left out: only" in text
+    assert "2 scenes only in second, left out: other, another" in text
+
+
+def test_the_first_is_compared_with_each_of_the_others() -> None:
+    three = [
+        results(name, a=value, b=value) for name, value in (("x", 3.0), ("y", 2.0), ("z", 5.0))
+    ]
+    pairs = Comparisons.of(three).pairs
+    assert [(p.first, p.second, p.differences[0].difference) for p in pairs] == [
+        ("x", "y", 1.0),
+        ("x", "z", -2.0),
+    ]
+
+
+def test_what_cannot_be_compared_is_refused() -> None:
+    with pytest.raises(ValueError, match="two or more different results"):
+        Comparisons.of([results("x", a=1.0), results("x", a=1.0)])
+    with pytest.raises(ValueError, match="x and y have no scene in common"):
+        Comparisons.of([results("x", a=1.0), results("y", b=1.0)])
+    rooms, halls = results("x", a=1.0), results("y", "halls", a=2.0)
+    with pytest.raises(ValueError, match=r"x was judged by rooms .*y by halls .*differ in views:"):
+        Comparisons.of([rooms, halls])
+    (pair,) = Comparisons.of([rooms, halls], across_protocols=True).pairs
+    assert not pair.same_protocol
+    assert pair.differences[0].low is None
+
+
+def test_tables_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    pair = [results("x", a=10.0, b=22.5), results("y", a=12.0, b=21.0)]
+    Comparisons.of(pair).show(Console(width=80))
+    out = capsys.readouterr().out
+    assert "[-2.000, +1.500]" in out
+    assert "1 : 1" in out
+
+
+def test_folders_without_results_are_told(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no results in"):
+        read_results(tmp_path)
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(ValueError, match="evaluate again with `qgs eval`"):
+        read_results(tmp_path)
