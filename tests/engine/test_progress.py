@@ -15,11 +15,12 @@ from qgs.engine.progress import TrainingProgress
 def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:
     """The lines for (step, images, seconds, used), each shown."""
     monkeypatch.setattr(progress, "_LOG_SECONDS", 0.0)
-    console = Console(record=True, width=200, file=io.StringIO())
+    told = io.StringIO()
+    console = Console(width=200, file=told)
     with TrainingProgress(console) as bar:
         for step, images, seconds, used in steps:
             assert bar.update(step, 0.1, 20.0, images, seconds, used)
-    return console.export_text().splitlines()
+    return [line for line in told.getvalue().splitlines() if line]
 
 
 def left(line: str) -> str:

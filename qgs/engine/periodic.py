@@ -1,0 +1,141 @@
+"""Evaluations and pictures while a model trains."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from accelerate import Accelerator
+from torch.distributed.tensor import DTensor
+
+from qgs.composer import Recipe
+from qgs.data.evaluation import EvaluationPlan
+from qgs.data.sampling import Sample
+from qgs.engine.ema import MovingAverage
+from qgs.engine.evaluation import evaluate
+from qgs.engine.protocol import index_of
+from qgs.engine.scores import METRICS
+from qgs.engine.seeds import RandomStates
+from qgs.engine.trackers import Trackers
+from qgs.io.atomic import write_text
+from qgs.io.drawing import Picture, depth_picture, depth_range, rgb_picture, side_by_side
+from qgs.io.pictures import write_png
+from qgs.model import QueryGaussianModel
+
+SAMPLES = 4
+"""Samples that are drawn, the same ones each time."""
+
+_GAP = 4
+
+
+class PeriodicEvaluation:
+    """Judges the model on the recipe's test views, beside its moving average where there is one.
+
+    Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png; random states and the
+    model's mode are afterwards what they were. One process judges and the others wait, unless the
+    weights lie in shards.
+    """
+
+    def __init__(
+        self,
+        accelerator: Accelerator,
+        recipe: Recipe,
+        model: QueryGaussianModel,
+        average: MovingAverage | None,
+        folder: Path,
+        trackers: Trackers,
+    ) -> None:
+        self._accelerator = accelerator
+        self._recipe = recipe
+        self._model = model
+        self._average = average
+        self._folder = folder
+        self._trackers = trackers
+        self._random = RandomStates(accelerator)
+
+    def run(self, step: int) -> None:
+        """Evaluate after `step` optimiser steps. All processes must call this."""
+        states = self._random.state()
+        main = self._accelerator.is_main_process
+        if main or any(isinstance(p, DTensor) for p in self._model.parameters()):
+            records, picture = self._judge(step), self._picture()
+            if main:
+                self._tell(records, picture, step)
+        self._accelerator.wait_for_everyone()
+        self._random.load_state(states)
+
+    def _judge(self, step: int) -> list[dict[str, Any]]:
+        """A record for the present weights and one for the averaged ones."""
+        records = [self._record("raw", step)]
+        if self._average:
+            with self._average.applied():
+                records.append(self._record("ema", step))
+        return records
+
+    def _record(self, weights: str, step: int) -> dict[str, Any]:
+        summary = evaluate(self._model, self._recipe, step).summary()
+        told = ("statement", "scenes", "scenes_in_protocol", "samples")
+        return {
+            "step": step,
+            "weights": weights,
+            "protocol": summary["protocol"]["sha256"],
+            **{name: summary[name] for name in told},
+            **{name: score for name, score in summary["model"].items() if score is not None},
+        }
+
+    def _tell(self, records: Sequence[Mapping[str, Any]], picture: Picture, step: int) -> None:
+        _append(self._folder / "evaluations.jsonl", records)
+        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
+        for record in records:
+            scores = {name: record[name] for name in METRICS if name in record}
+            group = f"evaluation/{record['weights']}"
+            self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
+        self._trackers.picture("evaluation", picture, step)
+
+    @torch.no_grad()
+    def _picture(self) -> Picture:
+        """A row per sample: input views, the first target view, its rendering and its depth."""
+        recipe, training = self._recipe, self._model.training
+        plan = EvaluationPlan(
+            recipe.build_data(), recipe.views, recipe.evaluation, index_of(recipe)
+        )
+        usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
+        self._model.eval()
+        try:
+            rows = [_row(self._model, sample) for sample in islice(usable, SAMPLES)]
+        finally:
+            self._model.train(training)
+        return _stacked(rows)
+
+
+def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
+    device = next(model.parameters()).device
+    target = sample.targets.select(slice(0, 1)).to(device)
+    rendering = model.render(model(sample.inputs.to(device)).gaussians, target.cameras)
+    photos = [rgb_picture(image) for image in (*sample.inputs.images[0], target.images[0, 0])]
+    depth = depth_picture(rendering.depth[0, 0], *depth_range(rendering.depth))
+    return side_by_side([*photos, rgb_picture(rendering.rgb[0, 0]), depth], _GAP)
+
+
+def _stacked(rows: Sequence[Picture]) -> Picture:
+    """Rows below each other, white between them and to the right of shorter ones."""
+    width = max(row.shape[1] for row in rows)
+    parts = []
+    for row in rows:
+        wider = ((0, _GAP), (0, width - row.shape[1]), (0, 0))
+        parts.append(np.pad(row, wider, constant_values=255))
+    return np.concatenate(parts)[:-_GAP]
+
+
+def _append(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """Add records of one step; those of that step and later ones, from before a resume, go."""
+    step = records[0]["step"]
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    kept = [line for line in lines if json.loads(line)["step"] < step]
+    lines = [*kept, *(json.dumps(record) for record in records)]
+    write_text(path, "\n".join(lines) + "\n")

@@ -1,0 +1,208 @@
+"""Steps that are not finite: which tensor was first, and what is saved."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import qgs
+from qgs.composer import Recipe
+from qgs.data.loader import training_batches
+from qgs.engine.gradients import Gradients
+from qgs.engine.incidents import KEPT, Incidents, read_batch
+from qgs.engine.nonfinite import Finding, Watch
+from qgs.engine.objective import Objective
+from qgs.engine.processes import make_accelerator
+
+NAN, INF = float("nan"), float("inf")
+
+
+class Step:
+    """One step of a small model, that can be broken in many places."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.accelerator = make_accelerator("cpu")
+        self.model = recipe.build_model().train()
+        losses = recipe.build_losses()
+        self.objective = Objective(self.model, losses, recipe.training.render_views)
+        self.gradients = Gradients(self.accelerator, self.objective, recipe.training)
+        stream = training_batches(recipe.build_data(), recipe.views, 2, seed=0)
+        self.batches = [next(stream), next(stream)]
+        stream.close()
+
+    def first(self) -> Finding | None:
+        watch = Watch()
+        with watch.on(self.objective):
+            self.gradients.compute(self.batches)
+        return watch.first
+
+
+@pytest.fixture
+def step(tiny: Callable[..., Recipe]) -> Step:
+    return Step(tiny("tokengs", "training.render_views=1"))
+
+
+def spoiling(call: int, value: float = NAN) -> Callable[..., Any]:
+    """A forward hook that puts `value` into the first tensor of what a module's call returns."""
+    calls = []
+
+    def hook(module: torch.nn.Module, arguments: Any, output: Tensor) -> Tensor | None:
+        calls.append(module)
+        if len(calls) != call:
+            return None
+        spoiled = output.clone()
+        spoiled.view(-1)[0] = value
+        return spoiled
+
+    return hook
+
+
+def test_a_good_step_shows_nothing_and_keeps_no_hook(step: Step) -> None:
+    assert step.first() is None
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in step.objective.modules())
+    assert not any(p._backward_hooks for p in step.objective.parameters())
+
+
+def test_a_weight_comes_before_everything(step: Step) -> None:
+    name, parameter = list(step.model.named_parameters())[5]
+    with torch.no_grad():
+        parameter.view(-1)[:2] = torch.tensor([NAN, INF])
+    found = step.first()
+    assert found
+    assert found.tensor == f"weight model.{name}"
+    assert found.values == f"1 NaN and 1 infinite of {parameter.numel()} values"
+
+
+@pytest.mark.parametrize(("side", "field"), [("inputs", "images"), ("targets", "cameras.c2w")])
+def test_data_is_named_with_its_batch(step: Step, side: str, field: str) -> None:
+    views = getattr(step.batches[1], side)
+    tensor = views.images if field == "images" else views.cameras.c2w
+    tensor.view(-1)[0] = NAN
+    found = step.first()
+    assert found == Finding(f"{side}.{field}", f"1 NaN of {tensor.numel()} values", 1)
+
+
+def test_a_module_is_named_by_its_output(step: Step) -> None:
+    layer = step.model.decoder[2]
+    layer.self_attention.register_forward_hook(spoiling(call=2))
+    found = step.first()
+    assert found
+    assert found.tensor == "output of model.decoder.2.self_attention"
+    assert found.batch == 1, "its second call is that of the second batch"
+
+
+def test_a_layer_and_its_gaussians_are_named(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
+    decode, calls = step.model.decode, []
+
+    def broken(state: Any) -> Any:
+        gaussians = decode(state)
+        calls.append(state)
+        return replace(gaussians, scales=gaussians.scales * INF) if len(calls) == 2 else gaussians
+
+    monkeypatch.setattr(step.model, "decode", broken)
+    found = step.first()
+    assert found
+    assert found.tensor == "prediction of layer 4.gaussians.scales"
+
+
+def test_a_rendering_and_a_loss_are_named(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
+    render = step.model.render
+    blank = lambda *a: replace(render(*a), depth=torch.full_like(render(*a).depth, NAN))  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(step.model, "render", blank)
+        found = step.first()
+        assert found
+        assert found.tensor == "rendering of layer 2.depth"
+    loss = step.objective.losses["visibility"]
+    loss.register_forward_hook(lambda m, a, out: {k: t / 0 for k, t in out.items()})
+    found = step.first()
+    assert found
+    assert found.tensor == "loss of layer 2.visibility"
+
+
+class Poison(torch.autograd.Function):
+    """The identity, with gradients that are not finite."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> Tensor:
+        return slopes[0] * NAN
+
+
+def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
+    layer = step.model.decoder[1]
+    handle = layer.cross_attention.register_forward_hook(lambda m, a, out: Poison.apply(out))
+    found = step.first()
+    handle.remove()
+    assert found
+    assert found.tensor.startswith("gradient of the output of model.decoder.1.cross_attention")
+    render = step.model.render
+
+    def poisoned(gaussians: Any, cameras: Any) -> Any:
+        return render(replace(gaussians, quats=Poison.apply(gaussians.quats)), cameras)
+
+    monkeypatch.setattr(step.model, "render", poisoned)
+    found = step.first()
+    assert found
+    assert found.tensor == "gradient of layer 2.quats"
+
+
+def incidents_of(step: Step, folder: Path) -> Incidents:
+    return Incidents(step.accelerator, step.objective, step.gradients, folder)
+
+
+def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
+    step.batches[1].targets.images[0, 0, 0, 0, 0] = NAN
+    told = incidents_of(step, tmp_path).look_into(7, step.batches, "loss term mse is nan")
+    place = tmp_path / "incidents" / "step-7"
+    names = {"batch.safetensors", "weights.safetensors", "report.json"}
+    assert {path.name for path in place.iterdir()} == names
+    batch, bad = read_batch(place / "batch.safetensors"), step.batches[1]
+    assert batch.scenes == step.batches[0].scenes + bad.scenes
+    assert batch.target_frames[2:] == bad.target_frames
+    for side in ("inputs", "targets"):
+        saved, own = getattr(batch, side).select(slice(None)), getattr(bad, side)
+        torch.testing.assert_close(saved.images[2:], own.images, equal_nan=True)
+        assert torch.equal(saved.cameras.c2w[2:], own.cameras.c2w)
+        assert torch.equal(saved.cameras.intrinsics[2:], own.cameras.intrinsics)
+        assert saved.cameras.size == own.cameras.size
+    weights = qgs.load(place / "weights.safetensors").state_dict()
+    assert all(torch.equal(t, weights[name]) for name, t in step.model.state_dict().items())
+    report = json.loads((place / "report.json").read_text())
+    assert report["symptom"] == "loss term mse is nan"
+    assert report["found"][0]["first"]["tensor"] == "targets.images"
+    assert report["found"][0]["batches"][1]["scenes"] == list(bad.scenes)
+    for part in ("targets.images", "1 NaN of", bad.scenes[0], str(list(bad.target_frames[0]))):
+        assert part in told
+    assert step.batches[0].scenes[0] not in told or step.batches[0].scenes[0] in bad.scenes
+
+
+def test_what_cannot_be_repeated_is_told_so(step: Step, tmp_path: Path) -> None:
+    told = incidents_of(step, tmp_path).look_into(3, step.batches, "loss is nan")
+    assert "repeating the step gave finite numbers" in told
+
+
+def test_the_number_of_saved_incidents_is_bounded(
+    step: Step, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(step.gradients, "compute", lambda batches: {})
+    incidents = incidents_of(step, tmp_path)
+    told = [incidents.look_into(n, step.batches[:1], "loss is nan") for n in range(KEPT + 2)]
+    assert len(list((tmp_path / "incidents").iterdir())) == KEPT
+    assert "not saved" in told[-1]
+    assert incidents.in_a_row == incidents.total == KEPT + 2
+    incidents.passed()
+    assert (incidents.in_a_row, incidents.total) == (0, KEPT + 2)
+    again = incidents_of(step, tmp_path)
+    again.load_state(incidents.state())
+    assert again.total == KEPT + 2
