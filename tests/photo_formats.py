@@ -141,8 +141,12 @@ def write_colmap(
 
 
 def world_to_camera(c2w: np.ndarray) -> tuple[float, ...]:
-    """Quaternion w, x, y, z and translation of the inverse of a pose."""
-    rotation = c2w[:3, :3].T
+    """Quaternion w, x, y, z and translation of the inverse of a pose.
+
+    Of a rotation written with few digits, the nearest one; the camera's centre stays.
+    """
+    left, _, right = np.linalg.svd(c2w[:3, :3].T)
+    rotation = left @ right
     return (*quaternion(rotation), *(-rotation @ c2w[:3, 3]))
 
 
