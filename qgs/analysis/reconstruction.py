@@ -57,7 +57,8 @@ class ViewScore:
 class Reconstruction:
     """Gaussians (1, G) of a sample, and what its input and target cameras see of them.
 
-    world: reference pose (4, 4) and scale of the sample's world, as `own_world` gives them.
+    world: reference pose (4, 4) and scale of the sample's world, as `own_world` gives them. tuning:
+    how the tokens were tuned on the inputs, as plain values; None where they were not.
     """
 
     sample: Sample
@@ -65,6 +66,7 @@ class Reconstruction:
     rendering: Rendering
     scores: list[ViewScore]
     world: tuple[Tensor, Tensor]
+    tuning: Mapping[str, Any] | None = None
 
 
 @torch.no_grad()
@@ -73,12 +75,15 @@ def reconstruct(
     sample: Sample,
     world: tuple[Tensor, Tensor],
     seen: Collection[int] = (),
+    tuned: Gaussians | None = None,
+    tuning: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
     """Gaussians from the inputs of `sample`, rendered from its inputs, then its targets.
 
-    world: see `Reconstruction`. seen: frames that the model was trained on.
+    world, tuning: see `Reconstruction`. seen: frames that the model was trained on. tuned: the
+    Gaussians of tuned tokens, None for the model's own.
     """
-    gaussians = model(sample.inputs).gaussians
+    gaussians: Gaussians = model(sample.inputs).gaussians if tuned is None else tuned
     rendering = model.render(gaussians, _cameras(sample))
     photos = torch.cat([sample.inputs.images, sample.targets.images], 1)
     quality = psnr(rendering.rgb[0], photos[0]).tolist()
@@ -92,7 +97,7 @@ def reconstruct(
         kind = "seen in training" if frame in seen else "novel"
         others = {name: values[index] for name, values in baselines.items()}
         scores.append(ViewScore(frame, kind, quality[inputs + index], others))
-    return Reconstruction(sample, gaussians, rendering, scores, world)
+    return Reconstruction(sample, gaussians, rendering, scores, world, tuning)
 
 
 def _baselines(sample: Sample) -> dict[str, list[float]]:
@@ -190,6 +195,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
+        "tuning": reconstruction.tuning,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from qgs.composer import Recipe
     from qgs.contracts import Scene
     from qgs.data.photos import PhotosConfig, PhotosSource
+    from qgs.data.sampling import Sample
+    from qgs.model import QueryGaussianModel
+    from qgs.types import Gaussians
 
 
 def register(app: typer.Typer) -> None:
@@ -38,6 +41,9 @@ def reconstruct(
         str | None,
         typer.Option(help="Frames to compare with; default: six between the inputs."),
     ] = None,
+    tune: Annotated[
+        int, typer.Option(min=0, help="Steps of token tuning on the input photos; 0 for none.")
+    ] = 0,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
@@ -75,11 +81,35 @@ def reconstruct(
     sample = make_sample(scene, *picked, recipe.views, mirror=False)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     world = own_world(scene.cameras[list(picked[0])].c2w, recipe.views, scene.name)
-    result = run(model, sample, world, seen)
     console = Console()
+    gaussians, record = tuned(model, recipe, sample, tune) if tune else (None, None)
+    if record:
+        console.print(
+            "{steps} steps of token tuning: photometric loss of the inputs {loss_before:.5f} -> "
+            "{loss_after:.5f}".format(**record),
+            highlight=False,
+        )
+    result = run(model, sample, world, seen, gaussians, record)
     console.print(score_table(result))
     for path in write_reconstruction(model, result, out):
         console.print(f"wrote {path}", soft_wrap=True)
+
+
+def tuned(
+    model: QueryGaussianModel, recipe: Recipe, sample: Sample, steps: int
+) -> tuple[Gaussians, dict[str, Any]]:
+    """Gaussians of tokens tuned on the inputs of `sample`, and a record of the tuning."""
+    from qgs.engine.tuning import tune, tuning_loss
+
+    loss, rate = tuning_loss(recipe), recipe.evaluation.tuning_rate
+    tuning = tune(model, sample.inputs, loss, steps, rate)
+    record = {
+        "steps": steps,
+        "rate": rate,
+        "loss_before": tuning.losses[0],
+        "loss_after": tuning.losses[-1],
+    }
+    return tuning.prediction.gaussians, record
 
 
 def only_scene(source: PhotosSource, photos: str) -> Scene:

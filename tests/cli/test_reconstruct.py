@@ -137,3 +137,20 @@ def test_frames_that_are_no_numbers_are_refused():
     assert frame_list(None, "--frames") is None
     with pytest.raises(ValueError, match=r"--frames takes frame numbers.*'0-8'"):
         frame_list("0-8", "--frames")
+
+
+def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tmp_path):
+    weights = checkpoint.read_bytes()
+    assert run(checkpoint, photos, "--out", tmp_path / "plain").exception is None
+    result = run(checkpoint, photos, "--out", tmp_path / "tuned", "--tune", 3)
+    assert result.exception is None
+    assert "3 steps of token tuning: photometric loss of the inputs" in result.output
+    plain, tuned = (
+        json.loads((tmp_path / name / "cameras.json").read_text()) for name in ("plain", "tuned")
+    )
+    assert plain["tuning"] is None
+    assert tuned["tuning"]["steps"] == 3
+    assert tuned["tuning"]["loss_after"] < tuned["tuning"]["loss_before"]
+    files = [(tmp_path / name / "gaussians.ply").read_bytes() for name in ("plain", "tuned")]
+    assert files[0] != files[1]
+    assert checkpoint.read_bytes() == weights
