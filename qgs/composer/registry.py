@@ -16,6 +16,7 @@ from qgs.contracts import (
     Component,
     ComponentConfig,
     Plugin,
+    WeightLayout,
 )
 
 
@@ -167,6 +168,9 @@ def _fault(plugin: Plugin, entry: EntryPoint) -> str:
         if (component.slot, component.name) in taken:
             return f"registers `{component.name}` twice in the slot `{component.slot}`"
         taken.add((component.slot, component.name))
+    for layout in plugin.layouts:
+        if not isinstance(layout, WeightLayout):
+            return f"lists {layout!r}, which is no WeightLayout"
     return ""
 
 

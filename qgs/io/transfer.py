@@ -165,7 +165,17 @@ def _as_float32(
             "that no conversion brings back. Take the float32 file, or convert with --to-float32"
         )
     notes = [f"converted to float32: {told}"] if others else []
-    return {name: t.to(torch.float32).contiguous() for name, t in tensors.items()}, notes
+    return _apart({name: t.to(torch.float32).contiguous() for name, t in tensors.items()}), notes
+
+
+def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same tensors, those that a torch file stored once for several names copied."""
+    seen: set[int] = set()
+    apart = {}
+    for name, tensor in tensors.items():
+        apart[name] = tensor.clone() if tensor.data_ptr() in seen else tensor
+        seen.add(tensor.data_ptr())
+    return apart
 
 
 def _refuse_nonfinite(tensors: Mapping[str, Tensor], names: Names, path: Path) -> None:

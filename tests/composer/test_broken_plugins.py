@@ -158,6 +158,10 @@ BROKEN_PLUGINS = {
         "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, (int,))",
         "is no qgs component",
     ),
+    "no layout": (
+        "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, (), layouts=(int,))",
+        "lists <class 'int'>, which is no WeightLayout",
+    ),
 }
 
 

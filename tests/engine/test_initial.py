@@ -10,8 +10,11 @@ import pytest
 import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
+from torch import Generator, Tensor
 
+from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
+from qgs.contracts import Queries
 from qgs.contracts.queries import GROWTH_NOISE
 from qgs.engine import train
 from qgs.engine.initial import initialise
@@ -111,6 +114,19 @@ def test_a_recipe_without_it_starts_from_its_own_seed(tiny: Tiny) -> None:
     fresh = recipe.build_model().state_dict()
     assert told == []
     assert all(torch.equal(tensor, fresh[key]) for key, tensor in model.state_dict().items())
+
+
+def test_queries_may_have_a_rule_of_their_own(
+    tiny: Tiny, learned: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def doubled(queries: Queries, learned: dict[str, Tensor], _: Generator) -> dict[str, Tensor]:
+        return {name: torch.cat([values, values]) for name, values in learned.items()}
+
+    monkeypatch.setattr(LatentQueries, "resized", doubled)
+    path = learned("tokengs")
+    model, _ = started(tiny("tokengs", "model.queries.count=48", f"init_from={path}"))
+    features = model.queries.get_parameter("features")
+    assert torch.equal(features, load_file(path)["queries.features"].repeat(2, 1))
 
 
 def test_every_difference_is_told_with_the_options_that_fit(

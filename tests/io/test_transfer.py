@@ -98,6 +98,21 @@ def test_other_precisions_are_converted_only_on_demand(
     assert torch.equal(features, weights["gs_tokens"].float())
 
 
+def test_parameters_that_share_memory_or_lie_in_strides(
+    published: Published, tmp_path: Path
+) -> None:
+    weights = published("tokengs_a")
+    tied = [name for name in weights if name.endswith("q_norm.weight")]
+    weights |= dict.fromkeys(tied, weights[tied[0]])
+    turned = weights["enc_dec_backbone.kv_proj.weight"].t().contiguous().t()
+    assert not turned.is_contiguous()
+    weights["enc_dec_backbone.kv_proj.weight"] = turned
+    torch.save(weights, tmp_path / "w.pt")
+    import_weights(tmp_path / "w.pt", None, tmp_path / "c.safetensors")
+    export_weights(tmp_path / "c.safetensors", tmp_path / "back.safetensors")
+    assert_same(load_file(tmp_path / "back.safetensors"), weights)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_weights_that_are_no_numbers_are_refused(
     imported: Callable[..., Path], published: Published, tmp_path: Path, value: float
