@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+import math
+from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +34,10 @@ class RadialTangential:
             -1,
         )
 
+    def sees(self, points: Tensor) -> Tensor:
+        """Whether points (..., 2) lie this side of where the radial polynomial turns back."""
+        return (points * points).sum(-1) < _turn(self.k1, self.k2, self.k3)
+
 
 @dataclass(frozen=True)
 class Fisheye:
@@ -53,10 +59,25 @@ class Fisheye:
         bent = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
         return points * torch.where(radius > 0, bent / radius, 1.0)
 
+    def sees(self, points: Tensor) -> Tensor:
+        """Whether points (..., 2) lie this side of where the polynomial of angles turns back."""
+        return points.norm(dim=-1).atan().square() < _turn(self.k1, self.k2, self.k3, self.k4)
+
 
 Lens: TypeAlias = RadialTangential | Fisheye
 
 
 def bending(lens: Lens) -> Lens | None:
     """`lens`, or None where it leaves every ray as a pinhole would."""
-    return lens if isinstance(lens, Fisheye) or any(astuple(lens)) else None
+    return lens if isinstance(lens, Fisheye) or any(vars(lens).values()) else None
+
+
+def _turn(*coefficients: float) -> float:
+    """The least t > 0 at which r (1 + k1 t + k2 t^2 + ...), t = r^2, stops to grow with r.
+
+    Beyond it the polynomial would show the same photo again, mirrored; inf where it grows for ever.
+    """
+    slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
+    roots = np.roots(slope[::-1])
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(real.min()) if len(real) else math.inf

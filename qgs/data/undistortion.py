@@ -26,22 +26,28 @@ def undistorted(
     What the lens did not see is 0.
     """
     height, width = pixels.shape[:2]
-    grid = _source_grid(intrinsics, lens, (height, width))
+    grid, seen = _source_grid(intrinsics, lens, (height, width))
     planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
     flat = F.grid_sample(
         planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
     )[0]
-    flat = flat * (grid.abs() <= 1).all(-1)
+    flat = flat * seen
     result = flat.permute(1, 2, 0).numpy().reshape(pixels.shape)
     if np.issubdtype(pixels.dtype, np.integer):
         result = result.round()
     return result.astype(pixels.dtype)
 
 
-def _source_grid(intrinsics: Intrinsics, lens: Lens, size: tuple[int, int]) -> Tensor:
-    """(H, W, 2): where in the photo, from -1 to 1 across it, each pinhole pixel is to be found."""
+def _source_grid(
+    intrinsics: Intrinsics, lens: Lens, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Where in the photo each pinhole pixel is to be found, and whether it is there.
+
+    (H, W, 2), from -1 to 1 across the photo, and (H, W).
+    """
     camera = torch.tensor(intrinsics)
     focal, centre = camera.split(2)
     directions = pixel_directions(camera, size)[..., :2]
     source = focal * lens.distorted(directions) + centre
-    return source / torch.tensor(size[::-1]) * 2 - 1
+    grid = source / torch.tensor(size[::-1]) * 2 - 1
+    return grid, lens.sees(directions) & (grid.abs() <= 1).all(-1)

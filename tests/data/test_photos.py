@@ -138,6 +138,18 @@ def test_lens_distortion_is_undone(tmp_path):
     assert image[24, 60].item() == pytest.approx(4 * expected, abs=2)
 
 
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path, model):
+    """x (1 - 0.6 x^2) is largest at 0.745, and x of its angle's polynomial at an angle of it."""
+    turn = math.sqrt(1 / 1.8) if model == "OPENCV" else math.tan(math.sqrt(1 / 1.8))
+    wide: dict = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
+    path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
+    image = opened(path, image_size=(48, 64)).scenes("train")[0].images([2])[0]
+    reach = math.ceil(30 * turn - 0.5)
+    assert (image[:, 24, 32 + reach :] == 0).all()
+    assert (image[2, 24, 32 : 32 + reach] > 0).all()
+
+
 @pytest.mark.parametrize("place", range(5))
 def test_each_coefficient_bends_rays_as_opencv_writes_it(place):
     coefficients = [0.0] * 5

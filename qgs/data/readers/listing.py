@@ -26,11 +26,14 @@ class Listing:
 
 def existing(paths: Iterable[UPath]) -> set[UPath]:
     """Those of `paths` that exist; each folder is listed once, which object stores need."""
-    wanted = set(paths)
+    by_folder: dict[str, list[UPath]] = {}
+    for path in paths:
+        by_folder.setdefault(str(path.parent), []).append(path)
     held: set[UPath] = set()
-    for folder in {path.parent for path in wanted}:
+    for inside in by_folder.values():
+        folder = inside[0].parent
         names = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
-        held |= {path for path in wanted if path.parent == folder and path.name in names}
+        held.update(path for path in inside if path.name in names)
     return held
 
 
