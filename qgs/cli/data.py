@@ -154,6 +154,8 @@ def _conclude(console: Console, packed: Packed, out: str) -> None:
         markup=False,
         soft_wrap=True,
     )
+    if not packed.scenes["test"]:
+        console.print("there are no test scenes: held-out frames are what is evaluated")
     if packed.left_out:
         console.print(f"{len(packed.left_out)} scenes could not be read and are left out:")
         for name, reason in packed.left_out.items():

@@ -19,6 +19,7 @@ from qgs.data.chunks.listing import Listing, has_chunks, list_scenes
 from qgs.data.chunks.record import Record, judge_record
 from qgs.data.chunks.store import ChunkStore
 from qgs.data.encoded import EncodedFrame, EncodedScene
+from qgs.data.frames import Size
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
 from qgs.data.paths import opened_path
 from qgs.types import Cameras
@@ -75,12 +76,11 @@ class ChunkScene(EncodedScene):
         """See `Scene`. Raises ValueError for cameras that cannot be used."""
         record = self._record
         judge_record(record)
-        target = self._config.image_size
-        intrinsics = [
-            CropResize(size, target).intrinsics(torch.tensor(pixels, dtype=torch.float64))
-            for pixels, size in zip(_in_pixels(record), record.image_sizes, strict=True)
-        ]
-        return Cameras(torch.linalg.inv(record.w2c), torch.stack(intrinsics), target)
+        return Cameras(
+            torch.linalg.inv(record.w2c),
+            _intrinsics(record, self._config.image_size),
+            self._config.image_size,
+        )
 
     def frame_name(self, frame: int) -> str:
         """See `Scene`: the writer's name of a frame, else its time stamp."""
@@ -144,10 +144,15 @@ class ChunkScene(EncodedScene):
         return CropResize((mask.height, mask.width), self._config.image_size).image(mask)
 
 
-def _in_pixels(record: Record) -> list[list[float]]:
-    """fx, fy, cx, cy of every frame in pixels of its image."""
-    sizes = torch.tensor([(w, h, w, h) for h, w in record.image_sizes], dtype=torch.float64)
-    return (record.cameras[:, :4].double() * sizes).tolist()
+def _intrinsics(record: Record, target: Size) -> Tensor:
+    """fx, fy, cx, cy (V, 4) float64 in pixels of the delivered images."""
+    intrinsics = record.cameras[:, :4].double()
+    sizes = torch.tensor(record.image_sizes)
+    for height, width in set(record.image_sizes):
+        alike = (sizes == torch.tensor([height, width])).all(1)
+        pixels = intrinsics[alike] * torch.tensor([width, height, width, height])
+        intrinsics[alike] = CropResize((height, width), target).intrinsics(pixels)
+    return intrinsics
 
 
 def _check_aspect(record: Record, frame: int, size: tuple[int, int]) -> None:

@@ -57,6 +57,7 @@ class Chunk:
         self.path = path
         self._entries = load_chunk(path)
         self._by_key: dict[str, int] = {}
+        self._parsed: dict[str, Record] = {}
         for place, entry in enumerate(self._entries):
             key = entry.get("key") if isinstance(entry, dict) else None
             if not isinstance(key, str):
@@ -84,7 +85,9 @@ class Chunk:
                 f"holds {', '.join(self.keys[:5])}{', ...' if len(self.keys) > 5 else ''}. Remove "
                 "index.json to have the chunks read instead, or pack the data set again"
             )
-        return parse_record(str(self.path), self._entries[self._by_key[key]])
+        if key not in self._parsed:
+            self._parsed[key] = parse_record(str(self.path), self._entries[self._by_key[key]])
+        return self._parsed[key]
 
 
 class ChunkStore:
