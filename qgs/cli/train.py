@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,24 +26,31 @@ def register(app: typer.Typer) -> None:
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe file.")],
     out: Annotated[Path, typer.Option(help="New folder for the run; never overwritten.")],
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in --out; start it if there is none.")
+    ] = False,
     overrides: Overrides = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Train a model, then evaluate it on views it never saw.
 
-    Ctrl-C finishes the step, saves the checkpoint and ends with 128 + the signal's number.
+    Ctrl-C and SIGTERM finish the step, save, and end with 128 + the signal's number. With --resume
+    the same command goes on from there, or from the last save if the process was killed, as if it
+    had never been interrupted.
     """
     from rich.console import Console
 
     from qgs import engine
     from qgs.composer import resolve
+    from qgs.engine.protocol import index_of
 
     use_threads(threads)
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
+    index_of(resolved)  # an index that is not there is told now, not after the training
     try:
-        result = engine.train(resolved, out, console=console, device=device)
+        result = engine.train(resolved, out, console=console, device=device, resume=resume)
     except engine.CollapseError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
@@ -54,25 +61,33 @@ def train(
 
 
 def _conclude(result: TrainingResult, recipe: Recipe, console: Console) -> None:
-    console.print(f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}")
+    finished = result.resumed_at == result.steps
+    done = "was already finished: " if finished and not result.stopped_by else ""
+    console.print(
+        f"{done}{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
+    )
     if result.stopped_by:
         console.print(f"stopped early by {result.stopped_by}; not evaluated")
+        console.print("continue with the same command and --resume", highlight=False)
+        return
+    if finished and result.folder.evaluation.exists():
+        console.print(f"evaluated before, see {result.folder.evaluation}")
         return
     evaluate_into(result.model, recipe, result.steps, result.folder.evaluation, console)
 
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """`recipe` with absolute paths in its data, so that its run can be judged from any folder."""
+    """`recipe` with absolute paths of data and index, so that its run can be judged anywhere."""
     from qgs.composer import resolve
     from qgs.data.paths import is_local, opened_path
 
-    def absolute(path: str) -> str:
-        opened = opened_path(path)
-        return str(opened.resolve()) if is_local(opened) else path
+    def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:
+        given = {key: section.get(key) for key in keys}
+        opened = {key: opened_path(path) for key, path in given.items() if isinstance(path, str)}
+        local = {key: str(path.resolve()) for key, path in opened.items() if is_local(path)}
+        return {**section, **local}
 
-    data = recipe.tree.get("data", {})
-    given = {key: data.get(key) for key in ("path", "test_scenes")}
-    paths = {key: absolute(path) for key, path in given.items() if isinstance(path, str)}
-    if not paths or not data["type"].startswith("qgs/"):
-        return recipe
-    return resolve({**recipe.tree, "data": {**data, **paths}})
+    tree = {**recipe.tree, "evaluation": absolute(recipe.tree["evaluation"], "index")}
+    if tree.get("data", {}).get("type", "").startswith("qgs/"):
+        tree["data"] = absolute(tree["data"], "path", "test_scenes")
+    return recipe if tree == recipe.tree else resolve(tree)

@@ -8,11 +8,18 @@ from dataclasses import dataclass
 
 from qgs.contracts import SceneSource, SceneSourceConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples
+from qgs.data.order import SceneOrder
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleError, SampleStream
 from qgs.data.workers import decoded_by_workers
 
-__all__ = ["SampleError", "Share", "evaluation_samples", "training_batches"]
+__all__ = [
+    "SampleError",
+    "Share",
+    "evaluation_samples",
+    "scenes_fingerprint",
+    "training_batches",
+]
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,11 @@ def training_batches(
         return _prefetched(lambda number: stream.batch(part.samples(number)), start)
     opener = _Opener(type(source), source.config, views, seed, part)
     return decoded_by_workers(opener, start, workers)
+
+
+def scenes_fingerprint(source: SceneSource) -> str:
+    """Equal where `training_batches` visits equally many training scenes, stored alike."""
+    return SceneOrder(source.groups("train"), len(source.scenes("train")), seed=0).fingerprint
 
 
 @dataclass(frozen=True)

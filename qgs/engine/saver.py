@@ -9,7 +9,7 @@ from accelerate import Accelerator
 from qgs.engine.collapse import GoodWeights
 from qgs.engine.folder import RunFolder
 from qgs.engine.state import SavedState, Stateful, Weights, write_state
-from qgs.io.checkpoint import save
+from qgs.io.checkpoint import CheckpointError, save
 from qgs.model import QueryGaussianModel
 
 
@@ -18,7 +18,8 @@ class Saver:
 
     parts: everything that continues the run, by name; "weights" and "good", the copies that outlive
         a collapse, are also what checkpoints are written from.
-    Each file appears whole or not at all, and the state is complete by itself.
+    Each file appears whole or not at all, and the state is complete by itself. It comes last: what
+    is in it has reached the other files.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class Saver:
         parts = {name: part.state() for name, part in self._parts.items()}
         if self._accelerator.is_main_process:
             extra = {"step": str(step)}
-            self._folder.flush()
+            self._folder.synchronise()
             save(self._model, self._folder.checkpoint, extra=extra, weights=parts["weights"])
             assert self._model.recipe is not None
             write_state(self._folder.state, self._model.recipe, parts)
@@ -55,6 +56,15 @@ class Saver:
         self._accelerator.wait_for_everyone()
 
     def restore(self, saved: SavedState) -> None:
-        """Bring every part back to where `saved` was taken. All processes must call this."""
+        """Bring every part back to where `saved` was taken. All processes must call this.
+
+        Raises CheckpointError, and what parts raise.
+        """
+        missing = [name for name in self._parts if name not in saved.parts]
+        if missing:
+            raise CheckpointError(
+                f"{self._folder.state} lacks {', '.join(missing)}: another version of qgs wrote "
+                "it; continue the run with that version"
+            )
         for name, part in self._parts.items():
             part.load_state(saved.parts[name])

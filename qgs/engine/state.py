@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 import qgs
+from qgs.composer import Recipe, resolve
 from qgs.engine.processes import placed_like, whole
 from qgs.io.atomic import replacing
 from qgs.io.checkpoint import CheckpointError, unique_tensors
@@ -43,16 +44,16 @@ class Stateful(Protocol):
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state file: the resolved recipe of its run, and the states of parts by name."""
+    """A state file: the recipe of its run, and the states of parts by name."""
 
-    recipe: Mapping[str, Any]
+    recipe: Recipe
     parts: Mapping[str, State]
 
 
 def write_state(
     path: str | os.PathLike[str], recipe: Mapping[str, Any], parts: Mapping[str, State]
 ) -> None:
-    """Write `parts` to `path`, whole or not at all."""
+    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, dict[str, Any]] = {}
     for part, state in parts.items():
@@ -71,7 +72,10 @@ def write_state(
 
 
 def read_state(path: str | os.PathLike[str]) -> SavedState:
-    """What `write_state` wrote. Raises FileNotFoundError and CheckpointError."""
+    """What `write_state` wrote.
+
+    Raises FileNotFoundError, CheckpointError, and the composer's error when a plugin is missing.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no training state at {path}")
     try:
@@ -93,7 +97,7 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
     for name, tensor in tensors.items():
         part, key = name.split("/", 1)
         parts[part][key] = tensor
-    return SavedState(json.loads(metadata[_RECIPE]), parts)
+    return SavedState(resolve(json.loads(metadata[_RECIPE])), parts)
 
 
 class Weights:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -15,7 +15,8 @@ from rich.console import Console
 from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.data.loader import Share, training_batches
+from qgs.data.loader import Share, scenes_fingerprint, training_batches
+from qgs.data.sampling import Batch
 from qgs.engine.clock import Clock
 from qgs.engine.collapse import (
     BROKEN_REMEDIES,
@@ -30,15 +31,17 @@ from qgs.engine.collapse import (
 from qgs.engine.device import choose_device
 from qgs.engine.folder import RunFolder
 from qgs.engine.gradients import Gradients
+from qgs.engine.initial import initialise
 from qgs.engine.interrupt import StopRequest, stop_requests
 from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
 from qgs.engine.processes import make_accelerator, mean
 from qgs.engine.progress import TrainingProgress
+from qgs.engine.resume import refuse_other_conditions, saved_state
 from qgs.engine.saver import Saver
 from qgs.engine.schedule import OneCycle
 from qgs.engine.seeds import RandomStates, set_seed
-from qgs.engine.state import Moments, Stateful
+from qgs.engine.state import Moments, SavedState, Stateful
 from qgs.model import QueryGaussianModel
 
 _log = logging.getLogger(__name__)
@@ -49,7 +52,8 @@ class TrainingResult:
     """What a run left: the trained model, its folder, optimiser steps, seconds on the clock.
 
     stopped_by: name of the signal that ended it early, else None; SIGTERM where another process got
-    the signal. main: whether this is the one process, of several, that writes files.
+    the signal. main: whether this is the one process, of several, that writes files. resumed_at:
+    the step from which a run was continued, None for one that began here.
     """
 
     model: QueryGaussianModel
@@ -58,29 +62,43 @@ class TrainingResult:
     seconds: float
     stopped_by: str | None
     main: bool
+    resumed_at: int | None = None
 
 
 def train(
-    recipe: Recipe, run: str | Path, *, console: Console | None = None, device: str = "auto"
+    recipe: Recipe,
+    run: str | Path,
+    *,
+    console: Console | None = None,
+    device: str = "auto",
+    resume: bool = False,
 ) -> TrainingResult:
     """Train the model of `recipe` on `device` and leave everything in the folder `run`.
 
-    Writes recipe.yaml, history.jsonl (one record per optimiser step) and checkpoint.safetensors: on
-    schedule, at the end, and after SIGINT or SIGTERM, which finish the step and return. The clock
-    of `training.seconds` starts after the first step, in which kernels compile. A start that fails,
-    for want of data for instance, leaves no folder. Of several processes the main one writes.
+    Writes recipe.yaml, history.jsonl (one record per optimiser step), checkpoint.safetensors (the
+    model) and state.safetensors (what continues the run): on schedule, at the end, and after SIGINT
+    or SIGTERM, which finish the step and return. The clock of `training.seconds` starts after the
+    first step, in which kernels compile. A start that fails, for want of data for instance, leaves
+    no folder. Of several processes the main one writes; all of them must see `run`.
 
-    Raises FileExistsError when `run` holds anything, ValueError as `choose_device` and `OneCycle`,
-    what the data source raises, and CollapseError when the model died; the checkpoint then holds
-    the last good weights.
+    resume: continue the run in `run` from its state, as if it had never been interrupted, or start
+    it where there is none yet. A run whose budget is used is left as it is.
+
+    Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
+    as `choose_device` and `OneCycle`, `qgs.engine.resume.OtherRunError` for another recipe or data
+    than the run's, what the data source raises, and CollapseError when the model died; the
+    checkpoint then holds the last good weights.
     """
-    RunFolder(run).refuse_used()
+    if not resume:
+        RunFolder(run).refuse_used()
     terminal = console or Console(stderr=True)
     chosen = choose_device(device, terminal.print)
     set_seed(recipe.seed)
-    with closing(Trainer(recipe, run, chosen)) as trainer:
+    with closing(Trainer(recipe, run, chosen, resume)) as trainer:
         if not trainer.accelerator.is_main_process:
             terminal = Console(quiet=True)
+        for note in trainer.notes:
+            terminal.print(note, highlight=False)
         with TrainingProgress(terminal) as progress, stop_requests() as stop:
             return trainer.run(progress, stop)
 
@@ -94,15 +112,40 @@ class Trainer:
     drawn, over all processes.
     """
 
-    def __init__(self, recipe: Recipe, run: str | Path, device: str = "cpu") -> None:
+    def __init__(
+        self, recipe: Recipe, run: str | Path, device: str = "cpu", resume: bool = False
+    ) -> None:
         self.recipe = recipe
         self.config = recipe.training
+        self._resumes = resume
         self.folder = RunFolder(run)
         self.schedule = OneCycle(self.config)
         self.accelerator = make_accelerator(device)
         self.device = self.accelerator.device
-        self.model = recipe.build_model(device=self.device).train()
-        losses = recipe.build_losses()
+        with ExitStack() as resources:
+            resources.callback(self.folder.close)
+            saved = self._claim_folder() if resume else None
+            self._build(fresh=saved is None)
+            self.resumed_at = self._restore(saved) if saved else None
+            self._stream = self._open_stream()
+            resources.callback(self._stream.close)
+            self._batches = chain([next(self._stream)], self._stream)
+            self._resources = resources.pop_all()
+        self._folder_is_open = False
+
+    def _claim_folder(self) -> SavedState | None:
+        """The state to continue from; a folder that holds a run is this one's from now on."""
+        self.folder.refuse_foreign()
+        if self.accelerator.is_main_process and not self.folder.is_new:
+            self.folder.take()
+        self.accelerator.wait_for_everyone()
+        return saved_state(self.folder, self.recipe)
+
+    def _build(self, fresh: bool) -> None:
+        """Everything with a state, as it is before the first step."""
+        self.model = self.recipe.build_model(device=self.device).train()
+        self.notes = initialise(self.model, self.recipe) if fresh else []
+        losses = self.recipe.build_losses()
         objective = Objective(self.model, losses, self.config.render_views).to(self.device)
         self.objective, self.optimizer = self.accelerator.prepare(
             objective, make_optimizer(objective, self.config)
@@ -111,6 +154,12 @@ class Trainer:
         self.detector = CollapseDetector(self.config.collapse_window)
         self.good = GoodWeights(self.model)
         self.clock = Clock(self.accelerator)
+        self.source = self.recipe.build_data()
+        batches = self.config.accumulate * self.accelerator.num_processes
+        self._conditions = {
+            "step_size": self.config.batch_size * batches,
+            "scenes": scenes_fingerprint(self.source),
+        }
         self.step = 0
         self.samples = 0
         self.parts: dict[str, Stateful] = {
@@ -122,32 +171,42 @@ class Trainer:
             "random": RandomStates(self.accelerator),
         }
         self.saver = Saver(self.accelerator, self.folder, self.model, self.good, self.parts)
-        self._folder_is_open = False
-        self._stream = training_batches(
-            recipe.build_data(),
-            recipe.views,
+
+    def _restore(self, saved: SavedState) -> int:
+        """Continue from `saved`; the step at which that is."""
+        self.saver.restore(saved)
+        return self.step
+
+    def _open_stream(self) -> Generator[Batch, None, None]:
+        """Batches from the first one that no optimiser step has seen."""
+        processes = self.accelerator.num_processes
+        return training_batches(
+            self.source,
+            self.recipe.views,
             self.config.batch_size,
-            recipe.seed,
-            share=Share(self.accelerator.process_index, self.accelerator.num_processes),
+            self.recipe.seed,
+            start=self.samples // (self.config.batch_size * processes),
+            share=Share(self.accelerator.process_index, processes),
             workers=self.config.workers,
         )
-        self._batches = chain([next(self._stream)], self._stream)
 
     def close(self) -> None:
-        """Stop reading ahead and close the history."""
-        self._stream.close()
-        self.folder.close()
+        """Stop reading ahead, close the history and leave the folder to others."""
+        self._resources.close()
 
-    def state(self) -> dict[str, int]:
+    def state(self) -> dict[str, Any]:
         """See `qgs.engine.state.Stateful`."""
-        return {"step": self.step, "samples": self.samples}
+        return {"step": self.step, "samples": self.samples, **self._conditions}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.state.Stateful`."""
+        """See `qgs.engine.state.Stateful`. Raises OtherRunError."""
+        refuse_other_conditions(state, self._conditions, self.folder)
         self.step, self.samples = state["step"], state["samples"]
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
+        if self.used >= 1:
+            return self._result(None)
         while self.used < 1:
             record = self._optimise(stop)
             self._open_folder()
@@ -160,9 +219,17 @@ class Trainer:
                 break
         stopped_by = self._stopped_by(stop)
         self._finish(stopped_by)
-        main = self.accelerator.is_main_process
+        return self._result(stopped_by)
+
+    def _result(self, stopped_by: str | None) -> TrainingResult:
         return TrainingResult(
-            self.model.eval(), self.folder, self.step, self.clock.seconds, stopped_by, main
+            self.model.eval(),
+            self.folder,
+            self.step,
+            self.clock.seconds,
+            stopped_by,
+            self.accelerator.is_main_process,
+            self.resumed_at,
         )
 
     @property
@@ -174,12 +241,19 @@ class Trainer:
         return max(of_steps, of_seconds)
 
     def _open_folder(self) -> None:
-        """Make the folder, once, and write the recipe. Raises FileExistsError."""
+        """Make the folder, once, write the recipe, and drop records of steps that were lost.
+
+        Raises FileExistsError.
+        """
         if self._folder_is_open:
             return
         self._folder_is_open = True
         if self.accelerator.is_main_process:
-            RunFolder.create(self.folder.path).write_recipe(self.recipe)
+            if not self._resumes:
+                self.folder.refuse_used()
+            self.folder.take()
+            self.folder.write_recipe(self.recipe)
+            self.folder.cut_history(self.resumed_at or 0)
         self.accelerator.wait_for_everyone()
 
     def _optimise(self, stop: StopRequest) -> dict[str, float]:

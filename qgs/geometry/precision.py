@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import wraps
 from typing import Any, TypeVar, cast
 
@@ -30,7 +31,10 @@ def full_precision(function: F) -> F:
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         tensors = [v for v in (*args, *kwargs.values()) if isinstance(v, Tensor)]
         device = tensors[0].device.type if tensors else "cpu"
-        with torch.autocast(device_type=device, enabled=False):
+        # Leaving the outermost autocast of a thread empties a cache that all threads share, so
+        # a thread that loads data must not enter one while another trains.
+        inside = torch.is_autocast_enabled(device)
+        with torch.autocast(device_type=device, enabled=False) if inside else nullcontext():
             return function(*map(raised, args), **{k: raised(v) for k, v in kwargs.items()})
 
     return cast(F, wrapper)

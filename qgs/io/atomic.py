@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +15,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place when the block ends well.
 
     Makes missing parent folders; the file gets the usual permissions whatever wrote it. When the
-    block raises, `path` stays as it was.
+    block raises, `path` stays as it was. The new file is on the disk before it takes the place of
+    the old one, and its name when the block has ended.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -24,9 +26,25 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         mode = temporary.stat().st_mode
         yield temporary
         temporary.chmod(mode)
+        _synchronise(temporary)
         os.replace(temporary, target)
+        _synchronise(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether `path` is a file that a process killed inside `replacing` left, or is now writing."""
+    return bool(re.fullmatch(r"\..+\.\d+\.tmp", path.name)) and path.is_file()
+
+
+def _synchronise(path: Path) -> None:
+    """Wait until `path`, a file or a folder, is on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
 
 
 @contextmanager

@@ -74,6 +74,18 @@ def test_worker_processes_change_nothing_and_end_with_the_stream(tmp_path):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_reading_ahead_leaves_the_autocast_of_training_alone(tmp_path):
+    """Threads share the cache of cast weights; a thread that empties it changes gradients."""
+    recipe = photos(tmp_path / "shelf")
+    weight, x = torch.eye(4, requires_grad=True), torch.ones(1, 4)
+    with torch.autocast("cpu", torch.bfloat16):
+        first = torch.nn.functional.linear(x, weight).grad_fn
+        batches(recipe, 2, 1)
+        second = torch.nn.functional.linear(x, weight).grad_fn
+    casts = [node.next_functions[-1][0].next_functions[0][0] for node in (first, second)]
+    assert casts[0] is casts[1]
+
+
 def test_closing_ends_the_thread():
     batches(ROOMS, 1, 1)
     assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]

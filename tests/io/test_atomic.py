@@ -1,4 +1,4 @@
-"""Folders whose entries are replaced together."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from qgs.io.atomic import replacing_entries
+from qgs.io.atomic import is_leftover, replacing, replacing_entries
 
 
 def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:
@@ -31,3 +31,13 @@ def test_an_error_changes_nothing(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="the disk is full"):
         fail()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path: Path) -> None:
+    for name in (".state.safetensors.tmp", "notes.12.tmp", ".git", "state.safetensors"):
+        (tmp_path / name).touch()
+        assert not is_leftover(tmp_path / name)
+    (tmp_path / ".folder.12.tmp").mkdir()
+    assert not is_leftover(tmp_path / ".folder.12.tmp")
+    with replacing(tmp_path / "state") as temporary:
+        assert is_leftover(temporary)

@@ -1,0 +1,286 @@
+"""A run that was interrupted and continued is the run that was not."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from accelerate import Accelerator
+from rich.console import Console
+
+from qgs.composer import Recipe
+from qgs.engine import RunFolder, TrainingResult, train
+from qgs.engine.interrupt import StopRequest
+from qgs.engine.progress import TrainingProgress
+from qgs.engine.resume import OtherRunError
+from qgs.engine.seeds import RandomStates
+from qgs.engine.state import read_state, write_state
+from qgs.engine.trainer import Trainer
+from qgs.io.checkpoint import CheckpointError, load_extra
+
+QUIET = Console(quiet=True)
+
+
+class Killed(BaseException):
+    """Ends a run as a kill does, from the loop's point of view: nothing is saved any more."""
+
+
+class Killer(TrainingProgress):
+    """Kills the run once it has made so many steps."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(QUIET)
+        self._last = step
+
+    def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
+        if step == self._last:
+            raise Killed
+        return False
+
+
+def kill_after(steps: int, recipe: Recipe, run: Path, resume: bool = False) -> None:
+    trainer = Trainer(recipe, run, resume=resume)
+    try:
+        with pytest.raises(Killed):
+            trainer.run(Killer(steps), StopRequest())
+    finally:
+        trainer.close()
+
+
+def resumed(recipe: Recipe, run: Path) -> TrainingResult:
+    return train(recipe, run, console=QUIET, device="cpu", resume=True)
+
+
+def assert_equal_runs(first: Path, second: Path) -> None:
+    """Same weights, optimiser state and random states to the bit, same history but for time."""
+    ours, theirs = (read_state(RunFolder(run).state).parts for run in (first, second))
+    assert ours.keys() == theirs.keys()
+    for name in ours.keys() - {"clock"}:
+        assert ours[name].keys() == theirs[name].keys(), name
+        for key, value in ours[name].items():
+            other = theirs[name][key]
+            same = torch.equal(value, other) if torch.is_tensor(value) else value == other
+            assert same, f"{name}/{key}"
+    assert losses(first) == losses(second)
+
+
+def losses(run: Path) -> list[tuple[float, float, float]]:
+    history = RunFolder(run).history()
+    return [(record["step"], record["loss"], record["lr"]) for record in history]
+
+
+CASES = [
+    ("locus", ()),
+    ("tokengs", ("training.accumulate=2", "training.batch_size=1", "views.mirror=0.5")),
+    ("locus", ("training.precision=bf16",)),
+]
+
+
+@pytest.mark.parametrize(("name", "overrides"), CASES)
+def test_17_and_23_steps_are_40(
+    tiny: Callable[..., Recipe], tmp_path: Path, name: str, overrides: Sequence[str]
+) -> None:
+    recipe = tiny(
+        name,
+        "training.steps=40",
+        "training.save_every=5",
+        "training.collapse_window=10",
+        *overrides,
+    )
+    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
+    kill_after(17, recipe, tmp_path / "killed")
+    assert len(RunFolder(tmp_path / "killed").history()) == 17
+    result = resumed(recipe, tmp_path / "killed")
+    assert (result.resumed_at, result.steps) == (15, 40)
+    assert_equal_runs(tmp_path / "through", tmp_path / "killed")
+
+
+@pytest.mark.slow
+def test_workers_and_several_kills_change_nothing(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("locus", "training.steps=40", "training.save_every=1")
+    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
+    with_workers = tiny("locus", "training.steps=40", "training.save_every=1", "training.workers=2")
+    kill_after(9, with_workers, tmp_path / "killed")
+    kill_after(17, with_workers, tmp_path / "killed", resume=True)
+    kill_after(18, recipe, tmp_path / "killed", resume=True)
+    resumed(with_workers, tmp_path / "killed")
+    assert_equal_runs(tmp_path / "through", tmp_path / "killed")
+
+
+def test_a_stopped_run_goes_on_where_it_stopped(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("locus", "training.save_every=0")
+    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
+    trainer = Trainer(recipe, tmp_path / "stopped")
+    stop = StopRequest()
+
+    class Stopping(TrainingProgress):
+        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
+            stop.signal = None if step < 2 else signal.SIGTERM
+            return False
+
+    trainer.run(Stopping(QUIET), stop)
+    trainer.close()
+    assert trainer.step == 3, "a request is seen at the end of the step in which it comes"
+    assert resumed(recipe, tmp_path / "stopped").resumed_at == 3
+    assert_equal_runs(tmp_path / "through", tmp_path / "stopped")
+
+
+def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe, run = tiny("tokengs"), tmp_path / "run"
+    first = resumed(recipe, run)
+    assert (first.resumed_at, first.steps) == (None, 4)
+    files = {path: path.stat().st_mtime_ns for path in run.iterdir()}
+    again = resumed(recipe, run)
+    assert (again.resumed_at, again.steps, again.stopped_by) == (4, 4, None)
+    assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == files
+    ours, theirs = first.model.state_dict(), again.model.state_dict()
+    assert all(torch.equal(theirs[name], tensor) for name, tensor in ours.items())
+
+
+def test_a_longer_budget_continues_a_finished_run(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    resumed(tiny("tokengs"), run)
+    longer = tiny("tokengs", "training.steps=6", "evaluation.scenes=1", "training.save_every=7")
+    assert resumed(longer, run).steps == 6
+    assert [step for step, *_ in losses(run)] == [1, 2, 3, 4, 5, 6]
+    assert "steps: 6" in (run / "recipe.yaml").read_text()
+    assert load_extra(run / "checkpoint.safetensors") == {"step": "6"}
+
+
+def test_the_clock_goes_on(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.5")
+    kill_after(5, tiny("tokengs", "training.steps=5", "training.save_every=4"), tmp_path / "run")
+    state = read_state(tmp_path / "run" / "state.safetensors")
+    parts = {**state.parts, "clock": {"seconds": 1.0}}
+    write_state(tmp_path / "run" / "state.safetensors", state.recipe.tree, parts)
+    result = resumed(recipe, tmp_path / "run")
+    history = result.folder.history()
+    assert [record["seconds"] for record in history[4:6]] == [1.0, history[5]["seconds"]]
+    assert 1.5 <= result.seconds < 10
+
+
+def test_a_run_killed_before_its_first_save_starts_again(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe, run = tiny("locus"), tmp_path / "run"
+    kill_after(2, recipe, run)
+    (run / ".state.safetensors.4711.tmp").write_text("half a state")
+    with (run / "history.jsonl").open("a") as file:
+        file.write('{"step": 3, "lo')
+    with pytest.raises(OtherRunError, match=r"seed: 1 here, 0 in the run"):
+        resumed(tiny("locus", "seed=1"), run)
+    assert resumed(recipe, run).resumed_at is None
+    assert [step for step, *_ in losses(run)] == [1, 2, 3, 4]
+    assert not list(run.glob(".*"))
+
+
+def test_another_recipe_is_refused_by_its_keys(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    kill_after(2, tiny("tokengs", "training.save_every=1"), run)
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    with pytest.raises(OtherRunError) as caught:
+        resumed(
+            tiny("tokengs", "training.learning_rate=1e-3", "seed=4", "training.save_every=3"), run
+        )
+    message = str(caught.value)
+    assert "training.learning_rate: 0.001 here, 0.0015 in the run" in message
+    assert "seed: 4 here, 0 in the run" in message
+    assert "training.save_every:" not in message
+    assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+
+
+def test_a_step_must_see_as_many_samples(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    recipe = tiny("tokengs", "training.batch_size=2", "training.save_every=1")
+    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
+    kill_after(2, recipe, run)
+    with pytest.raises(OtherRunError, match="sees 2 samples, here it would see 3"):
+        resumed(tiny("tokengs", "training.batch_size=3"), run)
+    halves = tiny("tokengs", "training.batch_size=1", "training.accumulate=2")
+    assert resumed(halves, run).steps == 4
+    for ours, theirs in zip(losses(run), losses(tmp_path / "through"), strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-4)
+
+
+def test_other_scenes_are_refused(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe = tiny("tokengs", "training.save_every=1")
+    kill_after(2, recipe, tmp_path / "run")
+    file = tmp_path / "run" / "state.safetensors"
+    state = read_state(file)
+    counters = {**state.parts["counters"], "scenes": "others"}
+    write_state(file, state.recipe.tree, {**state.parts, "counters": counters})
+    with pytest.raises(OtherRunError, match="other training scenes"):
+        resumed(recipe, tmp_path / "run")
+
+
+def test_folders_without_a_run_are_refused(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe = tiny("tokengs")
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="holds no run"):
+        resumed(recipe, tmp_path)
+    with pytest.raises(FileExistsError, match="is a file"):
+        resumed(recipe, tmp_path / "notes.txt")
+    (tmp_path / "checkpoint.safetensors").touch()
+    with pytest.raises(FileExistsError, match="cannot be continued"):
+        resumed(recipe, tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_one_process_at_a_time_trains_in_a_folder(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs")
+    kill_after(2, recipe, tmp_path / "run")
+    folder = RunFolder(tmp_path / "run")
+    folder.take()
+    with pytest.raises(FileExistsError, match="another process is training"):
+        resumed(recipe, tmp_path / "run")
+    folder.close()
+    assert resumed(recipe, tmp_path / "run").steps == 4
+
+
+def test_a_state_that_is_damaged_or_newer_is_refused(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe, run = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
+    kill_after(2, recipe, run)
+    file = run / "state.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-100])
+    with pytest.raises(CheckpointError, match="not a whole safetensors file"):
+        resumed(recipe, run)
+    file.write_bytes(whole.replace(b'"qgs.state_version":"1"', b'"qgs.state_version":"9"'))
+    with pytest.raises(CheckpointError, match="install the newer qgs"):
+        resumed(recipe, run)
+    file.write_bytes((run / "checkpoint.safetensors").read_bytes())
+    with pytest.raises(CheckpointError, match="no training state"):
+        resumed(recipe, run)
+
+
+def test_random_states_come_back() -> None:
+    states = RandomStates(Accelerator(cpu=True))
+
+    def draw() -> tuple[float, float, float]:
+        return random.random(), float(np.random.normal()), float(torch.rand(()))
+
+    np.random.normal()
+    saved = states.state()
+    as_json = {k: v for k, v in saved.items() if not torch.is_tensor(v)}
+    first = draw()
+    draw()
+    states.load_state({**saved, **json.loads(json.dumps(as_json))})
+    assert draw() == first
