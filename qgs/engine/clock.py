@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -31,6 +32,14 @@ class Clock:
             self._started = now
         elapsed = torch.tensor(now - self._started, device=self._accelerator.device)
         self.seconds = self._before + float(mean(self._accelerator, elapsed))
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Leave the time of the `with` block out."""
+        since = time.perf_counter()
+        yield
+        if self._started is not None:
+            self._started += time.perf_counter() - since
 
     def state(self) -> dict[str, Any]:
         """See `qgs.engine.state.Stateful`."""

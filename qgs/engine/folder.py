@@ -69,6 +69,11 @@ class RunFolder:
         return self.path / "checkpoint.safetensors"
 
     @property
+    def checkpoint_ema(self) -> Path:
+        """The moving average of the weights, where a recipe asks for it."""
+        return self.path / "checkpoint_ema.safetensors"
+
+    @property
     def state(self) -> Path:
         """Everything that continues the run."""
         return self.path / "state.safetensors"

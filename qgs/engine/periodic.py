@@ -39,6 +39,8 @@ class PeriodicEvaluation:
     Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png; random states and the
     model's mode are afterwards what they were. One process judges and the others wait, unless the
     weights lie in shards.
+
+    latest: the step of the latest evaluation of this session.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class PeriodicEvaluation:
         folder: Path,
         trackers: Trackers,
     ) -> None:
+        self.latest: int | None = None
         self._accelerator = accelerator
         self._recipe = recipe
         self._model = model
@@ -60,6 +63,7 @@ class PeriodicEvaluation:
 
     def run(self, step: int) -> None:
         """Evaluate after `step` optimiser steps. All processes must call this."""
+        self.latest = step
         states = self._random.state()
         main = self._accelerator.is_main_process
         if main or any(isinstance(p, DTensor) for p in self._model.parameters()):

@@ -16,8 +16,8 @@ from qgs.model import QueryGaussianModel
 class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
-    parts: everything that continues the run, by name; "weights" and "good", the copies that outlive
-        a collapse, are also what checkpoints are written from.
+    parts: everything that continues the run, by name; "weights", "good", the copies that outlive a
+        collapse, and "ema", if there is one, are also what checkpoints are written from.
     Each file appears whole or not at all, and the state is complete by itself. It comes last: what
     is in it has reached the other files.
     """
@@ -44,6 +44,9 @@ class Saver:
             extra = {"step": str(step)}
             self._folder.synchronise()
             save(self._model, self._folder.checkpoint, extra=extra, weights=parts["weights"])
+            if "ema" in parts:
+                averages = parts["ema"]
+                save(self._model, self._folder.checkpoint_ema, extra=extra, weights=averages)
             assert self._model.recipe is not None
             write_state(self._folder.state, self._model.recipe, parts)
         self._accelerator.wait_for_everyone()

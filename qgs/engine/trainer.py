@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -29,12 +30,15 @@ from qgs.engine.collapse import (
     not_finite,
 )
 from qgs.engine.device import choose_device
+from qgs.engine.ema import MovingAverage
 from qgs.engine.folder import RunFolder
 from qgs.engine.gradients import Gradients
+from qgs.engine.incidents import PATIENCE, Incidents
 from qgs.engine.initial import initialise
 from qgs.engine.interrupt import StopRequest, stop_requests
 from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
+from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.processes import make_accelerator, mean
 from qgs.engine.progress import TrainingProgress
 from qgs.engine.resume import refuse_other_conditions, saved_state
@@ -42,6 +46,7 @@ from qgs.engine.saver import Saver
 from qgs.engine.schedule import OneCycle
 from qgs.engine.seeds import RandomStates, set_seed
 from qgs.engine.state import Moments, SavedState, Stateful
+from qgs.engine.trackers import Trackers
 from qgs.model import QueryGaussianModel
 
 _log = logging.getLogger(__name__)
@@ -119,11 +124,13 @@ class Trainer:
         self.config = recipe.training
         self._resumes = resume
         self.folder = RunFolder(run)
+        self.trackers = Trackers(self.config.trackers)
         self.schedule = OneCycle(self.config)
         self.accelerator = make_accelerator(device)
         self.device = self.accelerator.device
         with ExitStack() as resources:
             resources.callback(self.folder.close)
+            resources.callback(self.trackers.close)
             saved = self._claim_folder() if resume else None
             self._build(fresh=saved is None)
             self.resumed_at = self._restore(saved) if saved else None
@@ -154,6 +161,12 @@ class Trainer:
         self.detector = CollapseDetector(self.config.collapse_window)
         self.good = GoodWeights(self.model)
         self.clock = Clock(self.accelerator)
+        decay, run = self.config.ema, self.folder.path
+        self.average = MovingAverage(self.model, decay) if decay else None
+        self.incidents = Incidents(self.accelerator, objective, self.gradients, run)
+        self.evaluations = PeriodicEvaluation(
+            self.accelerator, self.recipe, self.model, self.average, run, self.trackers
+        )
         self.source = self.recipe.build_data()
         batches = self.config.accumulate * self.accelerator.num_processes
         self._conditions = {
@@ -168,8 +181,11 @@ class Trainer:
             "schedule": self.schedule,
             "clock": self.clock,
             "detector": self.detector,
+            "incidents": self.incidents,
             "random": RandomStates(self.accelerator),
         }
+        if self.average:
+            self.parts["ema"] = self.average
         self.saver = Saver(self.accelerator, self.folder, self.model, self.good, self.parts)
 
     def _restore(self, saved: SavedState) -> int:
@@ -215,6 +231,8 @@ class Trainer:
                 symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
                 self._give_up(symptom, COLLAPSE_REMEDIES)
             self._keep_good_weights()
+            if self.config.evaluate_every and self.step % self.config.evaluate_every == 0:
+                self._evaluate()
             if record["stop"]:
                 break
         stopped_by = self._stopped_by(stop)
@@ -254,6 +272,7 @@ class Trainer:
             self.folder.take()
             self.folder.write_recipe(self.recipe)
             self.folder.cut_history(self.resumed_at or 0)
+            self.trackers.open(self.folder.path, self.recipe, self.resumed_at or 0)
         self.accelerator.wait_for_everyone()
 
     def _optimise(self, stop: StopRequest) -> dict[str, float]:
@@ -267,16 +286,42 @@ class Trainer:
         scenes = sum(len(batch.scenes) for batch in batches)
         self.samples += scenes * self.accelerator.num_processes
         record = self._read(measured, stop)
-        self._refuse_nonfinite(record)
-        self.optimizer.step()
-        self.detector.observe(Vitals(record["alpha"], record["deviation"], record["gradient"]))
+        symptom = self._nonfinite(record)
+        if symptom:
+            self._leave_out(batches, symptom)
+        else:
+            self._apply(record)
         self.step += 1
         self.clock.tick()
         return {"step": self.step, "seconds": self.clock.seconds, "lr": rate, **record}
 
+    def _apply(self, record: Mapping[str, float]) -> None:
+        """Let the optimiser use the gradients of a step that `record` tells of."""
+        self.optimizer.step()
+        if self.average:
+            self.average.update()
+        self.incidents.passed()
+        self.detector.observe(Vitals(record["alpha"], record["deviation"], record["gradient"]))
+
+    def _leave_out(self, batches: Sequence[Batch], symptom: str) -> None:
+        """Save a step that is not finite; end, or go on without it, as the recipe says."""
+        self._open_folder()
+        found = self.incidents.look_into(self.step + 1, batches, symptom)
+        if self.config.on_nonfinite == "stop":
+            self._give_up(found, BROKEN_REMEDIES)
+        if self.incidents.in_a_row > PATIENCE:
+            self._give_up(f"{PATIENCE} steps in a row were skipped; {found}", BROKEN_REMEDIES)
+        _log.warning("step %d is skipped: %s", self.step + 1, found)
+
+    def _evaluate(self) -> None:
+        with self.clock.stopped():
+            self.evaluations.run(self.step)
+
     def _report(self, record: dict[str, float], progress: TrainingProgress) -> None:
         if self.accelerator.is_main_process:
-            self.folder.append(record)
+            told = {name: value for name, value in record.items() if math.isfinite(value)}
+            self.folder.append(told)
+            self.trackers.log(told, self.step)
         images, seconds = self.samples * self.recipe.views.targets, self.clock.seconds
         if progress.update(self.step, record["loss"], record["psnr"], images, seconds, self.used):
             self.folder.flush()
@@ -288,11 +333,10 @@ class Trainer:
         numbers = mean(self.accelerator, values).tolist()
         return dict(zip([*measured, "stop"], numbers, strict=True))
 
-    def _refuse_nonfinite(self, record: dict[str, float]) -> None:
+    def _nonfinite(self, record: dict[str, float]) -> str:
+        """What of a step is NaN or infinite; "" if nothing is."""
         terms = {k: v for k, v in record.items() if k not in ("gradient", "stop", "psnr")}
-        problem = not_finite(terms, self.model, record["gradient"])
-        if problem:
-            self._give_up(problem, BROKEN_REMEDIES)
+        return not_finite(terms, self.model, record["gradient"])
 
     def _keep_good_weights(self) -> None:
         if self.detector.dead_steps:
@@ -325,6 +369,8 @@ class Trainer:
         if dead:
             _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
         self._save()
+        if self.average and not stopped_by and self.evaluations.latest != self.step:
+            self._evaluate()
 
     def _give_up(self, problem: str, causes: Sequence[str]) -> NoReturn:
         self._open_folder()

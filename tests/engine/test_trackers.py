@@ -14,6 +14,7 @@ import pytest
 from qgs.composer import Recipe
 from qgs.contracts.extras import MissingExtraError
 from qgs.engine import trackers
+from qgs.engine.processes import make_accelerator
 from qgs.engine.trackers import Trackers
 
 
@@ -88,6 +89,7 @@ class Wandb(types.ModuleType):
 def test_wandb_continues_one_run(
     tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    make_accelerator("cpu")
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     monkeypatch.setattr(trackers, "find_spec", lambda name: object())

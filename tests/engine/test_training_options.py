@@ -1,0 +1,208 @@
+"""Whole runs with the options of `training` that change what happens around a step."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Generator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+import qgs
+from qgs.composer import Recipe
+from qgs.contracts.extras import MissingExtraError
+from qgs.data.sampling import Batch
+from qgs.engine import CollapseError, TrainingResult, trackers, train, trainer
+from qgs.engine.incidents import PATIENCE, read_batch
+
+QUIET = Console(quiet=True)
+
+
+def run(recipe: Recipe, folder: Path) -> TrainingResult:
+    return train(recipe, folder, console=QUIET, device="cpu")
+
+
+def weights(result: TrainingResult) -> dict[str, torch.Tensor]:
+    return result.model.state_dict()
+
+
+def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return first.keys() == second.keys() and all(
+        torch.equal(t, second[n]) for n, t in first.items()
+    )
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    """The records of a JSONL file, each strictly JSON."""
+
+    def refuse(constant: str) -> float:
+        raise ValueError(f"{constant} is no JSON")
+
+    text = path.read_text(encoding="utf-8").splitlines()
+    return [json.loads(line, parse_constant=refuse) for line in text]
+
+
+@pytest.fixture
+def bad_batches(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """`bad_batches(2, 3)`: the training batches of these numbers, from 0, hold a NaN pixel."""
+
+    def spoil(*numbers: int) -> None:
+        whole = trainer.training_batches
+
+        def spoiled(*arguments: Any, **options: Any) -> Generator[Batch, None, None]:
+            stream = whole(*arguments, **options)
+            try:
+                for number, batch in enumerate(stream):
+                    if number in numbers:
+                        images = batch.targets.images.clone()
+                        images[0, 0, 0, 0, 0] = torch.nan
+                        batch = replace(batch, targets=replace(batch.targets, images=images))
+                    yield batch
+            finally:
+                stream.close()
+
+        monkeypatch.setattr(trainer, "training_batches", spoiled)
+
+    return spoil
+
+
+def test_rendering_in_parts_trains_the_same(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    histories = []
+    for render_views in (0, 1, 2):
+        recipe = tiny("locus", f"training.render_views={render_views}", "views.targets=3")
+        histories.append(run(recipe, tmp_path / str(render_views)).folder.history())
+    for history in histories[1:]:
+        for record, wanted in zip(history, histories[0], strict=True):
+            measured = record.keys() - {"seconds"}
+            assert {k: record[k] for k in measured} == pytest.approx(
+                {k: wanted[k] for k in measured}, rel=1e-4
+            )
+
+
+def test_the_average_is_saved_and_judged_at_the_end(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    plain = run(tiny("locus"), tmp_path / "plain")
+    averaged = run(tiny("locus", "training.ema=0.5"), tmp_path / "ema")
+    assert same(weights(plain), weights(averaged))
+    folder = averaged.folder
+    average = qgs.load(folder.checkpoint_ema).state_dict()
+    assert average.keys() == weights(plain).keys()
+    assert not same(average, weights(plain))
+    largest = max(float((average[n] - t).abs().max()) for n, t in weights(plain).items())
+    assert largest < 0.1, "near the weights it follows"
+    records = lines(folder.path / "evaluations.jsonl")
+    assert [(r["step"], r["weights"]) for r in records] == [(4, "raw"), (4, "ema")]
+    assert not plain.folder.checkpoint_ema.exists()
+
+
+def test_evaluations_do_not_touch_the_training(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    plain = run(tiny("locus"), tmp_path / "plain")
+    watched = run(tiny("locus", "training.evaluate_every=2"), tmp_path / "watched")
+    assert same(weights(plain), weights(watched))
+    losses = [[r["loss"] for r in result.folder.history()] for result in (plain, watched)]
+    assert losses[0] == losses[1]
+    folder = watched.folder.path
+    assert [record["step"] for record in lines(folder / "evaluations.jsonl")] == [2, 4]
+    assert {p.name for p in (folder / "pictures").iterdir()} == {"step-2.png", "step-4.png"}
+
+
+def test_a_bad_step_ends_the_run_before_the_optimiser(
+    tiny: Callable[..., Recipe], tmp_path: Path, bad_batches: Callable[..., None]
+) -> None:
+    bad_batches(2)
+    folder = tmp_path / "run"
+    with pytest.raises(CollapseError, match=r"targets\.images \(1 NaN of") as error:
+        run(tiny("tokengs"), folder)
+    incident = folder / "incidents" / "step-3"
+    assert str(incident) in str(error.value)
+    batch = read_batch(incident / "batch.safetensors")
+    assert f"scene {batch.scenes[0]!r}" in str(error.value)
+    assert str(list(batch.target_frames[0])) in str(error.value)
+    assert [record["step"] for record in lines(folder / "history.jsonl")] == [1, 2]
+    saved = qgs.load(incident / "weights.safetensors").state_dict()
+    assert all(tensor.isfinite().all() for tensor in saved.values())
+    report = json.loads((incident / "report.json").read_text())
+    assert report["step"] == 3
+    assert "mse is nan" in report["symptom"]
+
+
+def test_a_bad_gradient_ends_the_run_too(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = Recipe.build_model
+
+    def poisoned(recipe: Recipe, device: Any = None) -> Any:
+        model = build(recipe, device)
+        parameter = next(model.parameters())
+        parameter.register_hook(lambda gradient: gradient * float("inf"))
+        return model
+
+    monkeypatch.setattr(Recipe, "build_model", poisoned)
+    with pytest.raises(CollapseError, match="the first bad tensor is gradient of"):
+        run(tiny("tokengs"), tmp_path / "run")
+    assert not (tmp_path / "run" / "history.jsonl").exists()
+
+
+def test_a_bad_step_is_skipped_on_demand(
+    tiny: Callable[..., Recipe],
+    tmp_path: Path,
+    bad_batches: Callable[..., None],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bad_batches(1, 3)
+    recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.ema=0.9")
+    with caplog.at_level(logging.WARNING):
+        result = run(recipe, tmp_path / "run")
+    assert result.steps == 4
+    told = [r.message for r in caplog.records if "is skipped" in r.message]
+    assert [message.split(" is skipped")[0] for message in told] == ["step 2", "step 4"]
+    records = lines(result.folder.path / "history.jsonl")
+    assert [record["step"] for record in records] == [1, 2, 3, 4]
+    assert ["loss" in record for record in records] == [True, False, True, False]
+    incidents = {path.name for path in (result.folder.path / "incidents").iterdir()}
+    assert incidents == {"step-2", "step-4"}
+    for file in (result.folder.checkpoint, result.folder.checkpoint_ema):
+        assert all(tensor.isfinite().all() for tensor in qgs.load(file).state_dict().values())
+
+
+def test_skipping_comes_to_an_end(
+    tiny: Callable[..., Recipe], tmp_path: Path, bad_batches: Callable[..., None]
+) -> None:
+    bad_batches(*range(1, 100))
+    recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
+    with pytest.raises(CollapseError, match=f"{PATIENCE} steps in a row were skipped"):
+        run(recipe, tmp_path / "run")
+    steps = [record["step"] for record in lines(tmp_path / "run" / "history.jsonl")]
+    assert steps == list(range(1, PATIENCE + 2))
+
+
+def test_a_missing_tracker_is_told_before_anything_is_made(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trackers, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"qgs\[tensorboard\]"):
+        run(tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_tensorboard_gets_what_the_history_gets(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    options = ("training.trackers=[tensorboard]", "training.evaluate_every=4")
+    result = run(tiny("locus", *options), tmp_path / "run")
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    for name in ("loss", "psnr", "lr"):
+        told = [event.value for event in events.Scalars(name)]
+        assert told == pytest.approx([record[name] for record in result.folder.history()])
+    (judged,) = events.Scalars("evaluation/raw/psnr")
+    assert judged.step == 4
+    assert len(events.Images("evaluation")) == 1
