@@ -24,6 +24,9 @@ class Scene(ABC):
     held_out: Sequence[int] = ()
     """Frames that training never sees, so that evaluation can target them."""
 
+    missing: Sequence[str] = ()
+    """Images that are listed and do not exist; they are no frames, so later ones move up."""
+
     @property
     @abstractmethod
     def cameras(self) -> Cameras:
@@ -81,6 +84,10 @@ class SceneSource(Component):
     @abstractmethod
     def scenes(self, split: Split) -> Sequence[Scene]:
         """The scenes of a split; indexing is cheap and deterministic."""
+
+    def names(self, split: Split) -> Sequence[str]:
+        """The name of every scene of `scenes(split)`; sources that know them open no scene."""
+        return [scene.name for scene in self.scenes(split)]
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
         """Indices of `scenes(split)` by where they are stored, such as one group per file.

@@ -56,7 +56,7 @@ class EvaluationPlan:
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
-        names = [scene.name for scene in self._scenes]
+        names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
         self._count = Counter(names)
         self.wanted: tuple[str, ...] = tuple(dict.fromkeys(names[: evaluation.scenes]))
@@ -150,6 +150,11 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
 def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
     entry = index[scene.name]
     assert entry is not None
+    if scene.missing:
+        raise ValueError(
+            f"{len(scene.missing)} of its listed images do not exist, so that positions "
+            f"of the index would mean other frames: {', '.join(scene.missing)}"
+        )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
         raise ValueError(

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from typing import Annotated, Any, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-from upath import UPath
+
+from qgs.data.paths import opened_path
 
 FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
 
@@ -39,7 +40,7 @@ def read_index(path: str) -> EvaluationIndex:
     Raises FileNotFoundError, and ValueError for a file of another form, for a scene that is
     written twice, and for an index without any scene to judge.
     """
-    file = UPath(path).expanduser()
+    file = opened_path(path)
     if not file.is_file():
         raise FileNotFoundError(
             f"there is no evaluation index at {path}; evaluation.index is a JSON file of the form "

@@ -74,6 +74,10 @@ class PhotosSource(SceneSource):
         """See `SceneSource`."""
         return self._scenes[split]
 
+    def names(self, split: Split) -> Sequence[str]:
+        """See `SceneSource`."""
+        return self._scenes[split].names
+
 
 class PhotoScenes(Sequence[Scene]):
     """Scenes by folder, opened when asked for; the last ones stay open.
@@ -89,6 +93,11 @@ class PhotoScenes(Sequence[Scene]):
 
     def __len__(self) -> int:
         return len(self._folders)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the scenes; none is opened."""
+        return [name for name, _ in self._folders]
 
     @overload
     def __getitem__(self, index: int) -> Scene: ...
@@ -106,7 +115,9 @@ class PhotoScenes(Sequence[Scene]):
         frames = frames[: config.max_frames or None]
         development = Development(config.image_size, config.background, config.depth_unit)
         held_out = held_out_frames(frames, config.holdout)
-        return PhotoScene(name, frames, development, held_out, self._pixels)
+        scene = PhotoScene(name, frames, development, held_out, self._pixels)
+        scene.missing = self.missing[name]
+        return scene
 
 
 def _one(scene: PhotoScene) -> int:

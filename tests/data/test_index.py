@@ -6,13 +6,16 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, evaluation_samples
 from qgs.data.index import IndexEntry, read_index
+from qgs.data.photos import PhotosConfig, PhotosSource
 from qgs.data.sampling import Sample
 from qgs.types import Cameras
 
@@ -130,6 +133,41 @@ def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on() -> None:
     assert failure == SceneFailure("broken", "OSError: truncated file")
     assert isinstance(sample, Sample)
     assert sample.scene == "good"
+
+
+def write_photos(folder: Path, count: int) -> None:
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    frames = []
+    for number in range(count):
+        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * number
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
+    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+
+
+def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(
+    tmp_path: Path,
+) -> None:
+    for name in ("broken", "cut", "gap", "good"):
+        write_photos(tmp_path / name, 5)
+    (tmp_path / "broken" / "transforms.json").write_text("{")
+    photo = tmp_path / "cut" / "2.png"
+    photo.write_bytes(photo.read_bytes()[:200])
+    (tmp_path / "gap" / "1.png").unlink()
+    source = PhotosSource(PhotosConfig(path=str(tmp_path), image_size=(16, 16)))
+    index = {name: entry([0, 3], [2]) for name in ("broken", "cut", "gap", "good")}
+    found = list(EvaluationPlan(source, VIEWS, EvaluationConfig(), index).samples())
+    assert [sample.scene for sample in found] == ["broken", "cut", "gap", "good"]
+    assert [isinstance(sample, Sample) for sample in found] == [False, False, False, True]
+    reasons = [sample.reason for sample in found if isinstance(sample, SceneFailure)]
+    assert "transforms.json" in reasons[0]
+    assert "2.png" in reasons[1]
+    assert "1 of its listed images do not exist" in reasons[2]
+    assert "1.png" in reasons[2]
 
 
 def test_scenes_are_decoded_one_at_a_time() -> None:

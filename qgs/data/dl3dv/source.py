@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import overload
+from typing import ClassVar, overload
 
 from pydantic import Field
 from torch import Tensor
@@ -32,6 +32,11 @@ class Dl3dvConfig(SceneSource.Config):
     each scene is kept for evaluation, from frame n // 2 on; 0 for none. max_scenes: only the first
     scenes of each split by name, 0 for all. background: RGB behind transparent pixels.
     """
+
+    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {
+        "test_scenes",
+        "max_scenes",
+    }
 
     path: str
     images: str | None = None
@@ -80,6 +85,11 @@ class Dl3dvScene(EncodedScene):
         return self._photos.held_out
 
     @property
+    def missing(self) -> Sequence[str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """See `Scene`."""
+        return self._photos.missing
+
+    @property
     def cameras(self) -> Cameras:
         """See `Scene`; float64."""
         return self._photos.cameras
@@ -108,10 +118,12 @@ def open_scene(name: str, place: Place, config: Dl3dvConfig) -> PhotoScene:
     the folder of photos has. Raises FileNotFoundError and ValueError, with what to do, for a scene
     without photos or with poses or intrinsics that cannot be meant.
     """
-    frames, _ = present_frames(scene_folder(place), "nerfstudio", config.images)
+    frames, missing = present_frames(scene_folder(place), "nerfstudio", config.images)
     development = Development(config.image_size, config.background)
     held_out = held_out_frames(frames, config.holdout)
-    return PhotoScene(name, frames, development, held_out, pixel_cache(0))
+    scene = PhotoScene(name, frames, development, held_out, pixel_cache(0))
+    scene.missing = missing
+    return scene
 
 
 class Dl3dvSource(SceneSource):
