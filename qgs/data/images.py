@@ -61,8 +61,7 @@ def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Imag
             return decode_rgb(file, background)
     except OSError as error:
         raise ValueError(
-            f"{path} cannot be read as an image ({error}): replace the file, or remove its frame "
-            "from transforms.json"
+            f"{path} cannot be read as an image ({error}): replace the file, or remove its frame"
         ) from error
 
 
@@ -74,7 +73,7 @@ def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image
         color = tuple(round(255 * channel) for channel in background)
         canvas = Image.new("RGBA", image.size, (*color, 255))
         image = Image.alpha_composite(canvas, image)
-    return image.convert("RGB")
+    return image if image.mode == "RGB" else image.convert("RGB")
 
 
 def decode_gray(file: IO[bytes]) -> Image.Image:

@@ -63,10 +63,8 @@ def _all(source: SceneSource) -> Places:
 
 
 def _places(source: SceneSource, split: Split) -> dict[str, Place]:
-    scenes = source.scenes(split)
     places: dict[str, Place] = {}
-    for index in range(len(scenes)):
-        name = scenes[index].name
+    for index, name in enumerate(source.names(split)):
         if name in places:
             raise ValueError(
                 f"two scenes are called {name!r}, and chunks tell scenes by their names: rename one"
