@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import overload
@@ -13,6 +12,7 @@ from upath import UPath
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.cache import BoundedCache
 from qgs.data.frames import PhotoFrame
+from qgs.data.notices import warn_once
 from qgs.data.paths import opened_path
 from qgs.data.photo_scene import Development, PhotoScene, pixel_cache
 from qgs.data.readers import Format, formats_of, read_listing
@@ -20,7 +20,6 @@ from qgs.data.readers.listing import Listing, existing
 from qgs.data.validation import require_sound
 from qgs.types import Cameras, Views
 
-_log = logging.getLogger(__name__)
 _OPEN_SCENES = 64
 
 
@@ -150,10 +149,10 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
     ]  # fmt: skip
     left = [folder.name for folder in inside if folder not in wanted]
     if wanted and left:
-        _log.warning(
-            "%d of %d folders in %s hold no photos with cameras and are left out: %s",
-            len(left), len(inside), root, ", ".join(left),
-        )  # fmt: skip
+        warn_once(
+            f"{len(left)} of {len(inside)} folders in {root} hold no photos with cameras and are "
+            f"left out: {', '.join(left)}"
+        )
     return {folder.name: folder for folder in wanted}
 
 
@@ -190,10 +189,9 @@ def present_frames(
             f"and 2 are needed; the first missing one is {missing[0] if missing else 'none'}"
         )
     if missing:
-        _log.warning(
-            "%d of %d images of %s are missing: %s", len(missing), len(frames), folder,
-            ", ".join(missing),
-        )  # fmt: skip
+        warn_once(
+            f"{len(missing)} of {len(frames)} images of {folder} are missing: {', '.join(missing)}"
+        )
     _require_masks(listing.file, present)
     return present, missing
 
@@ -201,10 +199,10 @@ def present_frames(
 def _used(listing: Listing) -> list[PhotoFrame]:
     used = [frame for frame in listing.frames if frame.split != "unused"]
     if len(used) < len(listing.frames):
-        _log.warning(
-            "%d of %d frames of %s are in none of its splits and are left out",
-            len(listing.frames) - len(used), len(listing.frames), listing.file,
-        )  # fmt: skip
+        warn_once(
+            f"{len(listing.frames) - len(used)} of {len(listing.frames)} frames of {listing.file} "
+            "are in none of its splits and are left out"
+        )
     return used
 
 

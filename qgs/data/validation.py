@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from qgs.data.frames import Fault, Intrinsics, PhotoFrame, Size
+from qgs.data.notices import warn_once
 
 _RIGID = 1e-3  # of rotations against orthonormality
 _SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
@@ -100,9 +101,19 @@ def frame_faults(frame: PhotoFrame) -> Iterator[Fault]:
 
 
 def require_sound(listing: object, frames: Sequence[PhotoFrame]) -> None:
-    """Raise ValueError for the first frame of `listing` that has a fatal fault, naming both."""
+    """Raise ValueError for the first frame of `listing` that has a fatal fault, naming both.
+
+    Of other faults, the first is logged, with the number of frames that have any.
+    """
+    doubtful: list[str] = []
     for index, frame in enumerate(frames):
-        for fault in frame_faults(frame):
+        faults = list(frame_faults(frame))
+        name = f" ({frame.name})" if frame.name else ""
+        for fault in faults:
             if fault.fatal:
-                name = f" ({frame.name})" if frame.name else ""
                 raise ValueError(f"{listing}: frame {index}{name}: {fault}")
+        doubtful += [f"frame {index}{name}: {faults[0]}"] if faults else []
+    if doubtful:
+        warn_once(
+            f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful, first {doubtful[0]}"
+        )

@@ -1,6 +1,7 @@
 """The same photos through every format: the same pixels, intrinsics and poses."""
 
 import os
+import zipfile
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
@@ -20,10 +21,16 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data import PhotosSource, read_photos
+from qgs.data.notices import warn_once
 from qgs.data.photo_scene import PhotoScene
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 REAL = ("mary_rose", "office_walk", "desk")
+
+
+@pytest.fixture(autouse=True)
+def _warnings_are_told_again():
+    warn_once.cache_clear()
 
 
 def scene(path: Path, size=(30, 40), **options) -> PhotoScene:
@@ -177,15 +184,19 @@ def test_sources_travel_to_workers_without_their_cache(tmp_path):
     assert torch.equal(again.images(range(6)), images)
 
 
-def test_photos_of_other_file_systems(tmp_path):
+def test_photos_in_memory_and_in_archives(tmp_path):
     photos = synthetic(tmp_path / "photos")
     write_colmap(tmp_path / "a", photos, "binary")
     remote = UPath("memory://photos/a")
-    for file in (tmp_path / "a").rglob("*.*"):
-        target = remote / file.relative_to(tmp_path / "a").as_posix()
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(file.read_bytes())
-    views = read_photos("memory://photos/a", (30, 40))
-    np.testing.assert_allclose(views.cameras.c2w[0], photos.c2w, atol=1e-6)
-    assert views.cameras.c2w.dtype == torch.float32
-    assert torch.equal(views.images[0], scene(tmp_path / "a").images(range(6)))
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for file in (tmp_path / "a").rglob("*.*"):
+            name = file.relative_to(tmp_path / "a").as_posix()
+            archive.write(file, f"scene/{name}")
+            (remote / name).parent.mkdir(parents=True, exist_ok=True)
+            (remote / name).write_bytes(file.read_bytes())
+    expected = scene(tmp_path / "a").images(range(6))
+    for url in ("memory://photos/a", f"zip://scene::file://{tmp_path}/a.zip"):
+        views = read_photos(url, (30, 40))
+        np.testing.assert_allclose(views.cameras.c2w[0], photos.c2w, atol=1e-6)
+        assert views.cameras.c2w.dtype == torch.float32
+        assert torch.equal(views.images[0], expected)

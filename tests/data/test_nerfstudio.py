@@ -155,6 +155,18 @@ def test_lenses(folder):
     assert lenses == [RadialTangential(0.1, p2=0.01, k3=0.002), Fisheye(0.1, k4=0.3), None]
 
 
+def test_an_angle_of_view_without_a_size_goes_with_the_first_image(folder):
+    change(folder, fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None)
+    change(folder, camera_angle_x=np.pi / 2)
+    assert read(folder).cameras.intrinsics[3].tolist() == pytest.approx([20, 20, 20, 15])
+
+
+def test_doubtful_intrinsics_are_read_and_told(folder, caplog):
+    change(folder, 2, cx=55.0)
+    assert read(folder).cameras.intrinsics[2, 2] == 55
+    assert "1 of 6 frames are doubtful, first frame 2 (images/view_002.png)" in caplog.text
+
+
 def test_the_world_is_that_of_the_poses(folder):
     before = read(folder).cameras.c2w
     change(folder, applied_transform=[[0, 1, 0, 5], [1, 0, 0, 0], [0, 0, -1, 0]], applied_scale=3)

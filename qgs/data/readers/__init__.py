@@ -6,17 +6,15 @@ A reader is a module with `LISTING`, what makes the format, in words, `recognise
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from types import ModuleType
 from typing import Literal, TypeAlias
 
 from upath import UPath
 
+from qgs.data.notices import warn_once
 from qgs.data.readers import blender, colmap, llff, nerfstudio
 from qgs.data.readers.listing import IMAGE_SUFFIXES, Listing
-
-_log = logging.getLogger(__name__)
 
 Format: TypeAlias = Literal["auto", "nerfstudio", "blender", "colmap", "llff"]
 
@@ -51,11 +49,11 @@ def read_listing(folder: UPath, format: Format = "auto", images: str | None = No
     if not wanted:
         raise FileNotFoundError(_nothing(folder, format, held))
     if format == "auto" and len(held) > 1:
-        _log.warning(
-            "%s holds photos in %d formats (%s) and is read as %s; `format: %s` reads the other",
-            folder, len(held), ", ".join(f"{name}: {READERS[name].LISTING}" for name in held),
-            held[0], held[1],
-        )  # fmt: skip
+        listings = ", ".join(f"{name}: {READERS[name].LISTING}" for name in held)
+        warn_once(
+            f"{folder} holds photos in {len(held)} formats ({listings}) and is read as {held[0]}; "
+            f"`format: {held[1]}` reads the other"
+        )
     return READERS[wanted[0]].read(folder, images)
 
 

@@ -9,8 +9,7 @@ from typing import Literal
 from upath import UPath
 
 from qgs.data.frames import PhotoFrame
-from qgs.data.readers.listing import Listing, first_size
-from qgs.data.transforms_json import load_transforms, parse_transforms
+from qgs.data.readers.listing import Listing, parsed
 
 LISTING = "transforms_train.json"
 _SPLITS: Mapping[str, Literal["train", "test"]] = {"train": "train", "val": "test", "test": "test"}
@@ -24,8 +23,7 @@ def recognises(folder: UPath) -> bool:
 def read(folder: UPath, images: str | None) -> Listing:
     """The frames of all files that exist, training first; those of the others are held out.
 
-    A focal length given as an angle of view needs the image size: that of the first image. The
-    alpha channel is the mask. Raises ValueError for `images`.
+    The alpha channel is the mask. Raises ValueError for `images`.
     """
     if images is not None:
         raise ValueError(
@@ -44,8 +42,5 @@ def _file(folder: UPath, part: str) -> UPath:
 
 
 def _frames(folder: UPath, part: str) -> list[PhotoFrame]:
-    data = load_transforms(_file(folder, part))
-    frames = parse_transforms(data, folder)
-    if not all(frame.size for frame in frames):
-        frames = parse_transforms(data, folder, first_size([frame.path for frame in frames]))
+    frames = parsed(_file(folder, part))
     return [replace(frame, mask=frame.mask or frame.path) for frame in frames]

@@ -83,9 +83,9 @@ def _stage_text(folder: UPath, staged: Path) -> Mapping[int, str]:
 
 def _image_lines(lines: IO[str]) -> Iterator[str]:
     """The lines of images; each is followed by one of points."""
-    for line in lines:
-        if line.strip() and not line.startswith("#"):
-            yield line.strip()
+    for line in map(str.strip, lines):
+        if line and not line.startswith("#"):
+            yield line
             next(lines, None)
 
 

@@ -11,6 +11,7 @@ from upath import UPath
 
 from qgs.data.frames import PhotoFrame, Size
 from qgs.data.photo_files import image_size
+from qgs.data.transforms_json import load_transforms, parse_transforms
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _COPY = re.compile(r"images(_\d+)?")
@@ -68,7 +69,23 @@ def with_images(frames: Sequence[PhotoFrame], folder: UPath, wanted: str) -> lis
     return [moved(frame) if frame.name else frame for frame in frames]
 
 
-def first_size(paths: Sequence[UPath]) -> Size | None:
+def parsed(file: UPath) -> list[PhotoFrame]:
+    """The frames of a transforms file, with names relative to its folder.
+
+    A focal length given as an angle of view needs an image size: that of the first image, where the
+    file gives none. Raises as `load_transforms` and `parse_transforms`.
+    """
+    data, folder = load_transforms(file), file.parent
+    try:
+        frames = parse_transforms(data, folder)
+        if all(frame.size or not frame.faults for frame in frames):
+            return frames
+        return parse_transforms(data, folder, _first_size([frame.path for frame in frames]))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _first_size(paths: Sequence[UPath]) -> Size | None:
     """(H, W) of the first of `paths` that exists; None where none does."""
     present = existing(paths)
     return next((image_size(path) for path in paths if path in present), None)

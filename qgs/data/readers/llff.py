@@ -27,7 +27,11 @@ def read(folder: UPath, images: str | None) -> Listing:
     rows = _rows(file)
     photos = image_folder(folder, images)
     paths = sorted(
-        (item for item in photos.iterdir() if item.name.lower().endswith(IMAGE_SUFFIXES)),
+        (
+            item
+            for item in photos.iterdir()
+            if item.name.lower().endswith(IMAGE_SUFFIXES) and not item.name.startswith(".")
+        ),
         key=lambda item: item.name,
     )
     if len(paths) != len(rows):

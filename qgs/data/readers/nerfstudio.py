@@ -7,8 +7,7 @@ from pathlib import PurePosixPath
 from upath import UPath
 
 from qgs.data.frames import PhotoFrame
-from qgs.data.readers.listing import Listing, existing, with_images
-from qgs.data.transforms_json import load_transforms, parse_transforms
+from qgs.data.readers.listing import Listing, existing, parsed, with_images
 
 LISTING = "transforms.json"
 _REDUCED = ("images_2", "images_4", "images_8")
@@ -27,10 +26,7 @@ def read(folder: UPath, images: str | None) -> Listing:
     of their folder (images_2, _4, _8) is there, that is read.
     """
     file = folder / LISTING
-    try:
-        frames = parse_transforms(load_transforms(file), folder)
-    except ValueError as error:
-        raise ValueError(str(error) if LISTING in str(error) else f"{file}: {error}") from error
+    frames = parsed(file)
     if images is not None:
         return Listing(file, with_images(frames, folder, images))
     return Listing(file, _from_copy(frames, folder))
