@@ -67,25 +67,22 @@ def list_scenes(folder: UPath) -> Listing:
         return Listing(folder, _scanned(folder), {})
     index = read_index(folder / INDEX)
     present = {item.name for item in folder.iterdir()}
-    files = {key: folder / name for key, name in index.items()}
-    here = {key: file for key, file in files.items() if _exists(folder, file, present)}
-    missing = {key: file for key, file in files.items() if key not in here}
+    chunks = {name: folder / name for name in set(index.values())}
+    there = {name for name in chunks if name in present or chunks[name].is_file()}
+    here = {key: chunks[name] for key, name in index.items() if name in there}
+    missing = {key: chunks[name] for key, name in index.items() if name not in there}
     if not here:
         raise FileNotFoundError(
-            f"{folder / INDEX} names {len(files)} scenes, and none of their chunks exists: "
+            f"{folder / INDEX} names {len(index)} scenes, and none of their chunks exists: "
             "download the chunks beside it"
         )
     if missing:
         _log.warning(
             "%d of %d scenes of %s are left out, because their chunks do not exist: %s",
-            len(missing), len(files), folder / INDEX,
+            len(missing), len(index), folder / INDEX,
             ", ".join(f"{key} ({file.name})" for key, file in missing.items()),
         )  # fmt: skip
     return Listing(folder, here, missing)
-
-
-def _exists(folder: UPath, file: UPath, present: set[str]) -> bool:
-    return file.name in present if file.parent == folder else file.is_file()
 
 
 def _scanned(folder: UPath) -> dict[str, UPath]:

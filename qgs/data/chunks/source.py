@@ -6,7 +6,7 @@ import io
 import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import overload
+from typing import ClassVar, overload
 
 import numpy as np
 import torch
@@ -37,6 +37,11 @@ class ChunksConfig(SceneSource.Config):
     first scenes of each split, 0 for all. min_frames: scenes with fewer frames are left out, which
     opens every chunk once at the start; 0 keeps all. background: RGB behind transparent pixels.
     """
+
+    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {
+        "max_scenes",
+        "min_frames",
+    }
 
     path: str
     holdout: int = Field(default=0, ge=0)
