@@ -62,7 +62,7 @@ def import_(
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint, or the folder of a run.")],
     out: Annotated[Path, typer.Option(help="New .safetensors file; never overwritten.")],
-    layout: Annotated[Layout, typer.Option(help="Names and order of the state dict.")],
+    layout: Annotated[Layout, typer.Option(help="Whose names the weights get.")],
 ) -> None:
     """Write a checkpoint's weights as the published code names them."""
     from qgs.engine.folder import checkpoint_of
