@@ -97,7 +97,8 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
 def image_name(file_path: str) -> str:
     """`file_path` in one spelling; one without an image's suffix, as in Blender's sets, is PNG."""
     name = PurePosixPath(file_path.replace("\\", "/"))
-    known = name.suffix.lower() in Image.registered_extensions()
+    suffix = name.suffix.lower()
+    known = suffix[1:].isalpha() or suffix in Image.registered_extensions()
     return str(name if known else name.with_name(f"{name.name}.png"))
 
 

@@ -16,7 +16,7 @@ from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
 from qgs.data.photo_scene import PhotoScene
 from qgs.data.sampling import make_sample
-from qgs.data.transforms_json import load_transforms, parse_transforms
+from qgs.data.transforms_json import image_name, load_transforms, parse_transforms
 from qgs.data.validation import frame_faults, intrinsics_faults, pose_faults, size_faults
 
 
@@ -153,6 +153,21 @@ def test_lenses(folder):
     change(folder, 2, k1=0, p2=0, k3=None)
     lenses = [frame.lens for frame in parsed(folder)[:3]]
     assert lenses == [RadialTangential(0.1, p2=0.01, k3=0.002), Fisheye(0.1, k4=0.3), None]
+
+
+@pytest.mark.parametrize(
+    ("listed", "name"),
+    [
+        ("./train/r_0", "train/r_0.png"),
+        ("train/at_0.5", "train/at_0.5.png"),
+        ("images/a.JPG", "images/a.JPG"),
+        ("images\\b.jp2", "images/b.jp2"),
+        ("images/c.exr", "images/c.exr"),
+        ("../d", "../d.png"),
+    ],
+)
+def test_names_of_images(listed, name):
+    assert image_name(listed) == name
 
 
 def test_an_angle_of_view_without_a_size_goes_with_the_first_image(folder):
