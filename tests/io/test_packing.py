@@ -1,6 +1,7 @@
 import io
 import json
 import os
+import shutil
 import signal
 import time
 
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 from upath import UPath
 
 from qgs.cli import app
-from qgs.data import ChunksSource, PhotosSource
+from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
 from qgs.io import packing
 
 SIZE = (24, 32)
@@ -230,6 +231,19 @@ def test_scenes_that_cannot_be_read_are_left_out_by_name(tmp_path):
             {},
             leave_out_broken=True,
         )
+
+
+def test_archives_of_dl3dv(tmp_path):
+    many(tmp_path / "scenes", 3)
+    for scene in (tmp_path / "scenes").iterdir():
+        shutil.make_archive(str(tmp_path / "1K" / scene.name), "zip", scene.parent, scene.name)
+    (tmp_path / "1K" / "s1.zip").write_bytes(b"cut off")
+    config = Dl3dvSource.Config(path=str(tmp_path / "1K"), image_size=SIZE)
+    before = Dl3dvSource(config)
+    result = pack(before, tmp_path / "chunks", leave_out_broken=True)
+    assert (result.scenes["train"], result.kept) == (2, 4)
+    assert "s1.zip is no zip archive" in result.left_out["s1"]
+    same(before.scenes("train")[2], packed(tmp_path / "chunks").scenes("train")[1])
 
 
 def packed_until_killed(before: PhotosSource, out, seconds: float) -> bool:

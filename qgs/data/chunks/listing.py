@@ -48,8 +48,9 @@ def read_index(path: UPath) -> dict[str, str]:
         ) from error
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
+    outside = {name for name in set(index.values()) if not stays_inside(name)}
     for key, name in index.items():
-        if not stays_inside(name):
+        if name in outside:
             raise ValueError(
                 f"{path} places the scene {key!r} in {name!r}, outside its own folder: such an "
                 "index is not read"
