@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.contracts import Scene
+from qgs.contracts import SceneSource
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, told
 from qgs.data.sampling import Frames, Sample, collate
 from qgs.engine.protocol import index_of, protocol_of
@@ -86,9 +86,7 @@ def evaluate(
         null=plan.null,
         unlisted=plan.unlisted,
         empty=judge.empty,
-        held_out=_held_out(source.scenes("test")[: len(plan.wanted)], scores)
-        if not index
-        else None,
+        held_out=None if index else _held_out(source, scores),
         step=step,
     )
 
@@ -243,14 +241,18 @@ def _observed(
             observe(len(seen), len(wanted))
 
 
-def _held_out(scenes: Sequence[Scene], scores: Sequence[SceneScore]) -> tuple[int, int] | None:
+def _held_out(source: SceneSource, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
     """Held-out frames that were targets, and all of them, over the scenes that were judged."""
     judged = {
         score.scene: {frame for _, targets in score.views for frame in targets} for score in scores
     }
-    held = [(scene.name, set(scene.held_out)) for scene in scenes if scene.name in judged]
-    total = sum(len(frames) for _, frames in held)
-    return (sum(len(judged[name] & frames) for name, frames in held), total) if total else None
+    scenes, count, total = source.scenes("test"), 0, 0
+    for place, name in enumerate(source.names("test")):
+        if name in judged:
+            held_out = set(scenes[place].held_out)
+            count += len(judged[name] & held_out)
+            total += len(held_out)
+    return (count, total) if total else None
 
 
 def _without_folder(reason: str, recipe: Recipe) -> str:

@@ -10,8 +10,10 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rich.console import Console
 
 import qgs.engine.evaluation as engine_evaluation
@@ -93,10 +95,10 @@ def test_scores_hold_the_metrics_of_model_and_baselines(
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 def test_batches_change_no_score(tiny: Callable[..., Recipe], name: str) -> None:
-    recipe = tiny(name, "evaluation.scenes=5", "evaluation.samples=2")
+    recipe = tiny(name, "evaluation.scenes=3", "evaluation.samples=2")
     model = recipe.build_model()
     alone = evaluate(model, recipe)
-    for batch in (2, 3, 16):
+    for batch in (4, 16):
         together = evaluate(model, recipe, batch=batch)
         assert [score.scene for score in together.scores] == [s.scene for s in alone.scores]
         for ours, theirs in zip(together.scores, alone.scores, strict=True):
@@ -182,6 +184,38 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
     assert reasons["test/000000"] == "RuntimeError: out of memory"
     assert "is not finite" in reasons["test/000001"]
     assert reasons["test/000002"] == "OSError: /data/set/truncated.png is cut off"
+
+
+def write_photos(folder: Path, count: int) -> None:
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    frames = []
+    for number in range(count):
+        pixels = rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * number
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
+    camera = {"fl_x": 32, "fl_y": 32, "cx": 16, "cy": 16, "w": 32, "h": 32}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+
+
+def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    for name in ("a", "b", "c"):
+        write_photos(tmp_path / name, 12)
+    (tmp_path / "b" / "transforms.json").write_text("{")
+    (tmp_path / "c" / "6.png").write_bytes(b"no photo")
+    data = f"data={{type: qgs/photos, path: {tmp_path}, image_size: [32, 32], holdout: 4}}"
+    recipe = tiny("tokengs", data, "evaluation.scenes=9")
+    summary = (evaluation := evaluate(recipe.build_model(), recipe)).summary()
+    assert [score.scene for score in evaluation.scores] == ["a"]
+    assert list(summary["missing"]) == ["b", "c"]
+    assert summary["held_out_frames"] == (3, 3)
+    assert str(tmp_path) not in json.dumps(summary)
+    for reason in summary["missing"].values():
+        assert reason
 
 
 def test_no_scene_at_all_is_an_error_with_the_first_reason(
