@@ -88,6 +88,6 @@ def with_absolute_path(recipe: Recipe) -> Recipe:
         return {**section, **local}
 
     tree = {**recipe.tree, "evaluation": absolute(recipe.tree["evaluation"], "index")}
-    if tree.get("data", {}).get("type", "").startswith("qgs/"):
+    if tree.get("data"):
         tree["data"] = absolute(tree["data"], "path", "test_scenes")
     return recipe if tree == recipe.tree else resolve(tree)

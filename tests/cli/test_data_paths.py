@@ -1,3 +1,4 @@
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -27,14 +28,15 @@ RECIPE = {
         ("~/photos", "{home}/photos"),
         ("/data/photos", "/data/photos"),
         ("memory://bucket/photos", "memory://bucket/photos"),
-        ("zip://a::file:///data/photos.zip", "zip://a::file:///data/photos.zip"),
+        ("zip://a::file://{here}/photos.zip", "zip://a::file://{here}/photos.zip"),
     ],
 )
 def test_paths_become_absolute_and_urls_stay(given, expected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    data = {"type": "qgs/photos", "path": given, "image_size": [16, 16]}
-    recipe = with_absolute_path(resolve({**RECIPE, "data": data}))
     names = {"here": tmp_path, "above": tmp_path.parent, "home": Path.home()}
+    zipfile.ZipFile(tmp_path / "photos.zip", "w").close()
+    data = {"type": "qgs/photos", "path": given.format(**names), "image_size": [16, 16]}
+    recipe = with_absolute_path(resolve({**RECIPE, "data": data}))
     assert recipe.tree["data"]["path"] == expected.format(**names)
 
 
