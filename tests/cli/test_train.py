@@ -76,8 +76,9 @@ def test_eval_of_other_settings_keeps_the_first_results(run: Path) -> None:
         result = qgs("eval", run, "--set", "evaluation.scenes=1", "--device", "cpu")
         assert result.exit_code == 0, result.output
         summary = json.loads((run / name / "summary.json").read_text())
-        assert summary["settings"]["evaluation"]["scenes"] == 1
-        assert summary["settings"]["data"]["image_size"] == [32, 32]
+        settings = summary["protocol"]["settings"]
+        assert settings["views"]["drawn"]["scenes"] == 1
+        assert settings["image_size"] == [32, 32]
         assert summary["step"] == 2
         assert "held_out_frames" in summary
     assert (run / "evaluation" / "summary.json").read_bytes() == before
