@@ -15,7 +15,7 @@ from qgs.data.encoded import EncodedFrame, EncodedScene
 from qgs.data.images import decode_gray, decode_rgb
 from qgs.data.undistortion import undistorted
 
-_KEPT_FORMATS = {"JPEG", "PNG"}
+_KEPT_FORMATS = {"JPEG", "MPO", "PNG"}  # MPO: a JPEG with further pictures behind it
 
 
 @dataclass(frozen=True)
