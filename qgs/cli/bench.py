@@ -55,7 +55,7 @@ def bench(
 
     from qgs.cli.bench_tables import bench_tables, headline
     from qgs.composer import resolve
-    from qgs.engine.bench import Measures, workload_of
+    from qgs.engine.bench import Measures, Subject, workload_of
     from qgs.engine.bench import bench as measure
     from qgs.engine.bench.report import refuse_other_file
     from qgs.engine.device import choose_device
@@ -66,20 +66,14 @@ def bench(
         raise ValueError(f"--precision must be float32 or bf16, got {precision!r}")
     pixels = parse_size(size)
     use_threads(threads)
-    resolved = [(str(path), resolve(path, overrides or ())) for path in recipes]
     console = Console()
-    chosen = choose_device(device, console.print)
-    workloads = [
-        workload_of(
-            recipe, views=views, size=pixels, batch=batch, device=chosen, precision=precision
-        )
-        for _, recipe in resolved
-    ]
+    work = {"views": views, "size": pixels, "batch": batch, "precision": precision}
+    work["device"] = choose_device(device, console.print)
+    resolved = [(str(path), resolve(path, overrides or ())) for path in recipes]
+    subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
     measures = Measures(step, memory, renderer, rounds, warmup)
     with console.status("composing") as status:
-        report = measure(
-            resolved, workloads, measures, overrides=overrides or (), say=status.update
-        )
+        report = measure(subjects, measures, overrides=overrides or (), say=status.update)
     console.print(headline(report), markup=False)
     for table in bench_tables(report):
         console.print(table)

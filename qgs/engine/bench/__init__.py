@@ -2,7 +2,7 @@
 
 from qgs.engine.bench.memory import Peak, peak_memory
 from qgs.engine.bench.report import Report, Result
-from qgs.engine.bench.run import Measures, bench
+from qgs.engine.bench.run import Measures, Subject, bench
 from qgs.engine.bench.timing import Spread, in_turn
 from qgs.engine.bench.workload import Workload, workload_of
 
@@ -12,6 +12,7 @@ __all__ = [
     "Report",
     "Result",
     "Spread",
+    "Subject",
     "Workload",
     "bench",
     "in_turn",

@@ -41,29 +41,28 @@ class Measures:
 
 
 @dataclass(frozen=True)
-class _Subject:
+class Subject:
+    """What is measured: a recipe, by the name that the report gives it, with its workload."""
+
     name: str
     recipe: Recipe
     workload: Workload
 
 
 def bench(
-    recipes: Sequence[tuple[str, Recipe]],
-    workloads: Sequence[Workload],
+    subjects: Sequence[Subject],
     measures: Measures,
     *,
     overrides: Sequence[str] = (),
     say: Callable[[str], None] = lambda _: None,
 ) -> Report:
-    """Measure the named `recipes`, each with its workload.
+    """Measure all `subjects`, which share device and precision.
 
     All models are in memory while latencies are measured, so that each round has all of them. They
     have their initial weights. overrides: what the report says of them. `say` hears what is under
     way. Raises ValueError as the models, losses and renderers do, ChildProcessError as
     `peak_memory`.
     """
-    pairs = zip(recipes, workloads, strict=True)
-    subjects = [_Subject(name, recipe, workload) for (name, recipe), workload in pairs]
     peaks = [_peaks(subject, measures, say) for subject in subjects]
     models = [subject.recipe.build_model(subject.workload.device) for subject in subjects]
     sizes = [_size(subject, model) for subject, model in zip(subjects, models, strict=True)]
@@ -72,12 +71,12 @@ def bench(
         replace(size, times=spreads, peaks=peak)
         for size, spreads, peak in zip(sizes, times, peaks, strict=True)
     ]
-    machine = describe(workloads[0].device, torch.get_num_threads())
+    machine = describe(subjects[0].workload.device, torch.get_num_threads())
     return Report(results, machine, overrides, measures.rounds, measures.warmup)
 
 
 def _peaks(
-    subject: _Subject, measures: Measures, say: Callable[[str], None]
+    subject: Subject, measures: Measures, say: Callable[[str], None]
 ) -> dict[Operation, Peak]:
     operations: list[Operation] = ["forward", "step"] if measures.step else ["forward"]
     found: dict[Operation, Peak] = {}
@@ -89,7 +88,7 @@ def _peaks(
 
 
 def _times(
-    subjects: Sequence[_Subject],
+    subjects: Sequence[Subject],
     models: Sequence[QueryGaussianModel],
     measures: Measures,
     say: Callable[[str], None],
@@ -110,7 +109,7 @@ def _times(
     return [*times]
 
 
-def _size(subject: _Subject, model: QueryGaussianModel) -> Result:
+def _size(subject: Subject, model: QueryGaussianModel) -> Result:
     tensors = model.state_dict().values()
     return Result(
         recipe=subject.name,
