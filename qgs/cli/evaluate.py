@@ -86,17 +86,21 @@ def evaluate(
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
-    folder = out or evaluation_folder(checkpoint.parent, bool(settings))
+    folder = out or evaluation_folder(checkpoint, bool(settings))
     step = load_extra(checkpoint).get("step")
     evaluate_into(model, recipe, None if step is None else int(step), folder, Console(), batch)
 
 
-def evaluation_folder(run: Path, other: bool) -> Path:
-    """RUN/evaluation; the first unused of RUN/evaluation-2, ... for `other` settings."""
-    numbers = count(2)
-    folder = run / "evaluation"
-    while other and (folder.name == "evaluation" or folder.exists()):
-        folder = run / f"evaluation-{next(numbers)}"
+def evaluation_folder(checkpoint: Path, other: bool) -> Path:
+    """RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema, ...
+
+    For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ...
+    """
+    label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")
+    name = f"evaluation_{label}" if label else "evaluation"
+    folder, numbers = checkpoint.parent / name, count(2)
+    while other and (folder.name == name or folder.exists()):
+        folder = checkpoint.parent / f"{name}-{next(numbers)}"
     return folder
 
 

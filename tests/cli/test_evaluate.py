@@ -10,6 +10,7 @@ from typer.testing import CliRunner, Result
 
 import qgs
 from qgs.cli import app
+from qgs.cli.evaluate import evaluation_folder
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
 SMALL = (
@@ -81,6 +82,17 @@ def test_tuning_goes_into_a_folder_of_its_own_and_is_told(runs: Path) -> None:
     assert summary(runs / "locus" / "evaluation-2")["tuning"]["steps"] == 2
     assert (runs / "locus" / "evaluation" / "summary.json").read_bytes() == before
     assert (runs / "locus" / "checkpoint.safetensors").read_bytes() == weights
+
+
+def test_other_weights_of_a_run_keep_its_evaluation(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert evaluation_folder(run / "checkpoint.safetensors", False) == run / "evaluation"
+    assert evaluation_folder(run / "checkpoint_ema.safetensors", False) == run / "evaluation_ema"
+    assert evaluation_folder(run / "published.safetensors", False) == run / "evaluation_published"
+    (run / "evaluation_ema-2").mkdir(parents=True)
+    ema = run / "checkpoint_ema.safetensors"
+    assert evaluation_folder(ema, True) == run / "evaluation_ema-3"
+    assert evaluation_folder(run / "checkpoint.safetensors", True) == run / "evaluation-2"
 
 
 def test_two_runs_compare_scene_by_scene(runs: Path, tmp_path: Path) -> None:
