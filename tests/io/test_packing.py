@@ -80,6 +80,7 @@ def same(one, other, tolerance: float = 0.0) -> None:
 CASES = {
     "png": ({}, 4),
     "jpeg": ({"suffix": ".jpg"}, 4),
+    "mpo": ({"suffix": ".mpo"}, 4),
     "webp": ({"suffix": ".webp"}, 0),
     "grey": ({"convert": lambda image: image.convert("L")}, 0),
     "transparent": ({"convert": lambda image: with_alpha(image)}, 0),

@@ -21,23 +21,16 @@ class Journal:
     """The state of a packing into `folder`.
 
     settings: what decides the result; another packing must not go on with it. files: of each split
-    a scene's key to its chunk, for chunks that are complete. left_out: scenes that could not be
-    read, with the reason.
+    a scene's key to its chunk, for chunks that are complete.
     """
 
     folder: UPath
     settings: Mapping[str, Any]
     files: dict[Split, dict[str, str]] = field(default_factory=lambda: {"train": {}, "test": {}})
-    left_out: dict[str, str] = field(default_factory=dict)
 
     def save(self) -> None:
         """Write it beside the chunks, whole or not at all."""
-        content = {
-            "version": _VERSION,
-            "settings": self.settings,
-            "files": self.files,
-            "left_out": self.left_out,
-        }
+        content = {"version": _VERSION, "settings": self.settings, "files": self.files}
         write_bytes(self.folder / JOURNAL, json.dumps(content).encode())
 
     def remove(self) -> None:
@@ -70,7 +63,7 @@ def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
             f"{folder} holds an unfinished packing with other settings ({said}): give those again "
             "to finish it, or give a new folder"
         )
-    return Journal(folder, settings, content["files"], content["left_out"])
+    return Journal(folder, settings, content["files"])
 
 
 def _held(folder: UPath) -> list[str]:

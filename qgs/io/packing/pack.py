@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ class Packed:
     resumed: int = 0
     frames: int = 0
     kept: int = 0
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
 
 
 def pack(
@@ -56,19 +56,20 @@ def pack(
 
     settings: everything that decides what the source holds, as JSON; a packing with others does not
     go on. leave_out_broken: whether scenes that cannot be read are left out, counted and named in
-    the result. progress: told each scene once it is dealt with.
+    the result; a packing that goes on tries them again. progress: told each scene that is dealt
+    with.
     Raises FileExistsError for a folder with other content, ValueError and OSError as the scenes do.
     """
     encoding = encoding or Encoding()
-    decides = {**settings, "jpeg": encoding.jpeg, "chunk_bytes": chunk_bytes}
+    decides = {**settings, **asdict(encoding), "chunk_bytes": chunk_bytes}
     journal = open_journal(folder, decides)
     journal.save()
-    packed = Packed(left_out=journal.left_out)
+    packed = Packed()
     for split, places in splits.items():
         packer = _Packer(journal, split, encoding, chunk_bytes, leave_out_broken, packed)
         packer.run(source, places, progress)
     if not any(journal.files.values()):
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in journal.left_out.items())
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in packed.left_out.items())
         raise ValueError(f"there is no scene to pack{': ' if reasons else ''}{reasons}")
     for split, files in journal.files.items():
         packed.scenes[split] = len(files)
@@ -103,7 +104,7 @@ class _Packer:
         for name, place in places.items():
             if name in done:
                 self._packed.resumed += 1
-            elif name not in self._journal.left_out:
+            else:
                 self._add(name, source.scenes(place.split)[place.index])
             progress(name)
         self._flush()
@@ -114,7 +115,7 @@ class _Packer:
         except (ValueError, OSError) as error:
             if not self._leave_out_broken:
                 raise
-            self._journal.left_out[name] = str(error)
+            self._packed.left_out[name] = str(error)
             return
         size = stored_bytes(entry)
         if self._entries and self._bytes + size > self._limit:
