@@ -27,7 +27,7 @@ def evaluate(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RUN...", help="Run folder or checkpoint file; with --compare several results."
+            metavar="RUN", help="Run folder or checkpoint file; with --compare several results."
         ),
     ],
     overrides: Overrides = None,
@@ -61,14 +61,13 @@ def evaluate(
 ) -> None:
     """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour.
 
-    With --compare RUN RUN... nothing is evaluated: results in run folders are compared scene by
-    scene.
+    With --compare nothing is evaluated: the results in several RUNs are compared, scene by scene.
     """
     from rich.console import Console
 
     settings = [*(overrides or ()), *_short_forms(index, tune)]
     if compare:
-        _refuse_settings(settings)
+        _refuse_settings([*settings, *([f"--batch {batch}"] if batch > 1 else [])])
         compare_results(runs, across_protocols, out, Console())
         return
     if len(runs) > 1 or across_protocols:

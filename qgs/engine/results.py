@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from qgs.data.sampling import Frames
     from qgs.engine.scores import Evaluation, SceneScore
 
+METHODS = ("model", "nearest_input", "mean_colour")
 HEADERS = {"psnr": "PSNR ↑", "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
+METRICS = tuple(HEADERS)
 DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 EMPTY = "–"
 _NAMED = 10
@@ -63,8 +65,6 @@ def coverage(evaluation: Evaluation) -> str:
 
 def score_rows(evaluation: Evaluation) -> list[list[str]]:
     """The table, headers first: a row per method, in it how many scenes it is over."""
-    from qgs.engine.scores import METHODS
-
     header = ["method", *HEADERS.values(), "scenes"]
     rows = [
         [

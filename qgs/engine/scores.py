@@ -14,10 +14,8 @@ from qgs.data.evaluation import SceneFailure
 from qgs.data.sampling import Frames
 from qgs.engine import results
 from qgs.engine.protocol import Protocol
+from qgs.engine.results import METHODS, METRICS
 from qgs.metrics import OPACITY_USED, spread
-
-METHODS = ("model", "nearest_input", "mean_colour")
-METRICS = ("psnr", "ssim", "lpips")
 
 DISPERSIONS = ("dispersion_mean", "dispersion_median")
 """Over a scene's Gaussians, of the distance to their token's centroid, world units."""
