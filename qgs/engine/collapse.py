@@ -157,7 +157,7 @@ class GoodWeights:
 
 def broken_tensors(model: nn.Module) -> str:
     """Which tensors of `model` hold NaN or infinity; "" if none does."""
-    names = [n for n, t in unique_tensors(model).items() if not torch.isfinite(t).all()]
+    names = [n for n, t in unique_tensors(model).items() if not whole(torch.isfinite(t).all())]
     return f"weights are not finite: {_listed(names)}" if names else ""
 
 

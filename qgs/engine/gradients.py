@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from qgs.contracts import TrainingConfig
 from qgs.data.sampling import Batch
 from qgs.engine.objective import Outcome
+from qgs.engine.processes import average_gradients, unsynchronised, whole
 
 
 class Gradients:
@@ -33,11 +34,12 @@ class Gradients:
         sums: dict[str, Tensor] = {}
         for batch in batches:
             last = batch is batches[-1]
-            with nullcontext() if last else self.accelerator.no_sync(self.objective):
+            with nullcontext() if last else unsynchronised(self.accelerator, self.objective):
                 for name, value in self._backward(batch, len(batches)).items():
                     sums[name] = sums.get(name, 0) + value / len(batches)
+        average_gradients(self.accelerator, self.objective)
         norm = self.accelerator.clip_grad_norm_(self.objective.parameters(), self.config.clip)
-        sums["gradient"] = torch.as_tensor(norm, device=self.accelerator.device).detach()
+        sums["gradient"] = whole(torch.as_tensor(norm, device=self.accelerator.device))
         return sums
 
     def _backward(self, batch: Batch, count: int) -> dict[str, Tensor]:

@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 from torch import nn
+from torch.distributed.tensor import DTensor
 from torch.optim import AdamW
 
 from qgs.contracts import ModelComponent, TrainingConfig
 
 
 def make_optimizer(module: nn.Module, config: TrainingConfig) -> AdamW:
-    """AdamW over all parameters of `module` that train, in a decayed and an undecayed group."""
+    """AdamW over all parameters of `module` that train, in decayed and undecayed groups.
+
+    Parameters that lie in shards and whole ones are in groups of their own, where both exist.
+    """
     decayed, undecayed = parameter_groups(module)
     groups = [
-        {"params": decayed, "weight_decay": config.weight_decay},
-        {"params": undecayed, "weight_decay": 0.0},
+        {"params": parameters, "weight_decay": decay}
+        for group, decay in ((decayed, config.weight_decay), (undecayed, 0.0))
+        for parameters in _by_kind(group)
     ]
     return AdamW(groups, lr=config.learning_rate, betas=config.betas, fused=True)
+
+
+def _by_kind(parameters: list[nn.Parameter]) -> list[list[nn.Parameter]]:
+    """Parameters in shards and whole ones apart: no kernel updates both at once."""
+    kinds: dict[bool, list[nn.Parameter]] = {}
+    for parameter in parameters:
+        kinds.setdefault(isinstance(parameter, DTensor), []).append(parameter)
+    return list(kinds.values())
 
 
 def parameter_groups(module: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:

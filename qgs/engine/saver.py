@@ -6,10 +6,12 @@ from collections.abc import Mapping
 
 from accelerate import Accelerator
 
+from qgs.composer import resolve
 from qgs.engine.collapse import GoodWeights
 from qgs.engine.folder import RunFolder
+from qgs.engine.processes import sharded
 from qgs.engine.state import SavedState, Stateful, Weights, write_state
-from qgs.io.checkpoint import CheckpointError, save
+from qgs.io.checkpoint import CheckpointError, load_weights, save
 from qgs.model import QueryGaussianModel
 
 
@@ -57,6 +59,15 @@ class Saver:
             extra = {"step": str(self._good.step)}
             save(self._model, self._folder.checkpoint, extra=extra, weights=self._good.tensors)
         self._accelerator.wait_for_everyone()
+
+    def whole_model(self) -> QueryGaussianModel:
+        """The model, as a copy of its own where its weights lie in shards. All must call this."""
+        if not sharded(self._model):
+            return self._model
+        assert self._model.recipe is not None
+        copy = resolve(self._model.recipe).build_model()
+        load_weights(copy, self._weights.state(), "the model in shards")
+        return copy.to(self._accelerator.device)
 
     def restore(self, saved: SavedState) -> None:
         """Bring every part back to where `saved` was taken. All processes must call this.

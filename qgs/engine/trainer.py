@@ -37,8 +37,8 @@ from qgs.engine.incidents import PATIENCE, Incidents
 from qgs.engine.initial import initialise
 from qgs.engine.interrupt import StopRequest, stop_requests
 from qgs.engine.objective import Objective
-from qgs.engine.optimizer import make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
+from qgs.engine.prepare import prepared
 from qgs.engine.processes import make_accelerator, mean
 from qgs.engine.progress import TrainingProgress
 from qgs.engine.resume import refuse_other_conditions, saved_state
@@ -154,9 +154,7 @@ class Trainer:
         self.notes = initialise(self.model, self.recipe) if fresh else []
         losses = self.recipe.build_losses()
         objective = Objective(self.model, losses, self.config.render_views).to(self.device)
-        self.objective, self.optimizer = self.accelerator.prepare(
-            objective, make_optimizer(objective, self.config)
-        )
+        self.objective, self.optimizer = prepared(self.accelerator, objective, self.config)
         self.gradients = Gradients(self.accelerator, self.objective, self.config)
         self.detector = CollapseDetector(self.config.collapse_window)
         self.good = GoodWeights(self.model)
@@ -241,7 +239,7 @@ class Trainer:
 
     def _result(self, stopped_by: str | None) -> TrainingResult:
         return TrainingResult(
-            self.model.eval(),
+            self.saver.whole_model().eval(),
             self.folder,
             self.step,
             self.clock.seconds,

@@ -34,8 +34,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether `path` is a file that a process killed inside `replacing` left, or is now writing."""
-    return bool(re.fullmatch(r"\..+\.\d+\.tmp", path.name)) and path.is_file()
+    """Whether `path` is a file that a process killed inside `replacing` left, or is now writing.
+
+    safetensors, too, writes to a name of its own (.tmpXXXXXX) first.
+    """
+    name = r"\..+\.\d+\.tmp|\.tmp[A-Za-z0-9]{6}"
+    return bool(re.fullmatch(name, path.name)) and path.is_file()
 
 
 def _synchronise(path: Path) -> None:

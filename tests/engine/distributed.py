@@ -14,7 +14,7 @@ from qgs.engine import train
 def main(recipe: str, run: str) -> None:
     """Train, and print what this process knows of it."""
     torch.set_num_threads(1)
-    result = train(resolve(Path(recipe)), run, device="cpu")
+    result = train(resolve(Path(recipe)), run, device="cpu", resume=True)
     total = sum(float(p.detach().double().abs().sum()) for p in result.model.parameters())
     print(f"{result.main} {result.steps} {total:.6f}")
 

@@ -1,67 +1,103 @@
-"""Two processes on one machine train one model."""
+"""Two processes on one machine train the model that one would train."""
 
 from __future__ import annotations
 
-import json
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+import torch
 import yaml
+from rich.console import Console
 
+import qgs
 from qgs.composer import Recipe
+from qgs.engine import RunFolder, train
+from qgs.engine.interrupt import StopRequest
+from qgs.engine.progress import TrainingProgress
+from qgs.engine.state import read_state
+from qgs.engine.trainer import Trainer
 
 WORKER = Path(__file__).with_name("distributed.py")
+FSDP = {"ACCELERATE_USE_FSDP": "true"}
+"""What `accelerate launch --use_fsdp` tells its processes."""
 
 
-def free_port() -> int:
-    """A TCP port that is free now."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
+def train_in_two_processes(recipe: Recipe, run: Path, **environment: str) -> list[list[str]]:
+    """Continue or start `run` by torchrun; what each process said of it."""
+    file = run.with_suffix(".yaml")
+    file.write_text(yaml.safe_dump(dict(recipe.tree)))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    done = subprocess.run(
+        [*command, str(WORKER), str(file), str(run)],
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = [line.split() for line in done.stdout.splitlines()]
+    return [words for words in lines if words and words[0] in ("True", "False")]
 
 
-def test_two_processes_train_alike_and_one_writes(
-    tiny: Callable[..., Recipe], tmp_path: Path
+def losses(run: Path) -> list[float]:
+    return [record["loss"] for record in RunFolder(run).history()]
+
+
+@pytest.mark.parametrize("accumulate", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_two_processes_have_the_loss_curve_of_one(
+    tiny: Callable[..., Recipe], tmp_path: Path, accumulate: int
 ) -> None:
-    recipe = tiny("locus", "training.steps=3", "training.save_every=1", "training.batch_size=1")
-    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(dict(recipe.tree)))
-    port = free_port()
-    processes = []
-    for rank in range(2):
-        environment = {
-            **os.environ,
-            "WORLD_SIZE": "2",
-            "RANK": str(rank),
-            "LOCAL_RANK": str(rank),
-            "MASTER_ADDR": "127.0.0.1",
-            "MASTER_PORT": str(port),
-            "OMP_NUM_THREADS": "1",
-        }
-        command = [sys.executable, str(WORKER), str(tmp_path / "recipe.yaml"), str(tmp_path / "r")]
-        processes.append(
-            subprocess.Popen(
-                command,
-                env=environment,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-        )
-    try:
-        outputs = [process.communicate(timeout=120) for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    assert [process.returncode for process in processes] == [0, 0], outputs
-    said = [out.split()[-3:] for out, _ in outputs]
-    assert [main for main, *_ in said] == ["True", "False"]
-    assert said[0][1:] == said[1][1:] == ["3", said[0][2]], "the same weights everywhere"
-    names = {path.name for path in (tmp_path / "r").iterdir()}
-    files = ("recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors")
-    assert names == set(files)
-    lines = (tmp_path / "r" / "history.jsonl").read_text().splitlines()
-    assert [json.loads(line)["step"] for line in lines] == [1, 2, 3]
+    options = ("training.save_every=2", f"training.accumulate={accumulate}")
+    alone = tiny("locus", "training.batch_size=2", *options)
+    train(alone, tmp_path / "alone", console=Console(quiet=True), device="cpu")
+    said = train_in_two_processes(
+        tiny("locus", "training.batch_size=1", *options), tmp_path / "two"
+    )
+    assert sorted(main for main, *_ in said) == ["False", "True"]
+    assert said[0][1:] == said[1][1:] == ["4", said[0][2]], "the same weights everywhere"
+    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
+    names = {path.name for path in (tmp_path / "two").iterdir()}
+    assert names == {
+        "recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("accumulate", [pytest.param(1, marks=pytest.mark.slow), 2])
+def test_shards_continue_what_one_process_began(
+    tiny: Callable[..., Recipe], tmp_path: Path, accumulate: int
+) -> None:
+    options = ("training.save_every=2", "training.ema=0.9")
+    alone = tiny("locus", "training.batch_size=4", *options)
+    train(alone, tmp_path / "alone", console=Console(quiet=True), device="cpu")
+    begin(alone, tmp_path / "shards")
+    part = f"training.batch_size={2 // accumulate}", f"training.accumulate={accumulate}"
+    said = train_in_two_processes(tiny("locus", *part, *options), tmp_path / "shards", **FSDP)
+    assert said[0][1:] == said[1][1:] == ["4", said[0][2]]
+    assert losses(tmp_path / "shards") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
+    ours, theirs = (
+        read_state(tmp_path / n / "state.safetensors").parts for n in ("shards", "alone")
+    )
+    for name in ("weights", "moments", "ema", "good"):
+        assert ours[name].keys() == theirs[name].keys()
+        for key, tensor in ours[name].items():
+            torch.testing.assert_close(tensor, theirs[name][key], rtol=1e-3, atol=1e-4)
+    qgs.load(tmp_path / "shards" / "checkpoint.safetensors")
+
+
+def begin(recipe: Recipe, run: Path) -> None:
+    """The first two steps of a run, killed in the third."""
+
+    class Killing(TrainingProgress):
+        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
+            if step == 3:
+                raise KeyboardInterrupt
+            return False
+
+    trainer = Trainer(recipe, run)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run(Killing(Console(quiet=True)), StopRequest())
+    trainer.close()

@@ -178,7 +178,8 @@ def test_a_run_killed_before_its_first_save_starts_again(
 ) -> None:
     recipe, run = tiny("locus"), tmp_path / "run"
     kill_after(2, recipe, run)
-    (run / ".state.safetensors.4711.tmp").write_text("half a state")
+    for name in (".state.safetensors.4711.tmp", ".tmpA9b0zZ"):
+        (run / name).write_text("half a state")
     with (run / "history.jsonl").open("a") as file:
         file.write('{"step": 3, "lo')
     with pytest.raises(OtherRunError, match=r"seed: 1 here, 0 in the run"):

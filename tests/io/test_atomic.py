@@ -37,6 +37,8 @@ def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path: P
     for name in (".state.safetensors.tmp", "notes.12.tmp", ".git", "state.safetensors"):
         (tmp_path / name).touch()
         assert not is_leftover(tmp_path / name)
+    (tmp_path / ".tmpA9b0zZ").touch()
+    assert is_leftover(tmp_path / ".tmpA9b0zZ")
     (tmp_path / ".folder.12.tmp").mkdir()
     assert not is_leftover(tmp_path / ".folder.12.tmp")
     with replacing(tmp_path / "state") as temporary:
