@@ -176,9 +176,11 @@ def _about_protocol(evaluation: Evaluation) -> str:
     protocol, content = evaluation.protocol, evaluation.protocol.content
     height, width = content["image_size"]
     poses = content["poses"]
+    counts = sorted({len(inputs) for score in evaluation.scores for inputs, _ in score.views})
     return (
-        f"protocol {protocol.name}, sha256 {protocol.sha256}: {width}x{height} pixels (width x "
-        f"height), poses {poses['frame']}, scale {poses['scale']} {poses['scale_factor']}"
+        f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} input "
+        f"views of {width}x{height} pixels (width x height), poses {poses['frame']}, scale "
+        f"{poses['scale']} {poses['scale_factor']}"
     )
 
 
