@@ -44,10 +44,10 @@ def test_posact_and_its_slope_at_zero() -> None:
 
 
 def test_posact_limits_keep_saturated_inputs_finite() -> None:
-    t = torch.tensor([-1e4, 1e4], requires_grad=True)
+    t = torch.tensor([-1e4, -95.0, 95.0, 1e4], requires_grad=True)
     y = posact(t, 100.0, 1000.0)
     y.sum().backward()
-    assert y.tolist() == [-1000.0, 1000.0]
+    assert y.tolist() == [-1000.0, -1000.0, 1000.0, 1000.0]
     assert torch.isfinite(t.grad).all()
 
 
