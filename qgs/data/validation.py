@@ -49,7 +49,8 @@ def intrinsics_faults(intrinsics: Intrinsics, size: Size | None) -> Iterator[Fau
         fix = "focal lengths must be positive; export the intrinsics again"
         yield Fault(f"intrinsics are no numbers of a camera ({said})", fix)
         return
-    if max(fx, fy) < _NORMALISED and abs(cx) <= 1 and abs(cy) <= 1:
+    in_pixels = size is not None and max(size) > 20 * _NORMALISED
+    if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
         yield Fault(
             f"the intrinsics look normalised ({said})",
             "they must be in pixels; multiply fx and cx by the width, fy and cy by the height",

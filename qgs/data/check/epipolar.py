@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from qgs.data.check.conventions import AS_READ, Convention, Reading, readings
 from qgs.data.check.matching import Matches
-
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-READINGS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
-    "as read": lambda pose: pose,
-    "flipped": lambda pose: pose @ _FLIP,
-    "inverted": np.linalg.inv,
-    "inverted and flipped": lambda pose: np.linalg.inv(pose) @ _FLIP,
-}
-"""What the poses of a data set may have been meant as; "flipped" swaps OpenCV and OpenGL axes."""
 
 TOLERANCE = 0.005
 """Largest median distance that good poses leave, as a fraction of the image's diagonal."""
@@ -40,38 +31,38 @@ class Pair:
     intrinsics: np.ndarray
     size: tuple[int, int]
 
-    def distance(self, reading: str = "as read") -> float:
-        """Median epipolar distance under one of READINGS, as a fraction of the diagonal."""
-        first, second = (READINGS[reading](pose) for pose in self.poses)
+    def distance(self, reading: Reading = np.asarray) -> float:
+        """Median epipolar distance, as a fraction of the diagonal, if poses are meant so."""
+        first, second = (reading(pose) for pose in self.poses)
         distances = epipolar_distances(self.matches, first, second, self.intrinsics)
         return float(np.median(distances) / np.hypot(*self.size))
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """distances: median over pairs for each of READINGS, fractions of the diagonal."""
+    """distances: median over pairs for each reading, fractions of the diagonal."""
 
     distances: Mapping[str, float]
 
     @property
     def agrees(self) -> bool:
         """Whether the poses, as read, explain the photos."""
-        return self.distances["as read"] <= TOLERANCE and self.better is None
+        return self.distances[AS_READ] <= TOLERANCE and self.better is None
 
     @property
     def better(self) -> str | None:
         """The reading that explains the photos where the present one does not."""
         best = min(self.distances, key=lambda reading: self.distances[reading])
-        clear = self.distances["as read"] > CLEARLY_BETTER * self.distances[best]
+        clear = self.distances[AS_READ] > CLEARLY_BETTER * self.distances[best]
         return best if clear and self.distances[best] <= TOLERANCE else None
 
 
-def judge(pairs: Sequence[Pair]) -> Verdict:
-    """Compare all READINGS on at least one pair."""
+def judge(pairs: Sequence[Pair], convention: Convention) -> Verdict:
+    """Compare on at least one pair what poses of a format may have been meant as."""
     return Verdict(
         {
-            reading: float(np.median([pair.distance(reading) for pair in pairs]))
-            for reading in READINGS
+            name: float(np.median([pair.distance(reading) for pair in pairs]))
+            for name, reading in readings(convention).items()
         }
     )
 

@@ -18,6 +18,7 @@ from qgs.data.validation import intrinsics_faults, pose_faults
 
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_faults` tells
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
+_DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
 _HEADER = 4096  # bytes that nearly always hold an image's size
 _AGAIN = "pack the data set again with `qgs data pack`, or remove the scene from index.json"
 
@@ -189,6 +190,11 @@ def _sound(record: Record) -> bool:
 def camera_faults(record: Record, frame: int) -> Iterator[Fault]:
     """What is wrong with the camera of a frame."""
     yield from pose_faults(record.w2c[frame].numpy())
+    yield from stored_intrinsics_faults(record, frame)
+
+
+def stored_intrinsics_faults(record: Record, frame: int) -> Iterator[Fault]:
+    """What is wrong with the intrinsics of a frame, pixels instead of fractions included."""
     values = record.cameras[frame, :4].tolist()
     height, width = record.image_sizes[frame]
     if max(values[:2]) >= _IN_PIXELS:
@@ -196,6 +202,12 @@ def camera_faults(record: Record, frame: int) -> Iterator[Fault]:
         yield Fault(
             f"the intrinsics ({said}) look like pixels",
             "chunks hold fx and cx divided by the image's width, fy and cy by its height",
+        )
+        return
+    if 0 < max(values[:2]) < _DIVIDED_TWICE:
+        yield Fault(
+            f"the intrinsics ({', '.join(f'{value:.6g}' for value in values)}) look divided twice",
+            "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
         )
         return
     fx, fy, cx, cy = values

@@ -1,0 +1,112 @@
+"""Evaluation indices against the scenes that are there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from upath import UPath
+
+from qgs.data.check.finding import Finding, spans
+from qgs.data.index import IndexEntry, read_index
+
+_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Held:
+    """A scene that is there. split: empty where the format has none. frames: None if unreadable."""
+
+    split: str
+    frames: int | None
+
+
+@dataclass(frozen=True)
+class IndexSummary:
+    """An index in numbers. null: scenes that it lists without frames."""
+
+    file: str
+    scenes: int
+    null: int
+
+
+def found_indices(path: UPath) -> list[UPath]:
+    """The JSON files in the folder `path` that have the form of an evaluation index."""
+    if not path.is_dir():
+        return []
+    files = sorted((item for item in path.iterdir() if item.suffix == ".json"), key=str)
+    return [file for file in files if _is_index(file)]
+
+
+def _is_index(file: UPath) -> bool:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(data, dict) and any(
+        isinstance(entry, dict) and {"context", "target"} <= entry.keys() for entry in data.values()
+    )
+
+
+def index_findings(
+    file: UPath, scenes: Mapping[str, Sequence[Held]]
+) -> tuple[list[Finding], IndexSummary | None]:
+    """What the index names and is not there. The summary is None for a file that is no index."""
+    try:
+        index = read_index(str(file))
+    except (OSError, ValueError) as error:
+        fix = "correct the file, or get it again"
+        return [Finding(str(file.name), str(error), fix)], None
+    findings: list[Finding] = []
+    for name, entry in index.items():
+        if entry is not None:
+            findings += _entry_findings(file.name, name, entry, scenes.get(name, ()))
+    null = [name for name, entry in index.items() if entry is None]
+    if null:
+        more = f" and {len(null) - _SHOWN} more" if len(null) > _SHOWN else ""
+        findings.append(
+            Finding(
+                file.name,
+                f"{len(null)} of {len(index)} scenes are listed without frames (null) and so are "
+                f"never judged: {', '.join(null[:_SHOWN])}{more}",
+                "nothing if that is meant; else give them context and target frames",
+                severity="warning",
+            )
+        )
+    return findings, IndexSummary(str(file), len(index), len(null))
+
+
+def _entry_findings(
+    file: str, name: str, entry: IndexEntry, held: Sequence[Held]
+) -> Iterator[Finding]:
+    if not held:
+        fix = "add the scene, or take it out of the index; correct the name if it is spelled wrong"
+        yield Finding(name, f"the index {file} names the scene, which is not there", fix)
+        return
+    of_test = [scene for scene in held if scene.split != "train"]
+    if not of_test:
+        fix = "move it to the test split, or take it out of the index"
+        yield Finding(name, f"the index {file} names the scene, which is in train only", fix)
+    frames = (of_test or held)[0].frames
+    if frames is None:
+        return
+    for role, numbers in (("context", entry.context), ("target", entry.target)):
+        outside = [number for number in numbers if not 0 <= number < frames]
+        if outside:
+            yield Finding(
+                name,
+                f"the index {file} has the {role} frame{'s' if len(outside) > 1 else ''} "
+                f"{spans(outside)}, but the scene's {frames} frames are 0 to {frames - 1}",
+                "correct the index, or add the missing frames to the scene",
+                tuple(outside),
+            )
+    both = set(entry.context) & set(entry.target)
+    if both:
+        yield Finding(
+            name,
+            f"the index {file} has frames as context and as target",
+            "judge models on frames that they are not given",
+            tuple(sorted(both)),
+            severity="warning",
+        )
