@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from qgs.cli.data_check import check
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -21,8 +23,9 @@ Options = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add the group of commands to `app`."""
-    group = typer.Typer(no_args_is_help=True, help="Pack data sets.")
+    group = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
     group.callback()(_group)
+    group.command("check")(check)
     group.command("pack")(pack)
     app.add_typer(group, name="data")
 

@@ -72,8 +72,21 @@ def epipolar_distances(
 ) -> np.ndarray:
     """Distance in pixels of each point (P,) to the epipolar line of its partner, both ways' mean.
 
-    first, second: (4, 4) camera-to-world, OpenCV axes. intrinsics: (2, 4). Two cameras on one point
-    have no epipolar lines: all distances are then 0 (Hartley and Zisserman 2004, section 9.2).
+    Arguments as of `epipolar_lines`. Two cameras on one point have no epipolar lines: all distances
+    are then 0.
+    """
+    back, forth = epipolar_lines(matches, first, second, intrinsics)
+    return (_line_distance(matches.second, forth) + _line_distance(matches.first, back)) / 2
+
+
+def epipolar_lines(
+    matches: Matches, first: np.ndarray, second: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The lines (P, 3) of points in the first photo and in the second on which matches must lie.
+
+    A line is a, b, c of a x + b y + c = 0, in pixels; each is that of the point in the other photo.
+    first, second: (4, 4) camera-to-world, OpenCV axes. intrinsics: (2, 4). The fundamental matrix
+    is that of Hartley and Zisserman (2004), section 9.2.
     """
     relative = np.linalg.inv(second) @ first
     rotation, shift = relative[:3, :3], relative[:3, 3]
@@ -82,14 +95,12 @@ def epipolar_distances(
     inverse = [np.linalg.inv(_matrix(values)) for values in intrinsics]
     fundamental = inverse[1].T @ cross @ rotation @ inverse[0]
     a, b = _homogeneous(matches.first), _homogeneous(matches.second)
-    forth = _line_distance(b, a @ fundamental.T)
-    back = _line_distance(a, b @ fundamental)
-    return (forth + back) / 2
+    return b @ fundamental, a @ fundamental.T
 
 
 def _line_distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(lines[:, :2], axis=1)
-    return np.abs((points * lines).sum(1)) / np.where(length > 0, length, 1.0)
+    return np.abs((_homogeneous(points) * lines).sum(1)) / np.where(length > 0, length, 1.0)
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:

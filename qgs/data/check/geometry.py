@@ -44,10 +44,15 @@ class Geometry:
     unjudged: str = ""
 
     @property
-    def pixels(self) -> float:
-        """Median distance to the epipolar line as read, in pixels of the files."""
+    def fraction(self) -> float:
+        """Median distance to the epipolar line as read, as a fraction of the diagonal."""
         assert self.verdict is not None
-        return self.verdict.distances[AS_READ] * self.diagonal
+        return self.verdict.distances[AS_READ]
+
+    @property
+    def pixels(self) -> float:
+        """The same in pixels of the files."""
+        return self.fraction * self.diagonal
 
 
 @dataclass
