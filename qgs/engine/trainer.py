@@ -282,7 +282,6 @@ class Trainer:
         batches = list(islice(self._batches, self.config.accumulate))
         measured = self.gradients.compute(batches)
         scenes = sum(len(batch.scenes) for batch in batches)
-        self.samples += scenes * self.accelerator.num_processes
         record = self._read(measured, stop)
         symptom = self._nonfinite(record)
         if symptom:
@@ -290,6 +289,7 @@ class Trainer:
         else:
             self._apply(record)
         self.step += 1
+        self.samples += scenes * self.accelerator.num_processes
         self.clock.tick()
         return {"step": self.step, "seconds": self.clock.seconds, "lr": rate, **record}
 
@@ -305,11 +305,15 @@ class Trainer:
         """Save a step that is not finite; end, or go on without it, as the recipe says."""
         self._open_folder()
         found = self.incidents.look_into(self.step + 1, batches, symptom)
-        if self.config.on_nonfinite == "stop":
-            self._give_up(found, BROKEN_REMEDIES)
+        if self.config.on_nonfinite == "skip" and self.incidents.in_a_row <= PATIENCE:
+            _log.warning("step %d is skipped: %s", self.step + 1, found)
+            return
         if self.incidents.in_a_row > PATIENCE:
-            self._give_up(f"{PATIENCE} steps in a row were skipped; {found}", BROKEN_REMEDIES)
-        _log.warning("step %d is skipped: %s", self.step + 1, found)
+            found = f"{PATIENCE} steps in a row were skipped; {found}"
+        if self.detector.dead_steps or broken_tensors(self.model):
+            self._give_up(found, BROKEN_REMEDIES)
+        self._save()
+        self._fail(found, self.step, BROKEN_REMEDIES)
 
     def _evaluate(self) -> None:
         with self.clock.stopped():
@@ -373,10 +377,13 @@ class Trainer:
     def _give_up(self, problem: str, causes: Sequence[str]) -> NoReturn:
         self._open_folder()
         self.saver.save_good()
+        self._fail(problem, self.good.step, causes)
+
+    def _fail(self, problem: str, kept: int, causes: Sequence[str]) -> NoReturn:
         remedies = "".join(f"\n  - {cause}" for cause in causes)
         raise CollapseError(
             f"training collapsed at step {self.step}: {problem}. The weights of step "
-            f"{self.good.step} are kept in {self.folder.checkpoint}. Likely causes:{remedies}"
+            f"{kept} are kept in {self.folder.checkpoint}. Likely causes:{remedies}"
         )
 
     def _save(self) -> None:

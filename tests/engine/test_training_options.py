@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Generator
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,8 @@ import qgs
 from qgs.composer import Recipe
 from qgs.contracts.extras import MissingExtraError
 from qgs.data.sampling import Batch
-from qgs.engine import CollapseError, TrainingResult, trackers, train, trainer
+from qgs.data.stream import SampleStream
+from qgs.engine import CollapseError, TrainingResult, trackers, train
 from qgs.engine.incidents import PATIENCE, read_batch
 
 QUIET = Console(quiet=True)
@@ -52,21 +52,15 @@ def bad_batches(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """`bad_batches(2, 3)`: the training batches of these numbers, from 0, hold a NaN pixel."""
 
     def spoil(*numbers: int) -> None:
-        whole = trainer.training_batches
+        whole = SampleStream.batch
 
-        def spoiled(*arguments: Any, **options: Any) -> Generator[Batch, None, None]:
-            stream = whole(*arguments, **options)
-            try:
-                for number, batch in enumerate(stream):
-                    if number in numbers:
-                        images = batch.targets.images.clone()
-                        images[0, 0, 0, 0, 0] = torch.nan
-                        batch = replace(batch, targets=replace(batch.targets, images=images))
-                    yield batch
-            finally:
-                stream.close()
+        def spoiled(stream: SampleStream, samples: Sequence[int]) -> Batch:
+            batch = whole(stream, samples)
+            if samples[0] // len(samples) in numbers:
+                batch.targets.images[0, 0, 0, 0, 0] = torch.nan
+            return batch
 
-        monkeypatch.setattr(trainer, "training_batches", spoiled)
+        monkeypatch.setattr(SampleStream, "batch", spoiled)
 
     return spoil
 
@@ -169,6 +163,25 @@ def test_a_bad_step_is_skipped_on_demand(
     assert incidents == {"step-2", "step-4"}
     for file in (result.folder.checkpoint, result.folder.checkpoint_ema):
         assert all(tensor.isfinite().all() for tensor in qgs.load(file).state_dict().values())
+
+
+def test_a_run_that_a_bad_step_ended_goes_on_without_it(
+    tiny: Callable[..., Recipe], tmp_path: Path, bad_batches: Callable[..., None]
+) -> None:
+    bad_batches(2)
+    options = ("training.steps=6", "training.ema=0.9", "training.save_every=4")
+    skipping = tiny("locus", *options, "training.on_nonfinite=skip")
+    through = run(skipping, tmp_path / "through")
+    stopping = tiny("locus", *options)
+    with pytest.raises(CollapseError, match="collapsed at step 2"):
+        run(stopping, tmp_path / "stopped")
+    with pytest.raises(CollapseError, match="collapsed at step 2"):
+        train(stopping, tmp_path / "stopped", console=QUIET, device="cpu", resume=True)
+    again = train(skipping, tmp_path / "stopped", console=QUIET, device="cpu", resume=True)
+    assert again.resumed_at == 2
+    assert same(weights(again), weights(through))
+    averages = [qgs.load(r.folder.checkpoint_ema).state_dict() for r in (again, through)]
+    assert same(*averages)
 
 
 def test_skipping_comes_to_an_end(
