@@ -56,12 +56,13 @@ class Difference:
 class Comparison:
     """The first results against others. only_first, only_second: scenes that one alone judged.
 
-    empty: metrics that one of them lacks.
+    empty: metrics that one of them lacks. other_frames: shared scenes judged on different frames.
     """
 
     first: str
     second: str
     same_protocol: bool
+    other_frames: Sequence[str]
     differences: Sequence[Difference]
     only_first: Sequence[str]
     only_second: Sequence[str]
@@ -79,8 +80,9 @@ class Comparisons:
     def of(cls, results: Sequence[StoredResults], across_protocols: bool = False) -> Self:
         """Compare the first of `results` with each of the others.
 
-        Raises ValueError for fewer than two, for one folder twice, for results of different
-        protocols unless `across_protocols`, and for results without a scene in common.
+        Raises ValueError for fewer than two, for one folder twice, for results without a scene in
+        common, and unless `across_protocols` for results of different protocols and for scenes that
+        were judged on different frames.
         """
         names = [result.name for result in results]
         if len(names) < 2 or len(set(names)) < len(names):
@@ -89,6 +91,9 @@ class Comparisons:
         for other in others:
             if other.sha256 != first.sha256 and not across_protocols:
                 raise ValueError(_different_protocols(first, other))
+            moved = _judged_on_other_frames(first, other)
+            if moved and not across_protocols:
+                raise ValueError(_different_frames(first, other, moved))
         protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
         return cls(protocols, [_compared(first, other) for other in others])
 
@@ -171,6 +176,7 @@ def _compared(first: StoredResults, second: StoredResults) -> Comparison:
         first=first.name,
         second=second.name,
         same_protocol=first.sha256 == second.sha256,
+        other_frames=_judged_on_other_frames(first, second),
         differences=[
             _difference(
                 metric,
@@ -184,6 +190,11 @@ def _compared(first: StoredResults, second: StoredResults) -> Comparison:
         only_second=[name for name in second.scenes if name not in first.scenes],
         empty=[m for m in COLUMNS if m not in ours or m not in theirs],
     )
+
+
+def _judged_on_other_frames(first: StoredResults, second: StoredResults) -> list[str]:
+    shared = [name for name in first.frames if name in second.frames]
+    return [name for name in shared if first.frames[name] != second.frames[name]]
 
 
 def _difference(metric: str, first: np.ndarray, second: np.ndarray) -> Difference:
@@ -236,6 +247,11 @@ def _notes(pair: Comparison) -> list[str]:
         lines.append(f"not in both, left out: {empty}")
     if not pair.same_protocol:
         lines.append("the protocols differ: the scores do not measure the same")
+    if pair.other_frames:
+        lines.append(
+            f"{len(pair.other_frames)} scenes judged on different frames: "
+            f"{listed(pair.other_frames)}"
+        )
     return lines
 
 
@@ -246,4 +262,12 @@ def _different_protocols(first: StoredResults, other: StoredResults) -> str:
         f"{first.name} was judged by {first.protocol_name} ({first.sha256[:12]}), {other.name} by "
         f"{other.protocol_name} ({other.sha256[:12]}), which differ in {', '.join(unequal)}: "
         "evaluate both alike, or add --across-protocols to compare them all the same"
+    )
+
+
+def _different_frames(first: StoredResults, other: StoredResults, moved: Sequence[str]) -> str:
+    return (
+        f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, although "
+        f"their protocols agree: {listed(moved)}. The data, or how views are drawn, changed between "
+        "them: evaluate both again, or add --across-protocols"
     )

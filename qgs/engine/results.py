@@ -178,8 +178,8 @@ def _about_protocol(evaluation: Evaluation) -> str:
     poses = content["poses"]
     counts = sorted({len(inputs) for score in evaluation.scores for inputs, _ in score.views})
     return (
-        f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} input "
-        f"views of {width}x{height} pixels (width x height), poses {poses['frame']}, scale "
+        f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
+        f"input views of {width}x{height} pixels (width x height), poses {poses['frame']}, scale "
         f"{poses['scale']} {poses['scale_factor']}"
     )
 

@@ -14,8 +14,8 @@ from typing import Any
 class StoredResults:
     """Results of one evaluation. name: the folder, as it was given. protocol: its content.
 
-    scenes: name to values as `SceneScore.values`, of the scenes that were judged. missing: scene to
-    reason.
+    scenes: name to values as `SceneScore.values`, of the scenes that were judged. frames: their
+    input and target frames, as scenes.csv writes them.
     """
 
     name: str
@@ -23,7 +23,7 @@ class StoredResults:
     sha256: str
     protocol: Mapping[str, Any]
     scenes: Mapping[str, Mapping[str, float]]
-    missing: Mapping[str, str]
+    frames: Mapping[str, tuple[str, str]]
 
 
 def read_results(path: str | Path) -> StoredResults:
@@ -54,11 +54,11 @@ def _read(folder: Path, name: str) -> StoredResults:
     with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     told = {"scene", "input_frames", "target_frames", "problem"}
+    judged = {row["scene"]: row for row in rows if not row["problem"]}
     scenes = {
-        row["scene"]: {key: float(value) for key, value in row.items() if key not in told}
-        for row in rows
-        if not row["problem"]
+        scene: {key: float(value) for key, value in row.items() if key not in told}
+        for scene, row in judged.items()
     }
+    frames = {s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()}
     stated = summary["protocol"]
-    missing = dict(summary["missing"])
-    return StoredResults(name, stated["name"], stated["sha256"], protocol, scenes, missing)
+    return StoredResults(name, stated["name"], stated["sha256"], protocol, scenes, frames)

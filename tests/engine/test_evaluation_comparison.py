@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ HASHES = {"rooms": "a" * 64, "halls": "b" * 64}
 def results(name: str, protocol: str = "rooms", **psnr: float) -> StoredResults:
     scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
     content = {"format": 1, "views": protocol}
-    return StoredResults(name, protocol, HASHES[protocol], content, scenes, {})
+    frames = dict.fromkeys(scenes, ("0 3", "1 2"))
+    return StoredResults(name, protocol, HASHES[protocol], content, scenes, frames)
 
 
 def test_the_interval_is_that_of_scipy() -> None:
@@ -81,6 +83,15 @@ def test_what_cannot_be_compared_is_refused() -> None:
     (pair,) = Comparisons.of([rooms, halls], across_protocols=True).pairs
     assert not pair.same_protocol
     assert pair.differences[0].low is None
+
+
+def test_scenes_judged_on_other_frames_are_refused_although_protocols_agree() -> None:
+    first, second = results("x", a=1.0, b=2.0), results("y", a=1.0, b=2.0)
+    moved = replace(second, frames={**second.frames, "b": ("0 4", "1 2")})
+    with pytest.raises(ValueError, match=r"judged 1 scenes on different frames, .* agree: b"):
+        Comparisons.of([first, moved])
+    text = Comparisons.of([first, moved], across_protocols=True).markdown()
+    assert "1 scenes judged on different frames: b" in text
 
 
 def test_tables_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
