@@ -268,6 +268,6 @@ def _different_protocols(first: StoredResults, other: StoredResults) -> str:
 def _different_frames(first: StoredResults, other: StoredResults, moved: Sequence[str]) -> str:
     return (
         f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, although "
-        f"their protocols agree: {listed(moved)}. The data, or how views are drawn, changed between "
-        "them: evaluate both again, or add --across-protocols"
+        f"their protocols agree: {listed(moved)}. The data, or how views are drawn, changed "
+        "between them: evaluate both again, or add --across-protocols"
     )
