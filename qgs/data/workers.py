@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
+import os
 import signal
 import traceback
 from collections.abc import Callable, Generator, Iterator
@@ -93,3 +95,5 @@ def _prepare_worker(number: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     logging.getLogger("qgs").setLevel(logging.ERROR)  # opening the data has been reported before
+    # Python's own end aborts where the thread that sends batches is inside torch at that moment.
+    atexit.register(os._exit, 0)

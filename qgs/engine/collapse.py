@@ -115,14 +115,17 @@ class GoodWeights:
 
     A collapse is noticed late, and the newest healthy copy may already be on its way down; the
     older one is at least a window away.
+
+    keep: whether this process holds the copies; one of several suffices.
     """
 
-    def __init__(self, model: nn.Module) -> None:
+    def __init__(self, model: nn.Module, keep: bool = True) -> None:
         self._model = model
+        self._keep = keep
         self._copies = [(0, self._copy())]
 
     def refresh(self, step: int) -> None:
-        """Copy the present weights, which `step` optimiser steps made."""
+        """Copy the present weights, which `step` optimiser steps made. All processes must call."""
         self._copies = [*self._copies, (step, self._copy())][-2:]
 
     @property
@@ -151,8 +154,12 @@ class GoodWeights:
         ]
 
     def _copy(self) -> dict[str, Tensor]:
-        tensors = unique_tensors(self._model)
-        return {name: whole(tensor).to("cpu", copy=True) for name, tensor in tensors.items()}
+        copies: dict[str, Tensor] = {}
+        for name, tensor in unique_tensors(self._model).items():
+            gathered = whole(tensor)
+            if self._keep:
+                copies[name] = gathered.to("cpu", copy=True)
+        return copies
 
 
 def broken_tensors(model: nn.Module) -> str:

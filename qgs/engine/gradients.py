@@ -39,7 +39,7 @@ class Gradients:
                     sums[name] = sums.get(name, 0) + value / len(batches)
         average_gradients(self.accelerator, self.objective)
         norm = self.accelerator.clip_grad_norm_(self.objective.parameters(), self.config.clip)
-        sums["gradient"] = whole(torch.as_tensor(norm, device=self.accelerator.device))
+        sums["gradient"] = whole(torch.as_tensor(norm)).to(self.accelerator.device)
         return sums
 
     def _backward(self, batch: Batch, count: int) -> dict[str, Tensor]:

@@ -76,9 +76,12 @@ def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
 
 
 def whole(tensor: Tensor) -> Tensor:
-    """`tensor` without gradient, gathered where processes hold shards of it; all must call this."""
+    """`tensor` without gradient; where processes hold shards of it, gathered, in host memory.
+
+    All processes must call this.
+    """
     tensor = tensor.detach()
-    return tensor.full_tensor() if isinstance(tensor, DTensor) else tensor
+    return tensor.full_tensor().cpu() if isinstance(tensor, DTensor) else tensor
 
 
 def placed_like(tensor: Tensor, other: Tensor) -> Tensor:

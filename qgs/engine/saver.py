@@ -10,7 +10,7 @@ from qgs.composer import resolve
 from qgs.engine.collapse import GoodWeights
 from qgs.engine.folder import RunFolder
 from qgs.engine.processes import sharded
-from qgs.engine.state import SavedState, Stateful, Weights, write_state
+from qgs.engine.state import SavedState, State, Stateful, Weights, write_state
 from qgs.io.checkpoint import CheckpointError, load_weights, save
 from qgs.model import QueryGaussianModel
 
@@ -41,17 +41,30 @@ class Saver:
 
     def save(self, step: int) -> None:
         """Save the run after `step` optimiser steps. All processes must call this."""
-        parts = {name: part.state() for name, part in self._parts.items()}
+        parts = self._states()
         if self._accelerator.is_main_process:
             extra = {"step": str(step)}
-            self._folder.synchronise()
             save(self._model, self._folder.checkpoint, extra=extra, weights=parts["weights"])
             if "ema" in parts:
                 averages = parts["ema"]
                 save(self._model, self._folder.checkpoint_ema, extra=extra, weights=averages)
-            assert self._model.recipe is not None
-            write_state(self._folder.state, self._model.recipe, parts)
+            self._write(parts)
         self._accelerator.wait_for_everyone()
+
+    def save_state(self) -> None:
+        """Save what continues the run, and leave the checkpoint. All processes must call this."""
+        parts = self._states()
+        if self._accelerator.is_main_process:
+            self._write(parts)
+        self._accelerator.wait_for_everyone()
+
+    def _states(self) -> dict[str, State]:
+        return {name: part.state() for name, part in self._parts.items()}
+
+    def _write(self, parts: Mapping[str, State]) -> None:
+        self._folder.synchronise()
+        assert self._model.recipe is not None
+        write_state(self._folder.state, self._model.recipe, parts)
 
     def save_good(self) -> None:
         """Save a checkpoint of the last good weights. All processes must call this."""

@@ -157,7 +157,7 @@ class Trainer:
         self.objective, self.optimizer = prepared(self.accelerator, objective, self.config)
         self.gradients = Gradients(self.accelerator, self.objective, self.config)
         self.detector = CollapseDetector(self.config.collapse_window)
-        self.good = GoodWeights(self.model)
+        self.good = GoodWeights(self.model, keep=self.accelerator.is_main_process)
         self.clock = Clock(self.accelerator)
         decay, run = self.config.ema, self.folder.path
         self.average = MovingAverage(self.model, decay) if decay else None
@@ -367,6 +367,7 @@ class Trainer:
             self._give_up(symptom, COLLAPSE_REMEDIES)
         if self.detector.dead_after(self.step):
             self.saver.save_good()
+            self.saver.save_state()
             return
         if dead:
             _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)

@@ -78,7 +78,7 @@ def losses(run: Path) -> list[tuple[float, float, float]]:
 CASES = [
     ("locus", ()),
     ("tokengs", ("training.accumulate=2", "training.batch_size=1", "views.mirror=0.5")),
-    ("locus", ("training.precision=bf16",)),
+    ("locus", ("training.precision=bf16", "training.ema=0.9", "training.render_views=1")),
 ]
 
 
@@ -133,6 +133,18 @@ def test_a_stopped_run_goes_on_where_it_stopped(
     assert trainer.step == 3, "a request is seen at the end of the step in which it comes"
     assert resumed(recipe, tmp_path / "stopped").resumed_at == 3
     assert_equal_runs(tmp_path / "through", tmp_path / "stopped")
+
+
+def test_a_run_stopped_before_it_showed_signs_of_life_goes_on_too(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
+    trainer = Trainer(recipe, tmp_path / "run")
+    stop = StopRequest(signal.SIGTERM)
+    trainer.run(TrainingProgress(QUIET), stop)
+    trainer.close()
+    assert load_extra(tmp_path / "run" / "checkpoint.safetensors") == {"step": "0"}
+    assert Trainer(recipe, tmp_path / "run", resume=True).resumed_at == 1
 
 
 def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
