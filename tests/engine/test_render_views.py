@@ -1,9 +1,13 @@
-"""Rendering few target views at a time: the same gradients as all at once."""
+"""Rendering few target views at a time: the same gradients as all at once, in bounded memory."""
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
@@ -19,6 +23,7 @@ from qgs.losses import Mask, Opacity
 from qgs.metrics import psnr
 from qgs.types import LayerPrediction, Rendering, Views
 
+TOOL = Path(__file__).parents[2] / "tools" / "measure_render_memory.py"
 TARGETS = 5
 RENDERERS = ("qgs/torch", "qgs/cpu")
 
@@ -218,3 +223,16 @@ def test_every_shipped_loss_says_which_renderings_it_needs() -> None:
         "anchor_visibility": "none",
         "opacity": "none",
     }
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="reads Linux's accounts")
+def test_memory_does_not_grow_with_target_views() -> None:
+    """The script prints a pair of ratios without parts and a pair with parts."""
+    done = subprocess.run([sys.executable, TOOL], check=True, capture_output=True, text=True)
+    last = done.stdout.splitlines()[-1]
+    found = re.fullmatch(r" *ratio: peak (\S+), step (\S+)", last)
+    assert found, done.stdout
+    of_peak, of_step = map(float, found.groups())
+    assert of_peak <= 1.3
+    assert of_step <= 1.3
