@@ -43,6 +43,8 @@ class Saver:
         """Save the run after `step` optimiser steps. All processes must call this."""
         parts = self._states()
         if self._accelerator.is_main_process:
+            if not self._folder.state.exists():
+                self._write(parts)  # a checkpoint alone is a run that cannot be continued
             extra = {"step": str(step)}
             save(self._model, self._folder.checkpoint, extra=extra, weights=parts["weights"])
             if "ema" in parts:

@@ -220,6 +220,8 @@ class Trainer:
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
         if self.used >= 1:
+            if not self.folder.checkpoint.exists():
+                self._save()
             return self._result(None)
         while self.used < 1:
             record = self._optimise(stop)

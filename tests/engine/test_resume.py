@@ -161,6 +161,23 @@ def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
     assert all(torch.equal(theirs[name], tensor) for name, tensor in ours.items())
 
 
+def test_a_kill_between_the_first_two_files_loses_nothing(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, run = tiny("tokengs", "training.save_every=0"), tmp_path / "run"
+
+    def die(*_: object, **__: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr("qgs.engine.saver.save", die)
+        with pytest.raises(Killed):
+            train(recipe, run, console=QUIET, device="cpu")
+    assert not (run / "checkpoint.safetensors").exists()
+    assert resumed(recipe, run).resumed_at == 4
+    assert load_extra(run / "checkpoint.safetensors") == {"step": "4"}
+
+
 def test_a_longer_budget_continues_a_finished_run(
     tiny: Callable[..., Recipe], tmp_path: Path
 ) -> None:
