@@ -92,10 +92,7 @@ def _print(console: Console, result: CheckReport) -> None:
     for finding in result.findings:
         _line(console, str(finding))
     for summary in result.indices:
-        _line(
-            console,
-            f"{summary.file}: {summary.scenes} scenes, {summary.null} of them null",
-        )
+        _line(console, f"index {summary}")
     for note in result.notes:
         _line(console, f"note: {note}")
     warnings = len(result.findings) - result.errors

@@ -12,6 +12,7 @@ from qgs.data.notices import warn_once
 
 _RIGID = 1e-3  # of rotations against orthonormality
 _SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
+_SQUARE = 0.1  # relative difference of sides, or of fx and fy, that is none
 _NORMALISED = 5.0  # a focal length below is in units of the image, not of its pixels
 _FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
 
@@ -66,12 +67,24 @@ def intrinsics_faults(intrinsics: Intrinsics, size: Size | None) -> Iterator[Fau
             fatal=False,
         )
     focal = [f / max(size) for f in (fx, fy)]
-    if min(focal) < _FOCAL[0] or max(focal) > _FOCAL[1] or not 0.5 < fx / fy < 2:
+    if _divided_by_wrong_side(fx / fy, width / height):
+        yield Fault(
+            f"fx and fy differ as if divided by the wrong side of the image ({said}, {width} x "
+            f"{height} pixels)",
+            "width and height are swapped; divide fx and cx by the width, fy and cy by the height",
+            fatal=False,
+        )
+    elif min(focal) < _FOCAL[0] or max(focal) > _FOCAL[1] or not 0.5 < fx / fy < 2:
         yield Fault(
             f"the focal lengths are implausible ({said}, {width} x {height} pixels)",
             "correct them, or the size that goes with them",
             fatal=False,
         )
+
+
+def _divided_by_wrong_side(ratio: float, aspect: float) -> bool:
+    """Whether fx / fy is what square pixels give when width and height have been swapped."""
+    return abs(aspect - 1) > _SQUARE and abs(ratio / aspect**2 - 1) < _SQUARE
 
 
 def size_faults(size: Size, listed: Size | None) -> Iterator[Fault]:

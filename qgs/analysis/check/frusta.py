@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,14 +33,14 @@ def frusta_figure(scene: SceneReport) -> Figure | None:
     lines = _frusta(poses, scene.fov[kept].astype(float), _extent(poses[:, :, 3]) * _DEPTH)
     with figure_style():
         figure = Figure(figsize=(5.2, 4.4))
-        axes = figure.add_axes((0.0, 0.0, 0.94, 1.0), projection="3d")
+        axes: Any = figure.add_axes((-0.06, -0.02, 0.98, 1.04), projection="3d")
         colors = _colors(len(poses))
         centres = poses[:, :, 3]
         axes.plot(*centres.T, color=hex_color(INK), linewidth=0.6, alpha=0.5)
         for camera, color in zip(lines, colors, strict=True):
             axes.add_collection3d(Line3DCollection(camera, colors=[color], linewidths=0.9))
         _frame(axes, lines.reshape(-1, 3))
-        _order_scale(figure, axes, scene.frames[kept[0]], scene.frames[kept[-1]])
+        _order_scale(figure, scene.frames[kept[0]], scene.frames[kept[-1]])
     return figure
 
 
@@ -81,36 +81,32 @@ def _colors(count: int) -> np.ndarray:
     return colormaps[ORDER_MAP](np.linspace(0, 0.92, count))
 
 
-def _frame(axes, points: np.ndarray) -> None:  # type: ignore[no-untyped-def]
+def _frame(axes: Any, points: np.ndarray) -> None:
     """The same scale along all axes, a bare grid, a view from above and behind."""
+    from matplotlib.ticker import MaxNLocator
+
     low, high = points.min(0), points.max(0)
     sides = np.maximum(high - low, 0.25 * (high - low).max())
     middle = (low + high) / 2
     axes.set_xlim(middle[0] - sides[0] / 2, middle[0] + sides[0] / 2)
     axes.set_ylim(middle[1] - sides[1] / 2, middle[1] + sides[1] / 2)
     axes.set_zlim(middle[2] - sides[2] / 2, middle[2] + sides[2] / 2)
-    axes.set_box_aspect(sides, zoom=1.05)
+    axes.set_box_aspect(sides, zoom=1.15)
     axes.view_init(elev=28, azim=-62)
     axes.tick_params(labelsize=6, pad=-2)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color((1, 1, 1, 0))
-        axis.set_major_locator(_locator())
+        axis.set_major_locator(MaxNLocator(4))
 
 
-def _locator():  # type: ignore[no-untyped-def]
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(4)
-
-
-def _order_scale(figure: Figure, axes, first: int, last: int) -> None:  # type: ignore[no-untyped-def]
+def _order_scale(figure: Figure, first: int, last: int) -> None:
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
     colors = ListedColormap(colormaps[ORDER_MAP](np.linspace(0, 0.92, 256)))
     scale = ScalarMappable(Normalize(first, max(last, first + 1)), colors)
-    place = figure.add_axes((0.92, 0.22, 0.014, 0.56))
-    bar = figure.colorbar(scale, cax=place)
+    place = figure.add_axes((0.08, 0.96, 0.3, 0.018))
+    bar = figure.colorbar(scale, cax=place, orientation="horizontal")
     bar.set_label("frame")
     bar.outline.set_visible(False)  # type: ignore[operator]

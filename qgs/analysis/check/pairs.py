@@ -27,7 +27,8 @@ def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
 
     chosen = _spread(pair.matches.first, _MATCHES)
     points = (pair.matches.first[chosen], pair.matches.second[chosen])
-    lines = epipolar_lines(pair.matches, *pair.poses, pair.intrinsics)
+    first, second = pair.poses
+    lines = epipolar_lines(pair.matches, first, second, pair.intrinsics)
     height, width = pair.size
     with figure_style():
         figure = Figure(figsize=(8.0, 4.0 * height / width * (1 - _GAP) + 0.3))

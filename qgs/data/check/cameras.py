@@ -13,9 +13,8 @@ from qgs.data.check.photo import Photo
 from qgs.data.frames import Fault, Intrinsics, Size
 from qgs.data.validation import intrinsics_faults, pose_faults
 
-_SAME = 1e-6  # of the coordinates, and of a rotation's entries: what float32 keeps
+_SAME = 2e-6  # of the coordinates, and of a rotation's entries: what float32 keeps
 _FAR_OFF_CENTRE = 0.25  # of a side, from the middle
-_SWAPPED = 0.1  # relative
 
 
 def camera_findings(
@@ -44,14 +43,6 @@ def camera_findings(
 
 def _intrinsics(intrinsics: Intrinsics, size: Size | None) -> Iterator[Fault]:
     faults = list(intrinsics_faults(intrinsics, size))
-    swapped = size is not None and _swapped(intrinsics, size)
-    if swapped:
-        yield Fault(
-            f"fx {intrinsics[0]:.6g} and fy {intrinsics[1]:.6g} differ as if they were divided by "
-            "the wrong side of the image",
-            "width and height are swapped; divide fx and cx by the width, fy and cy by the height",
-        )
-        return
     yield from faults
     if size is None or faults:
         return
@@ -64,14 +55,6 @@ def _intrinsics(intrinsics: Intrinsics, size: Size | None) -> Iterator[Fault]:
             "correct cx and cy, unless the photo is cut from a larger one",
             fatal=False,
         )
-
-
-def _swapped(intrinsics: Intrinsics, size: Size) -> bool:
-    fx, fy = intrinsics[:2]
-    aspect = size[1] / size[0]
-    if abs(aspect - 1) < 2 * _SWAPPED or not fx > 0 or not fy > 0:
-        return False
-    return abs(fx / fy / aspect**2 - 1) < _SWAPPED
 
 
 @dataclass(frozen=True)
@@ -93,8 +76,8 @@ def sharing_findings(
     if len(cameras) < 2:
         return []
     centres = np.stack([camera.c2w[:3, 3] for camera in cameras])
-    extent = float(np.abs(centres).max())
-    if float(np.ptp(centres, axis=0).max()) <= _SAME * extent or extent == 0:
+    near = float(np.abs(centres).max()) * max(_SAME, _rigidity(cameras))
+    if float(np.ptp(centres, axis=0).max()) <= near:
         return [
             Finding(
                 scene,
@@ -105,7 +88,7 @@ def sharing_findings(
             )
         ]
     findings: list[Finding] = []
-    for place in _together(cameras, lambda camera: camera.c2w[:3, 3], _SAME * extent):
+    for place in _together(cameras, lambda camera: camera.c2w[:3, 3], near):
         groups = list(_together(place, lambda camera: camera.c2w[:3, :3].flatten(), _SAME))
         for alike in groups:
             findings += [_duplicate(scene, alike[0], other) for other in alike[1:]]
@@ -136,6 +119,13 @@ def _together(
         alike = near[np.abs(rows[near] - rows[place]).max(1) <= tolerance]
         leader[alike[leader[alike] < 0]] = place
     return list(groups.values())
+
+
+def _rigidity(cameras: Sequence[_Camera]) -> float:
+    """How far rotations are from orthonormal in the median; centres are no better known."""
+    rotations = np.stack([camera.c2w[:3, :3] for camera in cameras])
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    return float(np.median(errors))
 
 
 def _duplicate(scene: str, first: _Camera, second: _Camera) -> Finding:

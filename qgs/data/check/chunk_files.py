@@ -16,7 +16,7 @@ from qgs.data.check.conventions import OPENCV
 from qgs.data.check.finding import Finding
 from qgs.data.check.photo import Candidate, Photo
 from qgs.data.chunks.listing import INDEX, SUFFIX, has_chunks, read_index
-from qgs.data.chunks.record import Record, parse_record, stored_intrinsics_faults
+from qgs.data.chunks.record import Record, parse_record, unit_faults
 from qgs.data.chunks.store import load_chunk
 from qgs.data.frames import PhotoFrame, Size
 
@@ -26,11 +26,17 @@ _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
 @dataclass
 class ChunkFolder:
-    """What one folder of chunks holds. keys: of each file that could be read, by its name."""
+    """What one folder of chunks holds.
+
+    index: scene to file name, as index.json has it. keys: scenes of each file that could be read.
+    broken: those of these files with entries that are no scenes.
+    """
 
     split: str
     folder: UPath
+    index: Mapping[str, str] = field(default_factory=dict)
     keys: dict[str, list[str]] = field(default_factory=dict)
+    broken: set[str] = field(default_factory=set)
     candidates: list[Candidate] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
 
@@ -58,11 +64,21 @@ def chunk_folders(path: UPath) -> list[ChunkFolder]:
 
 def _folder(split: str, path: UPath) -> ChunkFolder:
     folder = ChunkFolder(split, path)
+    indexed = _read_index(folder) if (path / INDEX).is_file() else False
     for file in sorted((item for item in path.iterdir() if item.suffix == SUFFIX), key=str):
         _add_chunk(folder, file)
-    if (path / INDEX).is_file():
+    if indexed:
         _compare_index(folder)
     return folder
+
+
+def _read_index(folder: ChunkFolder) -> bool:
+    try:
+        folder.index = read_index(folder.folder / INDEX)
+    except (OSError, ValueError) as error:
+        folder.tell(folder.label(INDEX), str(error), "write it anew: scene to chunk file, in JSON")
+        return False
+    return True
 
 
 def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
@@ -70,19 +86,22 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
     try:
         entries = load_chunk(file)
     except (OSError, ValueError) as error:
-        folder.tell(folder.label(file.name), _reason(error, file), _REPACK)
+        folder.tell(folder.label(file.name), _reason(error, file) + _lost(folder, file), _REPACK)
         return
+    strange = [entry for entry in entries if not _has_key(entry)]
+    if strange:
+        folder.broken.add(file.name)
+        folder.tell(
+            folder.label(file.name),
+            f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the first "
+            f"is a {type(strange[0]).__name__})" + _lost(folder, file),
+            _REPACK,
+        )
     keys = folder.keys[file.name] = []
     for place, entry in enumerate(entries):
-        key = entry.get("key") if isinstance(entry, Mapping) else None
-        if not isinstance(key, str):
-            kind = type(entry).__name__
-            folder.tell(
-                folder.label(file.name),
-                f"entry {place} of {len(entries)} is a {kind}, expected a mapping with a 'key'",
-                _REPACK,
-            )
+        if not _has_key(entry):
             continue
+        key = entry["key"]
         if any(key in held for held in folder.keys.values()):
             folder.tell(
                 key,
@@ -95,22 +114,35 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
         folder.candidates.append(Candidate(key, key, "chunks", OPENCV, photos, folder.split))
 
 
+def _has_key(entry: Any) -> bool:
+    return isinstance(entry, Mapping) and isinstance(entry.get("key"), str)
+
+
+def _lost(folder: ChunkFolder, file: UPath) -> str:
+    """The scenes that a broken file was to hold, in words."""
+    keys = [key for key, name in folder.index.items() if name == file.name]
+    return f"; {INDEX} places there {_listed(keys)}" if keys else ""
+
+
+def _listed(keys: Sequence[str]) -> str:
+    more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
+    return f"{len(keys)} scene{'s' if len(keys) > 1 else ''}: {', '.join(keys[:_SHOWN])}{more}"
+
+
 def _reason(error: Exception, file: UPath) -> str:
-    return " ".join(str(error).replace(f"{file} ", "the file ").split())
+    """What was raised, less the remedy behind the last colon."""
+    told = " ".join(str(error).replace(f"{file} ", "the file ").split())
+    return told.rpartition(": ")[0] or told
 
 
 def _compare_index(folder: ChunkFolder) -> None:
-    try:
-        index = read_index(folder.folder / INDEX)
-    except (OSError, ValueError) as error:
-        folder.tell(folder.label(INDEX), str(error), "write it anew: scene to chunk file, in JSON")
-        return
+    index = folder.index
     files = {item.name for item in folder.folder.iterdir()}
     absent = [name for name in dict.fromkeys(index.values()) if name not in files]
     for name in absent:
         _tell_absent(folder, name, [key for key, file in index.items() if file == name])
     for key, name in index.items():
-        if name in folder.keys and key not in folder.keys[name]:
+        if name in folder.keys and key not in folder.keys[name] and name not in folder.broken:
             folder.tell(
                 key,
                 f"{folder.label(INDEX)} places the scene in {name}, which does not hold it",
@@ -129,11 +161,9 @@ def _compare_index(folder: ChunkFolder) -> None:
 
 
 def _tell_absent(folder: ChunkFolder, name: str, keys: Sequence[str]) -> None:
-    more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
     folder.tell(
         folder.label(name),
-        f"the chunk does not exist; {INDEX} places {len(keys)} scenes there: "
-        f"{', '.join(keys[:_SHOWN])}{more}",
+        f"the chunk does not exist; {INDEX} places there {_listed(keys)}",
         f"download the chunk, or take its scenes out of {INDEX}",
     )
 
@@ -164,7 +194,6 @@ def _photos(file: UPath, place: int) -> list[Photo]:
 def _frames(file: UPath, record: Record, sizes: Sequence[Size] | None) -> Iterator[Photo]:
     for frame in range(len(record)):
         size = sizes[frame] if sizes is not None else None
-        faults = tuple(stored_intrinsics_faults(record, frame)) if size else ()
         height, width = size or (1, 1)
         fx, fy, cx, cy = record.cameras[frame, :4].double().tolist()
         listed = PhotoFrame(
@@ -173,7 +202,7 @@ def _frames(file: UPath, record: Record, sizes: Sequence[Size] | None) -> Iterat
             c2w=_inverse(record.w2c[frame].numpy()),
             intrinsics=(fx * width, fy * height, cx * width, cy * height),
             size=size,
-            faults=faults,
+            faults=tuple(unit_faults(record, frame)),
         )
         yield Photo(listed, partial(_bytes, record, frame))
 

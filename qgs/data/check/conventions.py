@@ -35,6 +35,11 @@ def _from_right_down_forward(pose: np.ndarray) -> np.ndarray:
     return np.stack([pose[:, 1], pose[:, 0], -pose[:, 2], pose[:, 3]], 1)
 
 
+def _turned(pose: np.ndarray) -> np.ndarray:
+    """Half a turn about the camera's y axis."""
+    return pose @ np.diag([-1.0, 1.0, -1.0, 1.0])
+
+
 @dataclass(frozen=True)
 class Misreading:
     """What poses may have been meant as. meant: the OpenCV camera-to-world (4, 4) of a read one."""
@@ -115,6 +120,12 @@ LLFF = Convention(
             "the axes look like (up, right, forward), OpenGL and OpenCV mixed, and LLFF's are "
             "(down, right, back)",
             "negate columns 0 and 2 of every pose",
+        ),
+        "turned": Misreading(
+            _turned,
+            "the axes look like (down, left, forward), OpenGL and OpenCV mixed, and LLFF's are "
+            "(down, right, back)",
+            "negate columns 1 and 2 of every pose",
         ),
         "inverted": Misreading(
             _inverted,

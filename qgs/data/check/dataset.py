@@ -77,7 +77,7 @@ def check(
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
     is no data set at `path`.
     """
-    candidates, general = _candidates(path, options)
+    candidates, general, told = _candidates(path, options)
     if not candidates and not general:
         read_listing(path)  # tells what is missing
     chosen, notes = _geometry_scenes(len(candidates), options)
@@ -95,27 +95,30 @@ def check(
     summaries: list[IndexSummary] = []
     held = _held(scenes)
     for file in dict.fromkeys([*indices, *found_indices(path)]):
-        findings, summary = index_findings(file, held)
+        findings, summary = index_findings(file, held, told)
         general += findings
         summaries += [summary] if summary else []
     return CheckReport(str(path), scenes, general, summaries, len(chosen), notes)
 
 
-def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Finding]]:
+def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Finding], set[str]]:
+    """Scenes, findings about files, and names of scenes that such findings may be about."""
     kind = _kind(path, options.format)
     if kind == "chunks":
         folders = chunk_folders(path)
         return (
             [candidate for folder in folders for candidate in folder.candidates],
             [finding for folder in folders for finding in folder.findings],
+            {key for folder in folders for key in folder.index},
         )
     if kind == "dl3dv":
-        return dl3dv_scenes(path, options.images), []
+        return dl3dv_scenes(path, options.images), [], set()
     wanted = cast(Format, options.format if options.format in READERS else "auto")
     items = list(photo_folders(path, wanted, options.images))
     return (
         [item for item in items if isinstance(item, Candidate)],
         [item for item in items if isinstance(item, Finding)],
+        set(),
     )
 
 

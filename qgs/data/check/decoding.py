@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from qgs.data.check.finding import Finding
 from qgs.data.check.photo import Photo
@@ -49,9 +49,15 @@ def _decode(photo: Photo, headers_only: bool) -> Decoded:
                 image.draft(None, _SMALLEST)
                 image.load()
     except _ERRORS as error:
-        return Decoded(error=str(error) or type(error).__name__)
+        return Decoded(error=_told(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()
     return Decoded(size, digest, mask_error=None if headers_only else _mask_error(photo))
+
+
+def _told(error: Exception) -> str:
+    if isinstance(error, UnidentifiedImageError):
+        return "its header is none of a known image format"
+    return str(error) or type(error).__name__
 
 
 def _mask_error(photo: Photo) -> str | None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from upath import UPath
 
 from qgs.data.check.finding import Finding, spans
 from qgs.data.index import IndexEntry, read_index
-
-_SHOWN = 3
 
 
 @dataclass(frozen=True)
@@ -24,11 +22,14 @@ class Held:
 
 @dataclass(frozen=True)
 class IndexSummary:
-    """An index in numbers. null: scenes that it lists without frames."""
+    """An index in numbers. null: scenes that it lists without frames, which are never judged."""
 
     file: str
     scenes: int
     null: int
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.scenes} scenes, {self.null} of them without frames (null)"
 
 
 def found_indices(path: UPath) -> list[UPath]:
@@ -50,9 +51,12 @@ def _is_index(file: UPath) -> bool:
 
 
 def index_findings(
-    file: UPath, scenes: Mapping[str, Sequence[Held]]
+    file: UPath, scenes: Mapping[str, Sequence[Held]], told: Container[str] = ()
 ) -> tuple[list[Finding], IndexSummary | None]:
-    """What the index names and is not there. The summary is None for a file that is no index."""
+    """What the index names and is not there, less scenes whose absence is `told` already.
+
+    The summary is None for a file that is no index.
+    """
     try:
         index = read_index(str(file))
     except (OSError, ValueError) as error:
@@ -60,21 +64,10 @@ def index_findings(
         return [Finding(str(file.name), str(error), fix)], None
     findings: list[Finding] = []
     for name, entry in index.items():
-        if entry is not None:
+        if entry is not None and (name in scenes or name not in told):
             findings += _entry_findings(file.name, name, entry, scenes.get(name, ()))
-    null = [name for name, entry in index.items() if entry is None]
-    if null:
-        more = f" and {len(null) - _SHOWN} more" if len(null) > _SHOWN else ""
-        findings.append(
-            Finding(
-                file.name,
-                f"{len(null)} of {len(index)} scenes are listed without frames (null) and so are "
-                f"never judged: {', '.join(null[:_SHOWN])}{more}",
-                "nothing if that is meant; else give them context and target frames",
-                severity="warning",
-            )
-        )
-    return findings, IndexSummary(str(file), len(index), len(null))
+    null = sum(entry is None for entry in index.values())
+    return findings, IndexSummary(str(file), len(index), null)
 
 
 def _entry_findings(

@@ -190,27 +190,27 @@ def _sound(record: Record) -> bool:
 def camera_faults(record: Record, frame: int) -> Iterator[Fault]:
     """What is wrong with the camera of a frame."""
     yield from pose_faults(record.w2c[frame].numpy())
-    yield from stored_intrinsics_faults(record, frame)
+    of_unit = list(unit_faults(record, frame))
+    yield from of_unit
+    if not of_unit:
+        height, width = record.image_sizes[frame]
+        fx, fy, cx, cy = record.cameras[frame, :4].tolist()
+        in_pixels = (fx * width, fy * height, cx * width, cy * height)
+        yield from intrinsics_faults(in_pixels, (height, width))
 
 
-def stored_intrinsics_faults(record: Record, frame: int) -> Iterator[Fault]:
-    """What is wrong with the intrinsics of a frame, pixels instead of fractions included."""
+def unit_faults(record: Record, frame: int) -> Iterator[Fault]:
+    """What is wrong with the unit of a frame's intrinsics, fractions of the image's sides."""
     values = record.cameras[frame, :4].tolist()
-    height, width = record.image_sizes[frame]
-    if max(values[:2]) >= _IN_PIXELS:
-        said = ", ".join(f"{value:.6g}" for value in values)
+    focal = max(values[:2])
+    said = ", ".join(f"{value:.6g}" for value in values)
+    if focal >= _IN_PIXELS:
         yield Fault(
             f"the intrinsics ({said}) look like pixels",
             "chunks hold fx and cx divided by the image's width, fy and cy by its height",
         )
-        return
-    if 0 < max(values[:2]) < _DIVIDED_TWICE:
+    elif 0 < focal < _DIVIDED_TWICE:
         yield Fault(
-            f"the intrinsics ({', '.join(f'{value:.6g}' for value in values)}) look divided twice",
+            f"the intrinsics ({said}) look divided twice",
             "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
         )
-        return
-    fx, fy, cx, cy = values
-    yield from intrinsics_faults(
-        (fx * width, fy * height, cx * width, cy * height), (height, width)
-    )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
 import numpy as np
 from upath import UPath
 
@@ -9,6 +12,7 @@ from qgs.data.frames import PhotoFrame
 from qgs.data.readers.listing import IMAGE_SUFFIXES, Listing, image_folder
 
 LISTING = "poses_bounds.npy"
+_FEW = 5
 
 
 def recognises(folder: UPath) -> bool:
@@ -37,9 +41,18 @@ def read(folder: UPath, images: str | None) -> Listing:
     if len(paths) != len(rows):
         raise ValueError(
             f"{file} has {len(rows)} poses, but {photos} has {len(paths)} images: they belong "
-            "together in the order of the names, so give all images and no others"
+            "together in the order of the names{_skipped(paths)}, so give all images and no others"
         )
     return Listing(file, [_frame(path, row) for path, row in zip(paths, rows, strict=True)])
+
+
+def _skipped(paths: Sequence[UPath]) -> str:
+    """Which numbers the names skip, in words; empty where they count on or have no numbers."""
+    numbers = [int(found[0]) for path in paths if (found := re.search(r"\d+$", path.stem))]
+    if len(numbers) < max(2, len(paths)):
+        return ""
+    absent = sorted(set(range(min(numbers), max(numbers))) - set(numbers))
+    return f" (they skip {', '.join(map(str, absent))})" if 0 < len(absent) <= _FEW else ""
 
 
 def _rows(file: UPath) -> np.ndarray:
