@@ -51,7 +51,21 @@ def test_training_ends_with_an_evaluation(run: Path) -> None:
         "evaluation",
         "history.jsonl",
         "recipe.yaml",
+        "state.safetensors",
     }
+
+
+def test_resume_leaves_a_finished_run_and_refuses_another_recipe(run: Path) -> None:
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    sets = [word for setting in SMALL for word in ("--set", setting)]
+    again = qgs("train", RECIPE, "--out", run, "--resume", *sets)
+    assert again.exit_code == 0, again.output
+    words = " ".join(again.output.split())
+    assert "already finished: 2 steps" in words
+    assert "evaluated before" in words
+    other = qgs("train", RECIPE, "--out", run, "--resume", *sets, "--set", "seed=3")
+    assert "seed: 3 here, 0 in the run" in str(other.exception)
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
 def test_eval_gives_the_same_numbers_and_shows_all_methods(run: Path) -> None:

@@ -105,7 +105,7 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
         "tokengs",
         "training.steps=400",
         "training.warmup=300",
-        "training.learning_rate=2.0",
+        "training.learning_rate=0.5",
         "training.initial_divisor=1e5",
         "training.save_every=25",
     )
