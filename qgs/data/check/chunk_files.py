@@ -88,18 +88,11 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
     except (OSError, ValueError) as error:
         folder.tell(folder.label(file.name), _reason(error, file) + _lost(folder, file), _REPACK)
         return
-    strange = [entry for entry in entries if not _has_key(entry)]
-    if strange:
-        folder.broken.add(file.name)
-        folder.tell(
-            folder.label(file.name),
-            f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the first "
-            f"is a {type(strange[0]).__name__})" + _lost(folder, file),
-            _REPACK,
-        )
     keys = folder.keys[file.name] = []
+    strange: list[Any] = []
     for place, entry in enumerate(entries):
         if not _has_key(entry):
+            strange.append(entry)
             continue
         key = entry["key"]
         if any(key in held for held in folder.keys.values()):
@@ -112,6 +105,14 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
         keys.append(key)
         photos = partial(_photos, file, place)
         folder.candidates.append(Candidate(key, key, "chunks", OPENCV, photos, folder.split))
+    if strange:
+        folder.broken.add(file.name)
+        folder.tell(
+            folder.label(file.name),
+            f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the first "
+            f"is a {type(strange[0]).__name__})" + _lost(folder, file),
+            _REPACK,
+        )
 
 
 def _has_key(entry: Any) -> bool:
@@ -120,7 +121,8 @@ def _has_key(entry: Any) -> bool:
 
 def _lost(folder: ChunkFolder, file: UPath) -> str:
     """The scenes that a broken file was to hold, in words."""
-    keys = [key for key, name in folder.index.items() if name == file.name]
+    read = folder.keys.get(file.name, ())
+    keys = [key for key, name in folder.index.items() if name == file.name and key not in read]
     return f"; {INDEX} places there {_listed(keys)}" if keys else ""
 
 
