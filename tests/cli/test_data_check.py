@@ -1,6 +1,6 @@
 import json
 import re
-import subprocess
+import shutil
 
 import numpy as np
 import pytest
@@ -32,8 +32,8 @@ def broken(room):
     """A folder of folders: the sound room, and one with a missing image and markup in its name."""
     path = room.parent / "many"
     path.mkdir()
-    subprocess.run(["cp", "-r", room, path / "sound"], check=True)
-    subprocess.run(["cp", "-r", room, path / "<b>bad"], check=True)
+    shutil.copytree(room, path / "sound")
+    shutil.copytree(room, path / "<b>bad")
     (path / "<b>bad" / "images" / "1.jpg").unlink()
     return path
 
@@ -87,7 +87,7 @@ def test_the_page_needs_no_other_file(broken, tmp_path):
 
 def test_quick_reads_headers_only(room, tmp_path):
     path = tmp_path / "room"
-    subprocess.run(["cp", "-r", room, path], check=True)
+    shutil.copytree(room, path)
     file = path / "images" / "2.jpg"
     file.write_bytes(file.read_bytes()[:-400])
     result = run(path, "--quick")
