@@ -78,7 +78,7 @@ def check(
     """Check the data set at `path`, and evaluation indices: those given and those beside it.
 
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
-    is no data set at `path`.
+    is no data set at `path`, or no file at one of `indices`.
     """
     if path.is_file() and path.suffix in _LISTINGS:
         path = path.parent
@@ -99,7 +99,7 @@ def check(
         )
     summaries: list[IndexSummary] = []
     held = _held(scenes)
-    for file in dict.fromkeys([*indices, *found_indices(path)]):
+    for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         findings, summary = index_findings(file, held, told)
         general += findings
         summaries += [summary] if summary else []

@@ -55,11 +55,11 @@ def index_findings(
 ) -> tuple[list[Finding], IndexSummary | None]:
     """What the index names and is not there, less scenes whose absence is `told` already.
 
-    The summary is None for a file that is no index.
+    The summary is None for a file that is no index. Raises FileNotFoundError without a file.
     """
     try:
         index = read_index(str(file))
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         fix = "correct the file, or get it again"
         return [Finding(str(file.name), str(error), fix)], None
     findings: list[Finding] = []
