@@ -95,4 +95,5 @@ class Copy:
 
     def chunk(self, change) -> None:
         content = torch.load(self.path / "test" / "0.torch", weights_only=True)
-        save(self.path, change(content) or content)
+        changed = change(content)
+        save(self.path, content if changed is None else changed)

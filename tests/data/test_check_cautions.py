@@ -146,3 +146,13 @@ def test_single_files_are_data_sets_too(good):
     assert names(good / "archives" / f"{HASH}.zip") == [HASH]
     assert names(good / "chunks" / "test" / "0.torch") == ["a", "b"]
     assert names(good / "room" / "transforms.json") == ["room"]
+
+
+def test_nothing_passes_in_silence(room, chunks):
+    with pytest.raises(FileNotFoundError, match="holds no chunks: leave --format out"):
+        check(UPath(room.path), Options(format="chunks"))
+    with pytest.raises(FileNotFoundError, match="no evaluation index at"):
+        check(UPath(room.path), Options(geometry=0), [UPath(room.path / "none.json")])
+    chunks.chunk(lambda _: [])
+    (line,) = [line for line in told(chunks.path) if "0.torch: " in line]
+    assert line.startswith("error: test/0.torch: the chunk holds no scene: pack the data set again")

@@ -89,6 +89,8 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
         folder.tell(folder.label(file.name), _reason(error, file) + _lost(folder, file), _REPACK)
         return
     keys = folder.keys[file.name] = []
+    if not entries:
+        folder.tell(folder.label(file.name), "the chunk holds no scene", _REPACK)
     strange: list[Any] = []
     for place, entry in enumerate(entries):
         if not _has_key(entry):

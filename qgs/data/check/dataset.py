@@ -85,6 +85,7 @@ def check(
     candidates, general, told = _candidates(path, options)
     if not candidates and not general:
         read_listing(path, _photo_format(options))  # tells what is missing
+        raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
     chosen, notes = _geometry_scenes(len(candidates), options)
     scenes: list[SceneReport] = []
     for number, candidate in enumerate(candidates):

@@ -76,6 +76,9 @@ def check_scene(
         photos = candidate.photos()
     except (OSError, ValueError) as error:
         return replace(report, findings=[Finding(candidate.name, *_reason_and_fix(error))])
+    if not photos:
+        nothing = Finding(candidate.name, "no photos are listed", "export the scene again")
+        return replace(report, findings=[nothing])
     decoded = decode_all(photos, threads, headers_only)
     return _judged(report, candidate, photos, decoded, with_geometry)
 
