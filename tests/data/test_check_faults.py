@@ -182,6 +182,27 @@ def test_zero_baseline(room, shots):
     ]
 
 
+def far_away(number, pose):
+    """In metres of a map's grid."""
+    pose[:3, 3] += [2e5, 3e5, 100]
+    return pose
+
+
+def test_sound_poses_far_from_the_origin_pass(room):
+    room.poses(far_away)
+    assert told(room.path) == []
+
+
+def test_zero_baseline_far_from_the_origin(room, shots):
+    def moved(number, pose):
+        pose[:3, 3] = shots[2].c2w[:3, 3] if number == 3 else pose[:3, 3]
+        return far_away(number, pose)
+
+    room.poses(moved)
+    (line,) = told(room.path)
+    assert "room, frame 3 (images/3.jpg): the camera stands on the same point as that of" in line
+
+
 def test_all_cameras_on_one_point(chunks):
     def centred(content):
         content[0]["cameras"][:, [9, 13, 17]] = 0
