@@ -43,11 +43,6 @@ class ChunksConfig(SceneSource.Config):
         "min_frames",
     }
 
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {
-        "max_scenes",
-        "min_frames",
-    }
-
     path: str
     holdout: int = Field(default=0, ge=0)
     max_scenes: int = Field(default=0, ge=0)
