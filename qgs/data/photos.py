@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import overload
+from typing import ClassVar, overload
 
 from pydantic import Field
 from upath import UPath
@@ -35,6 +35,8 @@ class PhotosConfig(SceneSource.Config):
     only the first frames of a listing, 0 for all. background: RGB behind transparent pixels.
     depth_unit: world units per number of a depth map (nerfstudio: 0.001, for millimetres).
     """
+
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     path: str
     format: Format = "auto"

@@ -42,6 +42,7 @@ class ChunksConfig(SceneSource.Config):
         "max_scenes",
         "min_frames",
     }
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
     holdout: int = Field(default=0, ge=0)

@@ -37,6 +37,7 @@ class Dl3dvConfig(SceneSource.Config):
         "test_scenes",
         "max_scenes",
     }
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
     images: str | None = None

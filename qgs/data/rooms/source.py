@@ -36,6 +36,7 @@ class RoomsConfig(SceneSource.Config):
     """
 
     undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {"cache_mb"}
+    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
     scenes: int = Field(default=2000, ge=1)
     test_scenes: int = Field(default=32, ge=1)
