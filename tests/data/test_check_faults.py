@@ -12,6 +12,7 @@ from planted import FLIP, FRAMES, HASH, Copy, good_sets, told
 from textured_room import SIZE, walk
 from upath import UPath
 
+from qgs.data.check.chunk_files import chunk_folders
 from qgs.data.check.dataset import Options, check
 
 
@@ -277,6 +278,35 @@ def test_chunk_that_is_no_list_of_mappings(chunks, content, reason):
         f"error: test/0.torch: {reason}; index.json places there 2 scenes: a, b: pack the data set "
         "again with `qgs data pack`, or copy the file again"
     ]
+
+
+class Counted(str):
+    """A string that counts how often any is compared."""
+
+    __slots__ = ()
+    compared = 0
+    __hash__ = str.__hash__
+
+    def __eq__(self, other):
+        Counted.compared += 1
+        return super().__eq__(other)
+
+
+def test_keys_are_looked_up_and_not_searched(tmp_path, monkeypatch):
+    number = 300
+    keys = {f"{n}.torch": Counted(f"scene {n}") for n in range(number)}
+    (tmp_path / "index.json").touch()
+    for name in list(keys)[1:]:
+        (tmp_path / name).touch()
+    module = "qgs.data.check.chunk_files"
+    monkeypatch.setattr(f"{module}.load_chunk", lambda file: [{"key": keys[file.name]}])
+    monkeypatch.setattr(
+        f"{module}.read_index", lambda file: {key: Counted(name) for name, key in keys.items()}
+    )
+    (folder,) = chunk_folders(UPath(tmp_path))
+    assert [finding.scene for finding in folder.findings] == ["0.torch"]
+    assert len(folder.candidates) == number - 1
+    assert Counted.compared < 10 * number
 
 
 def test_archive_that_leads_outside(archives):
