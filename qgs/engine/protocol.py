@@ -24,7 +24,8 @@ class Protocol:
     content: everything that decides a score of given Gaussians, and nothing else: no path, no name
     of a file. That is the data's images and cameras, which views are judged, their poses, the
     metrics, tuning, and the settings that every renderer obeys; not the renderer's type, as all of
-    them render alike, on whichever device. `canonical` is its JSON with sorted keys and no spaces, `sha256` the hash of that.
+    them render alike, on whichever device. `canonical` is its JSON with sorted keys and no
+    spaces, `sha256` the hash of that.
     """
 
     name: str

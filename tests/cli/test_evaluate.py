@@ -126,6 +126,17 @@ def test_different_protocols_compare_only_when_told(
     assert "test/000000" in allowed.output
 
 
+def test_a_comparison_of_incomplete_results_names_what_is_missing(
+    runs: Path, index: Path, tmp_path: Path
+) -> None:
+    outs = [tmp_path / name for name in ("locus", "tokengs")]
+    for out in outs:
+        assert evaluated(runs / out.name, "--index", index, "--out", out).exit_code == 0
+    result = evaluated("--compare", *outs)
+    assert result.exit_code == 0, result.output
+    assert "2 of 3 scenes (missing: absent)" in " ".join(result.output.split())
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
