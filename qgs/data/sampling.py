@@ -183,20 +183,21 @@ def _flipped(images: Tensor) -> Tensor:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size.
-
-    Where only some have masks, the others get masks that are 1 everywhere.
-    """
+    """Stack samples of equal view counts and image size."""
     return Batch(
-        _stack([sample.inputs for sample in samples]),
-        _stack([sample.targets for sample in samples]),
+        stack_views([sample.inputs for sample in samples]),
+        stack_views([sample.targets for sample in samples]),
         tuple(sample.scene for sample in samples),
         tuple(sample.input_frames for sample in samples),
         tuple(sample.target_frames for sample in samples),
     )
 
 
-def _stack(views: Sequence[Views]) -> Views:
+def stack_views(views: Sequence[Views]) -> Views:
+    """Views (B, V) of several (b, V) with equal view counts and image size, on the CPU.
+
+    Where only some have masks, the others get masks that are 1 everywhere.
+    """
     cameras = Cameras(
         torch.cat([v.cameras.c2w for v in views]),
         torch.cat([v.cameras.intrinsics for v in views]),

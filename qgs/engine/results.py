@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from qgs.data.index import GIVEN
 from qgs.io.atomic import write_text
 from qgs.metrics import OPACITY_USED
 
@@ -121,6 +122,7 @@ def notes(evaluation: Evaluation) -> list[str]:
     ):
         if names:
             lines.append(f"{what}, not judged ({len(names)}): {listed(names)}")
+    lines += _about_given(evaluation)
     lines += [f"{HEADERS[m].split()[0]} is empty: {why}" for m, why in evaluation.empty.items()]
     if evaluation.held_out:
         lines.append("judged on {} of {} held-out frames".format(*evaluation.held_out))
@@ -152,6 +154,16 @@ def scenes_csv(evaluation: Evaluation) -> str:
 def _number(evaluation: Evaluation, metric: str, method: str) -> str:
     value = evaluation.mean(metric, method)
     return EMPTY if value is None else f"{value:.{DIGITS[metric]}f}"
+
+
+def _about_given(evaluation: Evaluation) -> Iterable[str]:
+    given = {score.scene: score.given for score in evaluation.scores if score.given}
+    if given:
+        named = [f"{scene} ({' '.join(map(str, frames))})" for scene, frames in given.items()]
+        yield (
+            f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the nearest "
+            f"input view is perfect: {listed(named)}"
+        )
 
 
 def _about_gaussians(evaluation: Evaluation) -> Iterable[str]:

@@ -122,6 +122,31 @@ def test_batches_pass_through_the_model_together(
     assert sizes == [(2, 2), (1, 3), (1, 1)]
 
 
+def test_scenes_with_other_numbers_of_targets_pass_together(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [2]), room1=([0, 4], [1, 2, 3])))
+    model = recipe.build_model()
+    alone = evaluate(model, recipe)
+    sizes = []
+    model.register_forward_hook(lambda module, args, out: sizes.append(len(args[0].images)))
+    together = evaluate(model, recipe, batch=2)
+    assert sizes == [2]
+    for first, second in zip(alone.scores, together.scores, strict=True):
+        assert second.values == pytest.approx(first.values, rel=1e-4, abs=1e-5)
+
+
+def test_frames_that_a_model_is_given_and_judged_on_are_told(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [4, 2, 0]), room1=([0, 4], [2])))
+    evaluation = evaluate(recipe.build_model(), recipe)
+    assert evaluation.summary()["context_and_target"] == {"test/000000": [0, 4]}
+    expected = "1 scene with frames as context and as target"
+    (line,) = (line for line in shown(evaluation).splitlines() if expected in line)
+    assert line.endswith("test/000000 (0 4)")
+
+
 def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     tiny: Callable[..., Recipe], tmp_path: Path
 ) -> None:
