@@ -17,6 +17,7 @@ import qgs
 from qgs.composer import Recipe, resolve
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.atomic import replacing
+from qgs.io.differences import differing_tensors, shapes_of
 from qgs.model import QueryGaussianModel
 
 FORMAT_VERSION = 1
@@ -119,13 +120,7 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
     Raises CheckpointError that lists all differences; `origin` names the source in it.
     """
     own = unique_tensors(model)
-    differences = [f"missing: {name}" for name in own if name not in tensors]
-    differences += [f"unexpected: {name}" for name in tensors if name not in own]
-    differences += [
-        f"shape of {name}: {tuple(tensors[name].shape)} in the file, {tuple(own[name].shape)} here"
-        for name in own
-        if name in tensors and tensors[name].shape != own[name].shape
-    ]
+    differences = differing_tensors(shapes_of(tensors), shapes_of(own))
     if differences:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
@@ -151,7 +146,8 @@ def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
     if _RECIPE not in metadata:
         raise CheckpointError(
             f"{path} is a safetensors file without a qgs recipe; only files written by qgs.save "
-            "or `qgs train` can be loaded"
+            "or `qgs train` can be loaded. If it holds published weights, turn them into a "
+            f"checkpoint: `qgs import {path} --recipe auto --out CHECKPOINT.safetensors`"
         )
     _refuse_newer(path, metadata)
     return metadata

@@ -11,9 +11,8 @@ from torch import Tensor
 from published.files import GoldenFile, GoldenFileError
 from published.recording import model_tensors
 from qgs.components.released import tokengs_recipe
-from qgs.composer import Recipe, resolve
+from qgs.composer import resolve
 from qgs.io.published import from_published
-from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -30,7 +29,9 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
     for options that no recipe stands for.
     """
-    model = _filled(resolve(recipe_of(golden)), golden.weights())
+    recipe = resolve(recipe_of(golden))
+    model = recipe.build_model().eval()
+    model.load_state_dict(from_published(golden.weights(), recipe), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
     return model_tensors(model, Views(golden.input("rgb"), cameras))
 
@@ -58,13 +59,3 @@ def _expect_agreement(golden: GoldenFile, name: str, from_options: Any) -> None:
         raise GoldenFileError(
             f"the metadata contradicts itself: {name} is {stated}, by its options {from_options}"
         )
-
-
-def _filled(recipe: Recipe, weights: dict[str, Tensor]) -> QueryGaussianModel:
-    """The model of `recipe` with published weights; raises ValueError for ones that do not fit."""
-    model = recipe.build_model().eval()
-    try:
-        model.load_state_dict(from_published(weights, recipe), strict=True)
-    except RuntimeError as error:
-        raise GoldenFileError(f"the weights do not fit the options: {error}") from error
-    return model
