@@ -65,7 +65,7 @@ def save(root, content) -> None:
         torch.save(content, file)
 
 
-def told(path, index=(), geometry: int = 0) -> list[str]:
+def told(path, index=(), geometry: int = 1) -> list[str]:
     options = Options(geometry=geometry, threads=2)
     report = check(UPath(path), options, [UPath(file) for file in index])
     return [str(finding) for finding in report.findings]

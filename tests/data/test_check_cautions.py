@@ -5,38 +5,11 @@ import shutil
 
 import pytest
 from PIL import Image
-from planted import FLIP, FRAMES, HASH, Copy, good_sets, told
-from textured_room import SIZE, walk
+from planted import FLIP, FRAMES, HASH, told
+from textured_room import SIZE
 from upath import UPath
 
 from qgs.data.check.dataset import Options, check
-
-
-@pytest.fixture(scope="module")
-def shots():
-    return walk(FRAMES)
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory, shots):
-    root = tmp_path_factory.mktemp("good")
-    good_sets(root, shots)
-    return root
-
-
-@pytest.fixture
-def room(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "room", tmp_path / "room"))
-
-
-@pytest.fixture
-def chunks(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "chunks", tmp_path / "chunks"))
-
-
-@pytest.fixture
-def archives(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "archives", tmp_path / "archives"))
 
 
 def test_image_of_another_scale_than_the_rest(room):
@@ -77,7 +50,7 @@ def test_chunk_that_index_json_names_and_that_is_missing(chunks):
     (chunks.path / "test" / "index.json").write_text(
         '{"a": "0.torch", "c": "1.torch", "d": "0.torch"}'
     )
-    assert told(chunks.path) == [
+    assert told(chunks.path, geometry=0) == [
         "error: test/1.torch: the chunk does not exist; index.json places there 1 scene: c: "
         "download the chunk, or take its scenes out of index.json",
         "error: d: test/index.json places the scene in 0.torch, which does not hold it: take the "
@@ -123,7 +96,7 @@ def test_masks_that_are_missing_or_damaged(room):
             data["frames"][number]["mask_path"] = f"masks/{number}.png"
 
     room.listing(masked)
-    first, second = told(room.path)
+    first, second = told(room.path, geometry=0)
     assert first == (
         "error: room, frame 0 (images/0.jpg): the mask 0.png does not exist: add it, or list no "
         "mask"

@@ -1,46 +1,18 @@
 """Each planted fault is found as exactly one line; the untouched sets pass without any."""
 
 import json
-import shutil
 import zipfile
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from planted import FLIP, FRAMES, HASH, Copy, good_sets, told
-from textured_room import SIZE, walk
+from planted import FLIP, HASH, told
+from textured_room import SIZE
 from upath import UPath
 
 from qgs.data.check.chunk_files import chunk_folders
 from qgs.data.check.dataset import Options, check
-
-
-@pytest.fixture(scope="module")
-def shots():
-    return walk(FRAMES)
-
-
-@pytest.fixture(scope="module")
-def good(tmp_path_factory, shots):
-    root = tmp_path_factory.mktemp("good")
-    good_sets(root, shots)
-    return root
-
-
-@pytest.fixture
-def room(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "room", tmp_path / "room"))
-
-
-@pytest.fixture
-def chunks(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "chunks", tmp_path / "chunks"))
-
-
-@pytest.fixture
-def archives(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "archives", tmp_path / "archives"))
 
 
 @pytest.mark.parametrize("name", ["room", "chunks", "archives"])
@@ -247,7 +219,7 @@ def test_pixels_in_a_chunk(chunks):
 def test_index_scene_that_is_absent(chunks, tmp_path):
     index = tmp_path / "wanted.json"
     index.write_text(json.dumps({"nowhere": {"context": [0], "target": [1]}, "b": None}))
-    assert told(chunks.path, [index]) == [
+    assert told(chunks.path, [index], geometry=0) == [
         "error: nowhere: the index wanted.json names the scene, which is not there: add the scene, "
         "or take it out of the index; correct the name if it is spelled wrong"
     ]
@@ -256,7 +228,7 @@ def test_index_scene_that_is_absent(chunks, tmp_path):
 def test_index_frame_out_of_range(chunks):
     index = {"b": {"context": [0, 2], "target": [3]}}
     (chunks.path / "evaluation.json").write_text(json.dumps(index))
-    assert told(chunks.path) == [
+    assert told(chunks.path, geometry=0) == [
         "error: b, frame 3: the index evaluation.json has the target frame 3, but the scene's 3 "
         "frames are 0 to 2: correct the index, or add the missing frames to the scene"
     ]
