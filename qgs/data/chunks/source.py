@@ -6,7 +6,7 @@ import io
 import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import ClassVar, overload
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from qgs.data.chunks.store import ChunkStore
 from qgs.data.encoded import EncodedFrame, EncodedScene
 from qgs.data.frames import Size
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
+from qgs.data.lazy_scenes import LazyScenes
 from qgs.data.paths import opened_path
 from qgs.types import Cameras
 
@@ -172,7 +173,7 @@ def _check_aspect(record: Record, frame: int, size: tuple[int, int]) -> None:
         )
 
 
-class ChunkScenes(Sequence[Scene]):
+class ChunkScenes(LazyScenes):
     """The scenes of a split, made when they are asked for."""
 
     def __init__(self, store: ChunkStore, files: Mapping[str, UPath], config: ChunksConfig) -> None:
@@ -182,14 +183,9 @@ class ChunkScenes(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._keys)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        key = self._keys[index]
+    def scene(self, place: int) -> ChunkScene:
+        """See `LazyScenes`."""
+        key = self._keys[place]
         return ChunkScene(self._store, self._files[key], key, self._config)
 
     def groups(self) -> list[list[int]]:
