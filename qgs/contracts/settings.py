@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
 
+SsimCovariance: TypeAlias = Literal["population", "sample"]
 Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -90,6 +91,8 @@ class EvaluationConfig(ComponentConfig):
     are positions in the scene's frames, the path is relative to the working directory. protocol: a
     name for these settings in tables, by default the index's file name; what decides the numbers,
     the index's content included, is hashed beside it. metrics: besides PSNR and SSIM.
+    ssim_covariance: population as in Wang et al. 2004, or sample, scikit-image's default, by which
+    pixelSplat's evaluation and those derived from it score.
     lpips_weights: file of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth), None
     for torch's cache. tuning_steps, tuning_rate: token tuning on the input views before each scene
     is judged, with the recipe's photometric loss (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
@@ -101,6 +104,7 @@ class EvaluationConfig(ComponentConfig):
     index: str | None = None
     protocol: str | None = None
     metrics: tuple[Literal["lpips"], ...] = ()
+    ssim_covariance: SsimCovariance = "population"
     lpips_weights: str | None = None
     tuning_steps: int = Field(default=0, ge=0)
     tuning_rate: float = Field(default=1e-4, gt=0)

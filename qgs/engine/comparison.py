@@ -100,7 +100,7 @@ class Comparisons:
             moved = _judged_on_other_frames(first, other)
             if moved and not across_protocols:
                 raise ValueError(_different_frames(first, other, moved))
-        protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
+        protocols = {result.name: _protocol(result) for result in results}
         return cls(protocols, [_compared(first, other) for other in others])
 
     def show(self, console: Console) -> None:
@@ -275,6 +275,12 @@ def _notes(pair: Comparison) -> list[str]:
             f"{listed(pair.other_frames)}"
         )
     return lines
+
+
+def _protocol(result: StoredResults) -> str:
+    text = f"{result.protocol_name}, sha256 {result.sha256}"
+    covariance = result.protocol.get("ssim_covariance", "population")
+    return text if covariance == "population" else f"{text}, SSIM with {covariance} covariance"
 
 
 def _different_protocols(first: StoredResults, other: StoredResults) -> str:

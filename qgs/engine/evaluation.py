@@ -113,7 +113,10 @@ class _Judge:
     @classmethod
     def of(cls, model: QueryGaussianModel, recipe: Recipe) -> _Judge:
         evaluation = recipe.evaluation
-        metrics: dict[str, Metric] = {"psnr": psnr, "ssim": ssim}
+        metrics: dict[str, Metric] = {
+            "psnr": psnr,
+            "ssim": partial(ssim, covariance=evaluation.ssim_covariance),
+        }
         empty: dict[str, str] = {}
         if "lpips" not in evaluation.metrics:
             empty["lpips"] = _NOT_ASKED

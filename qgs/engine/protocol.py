@@ -84,6 +84,7 @@ def protocol_of(
         "views": _indexed(index) if index is not None else _drawn(recipe, scenes),
         "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
         "metrics": {m: IMAGE_METRICS[m] for m in ("psnr", "ssim", *evaluation.metrics)},
+        "ssim_covariance": evaluation.ssim_covariance,
         "tuning": _tuning(recipe),
     }
     return Protocol(evaluation.protocol or _name(evaluation.index), content)

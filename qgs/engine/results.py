@@ -67,6 +67,9 @@ def coverage(evaluation: Evaluation) -> str:
 def score_rows(evaluation: Evaluation) -> list[list[str]]:
     """The table, headers first: a row per method, in it how many scenes it is over."""
     header = ["method", *HEADERS.values(), "scenes"]
+    covariance = evaluation.protocol.content["ssim_covariance"]
+    if covariance != "population":
+        header[header.index(HEADERS["ssim"])] = f"SSIM ({covariance} covariance) ↑"
     rows = [
         [
             method.replace("_", " "),

@@ -22,7 +22,9 @@ from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.rooms import RoomsSource
 from qgs.engine import evaluate
+from qgs.engine.comparison import Comparisons
 from qgs.engine.scores import METHODS, Evaluation
+from qgs.engine.stored import read_results
 from qgs.metrics import mean_colour, nearest_input, psnr, ssim, token_dispersion
 from qgs.metrics.lpips import LpipsUnavailableError
 
@@ -294,6 +296,25 @@ def test_the_table_shows_all_three_and_why_a_column_is_empty(
     for word in ("model", "nearest input", "mean colour", "PSNR", "SSIM", "dispersion"):
         assert word in text
     assert "LPIPS is empty: there are no VGG-16 weights here" in text
+
+
+def test_the_form_of_ssim_is_named_where_it_is_not_the_default(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    plain, sample = tiny("tokengs"), tiny("tokengs", "evaluation.ssim_covariance=sample")
+    model = plain.build_model()
+    evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
+    first, second = (evaluation.mean("ssim", "mean_colour") for evaluation in evaluations)
+    assert 0 < abs(first - second) < 1e-3
+    assert "covariance" not in shown(evaluations[0])
+    assert "SSIM (sample covariance) ↑" in shown(evaluations[1])
+    for name, evaluation in zip("ab", evaluations, strict=True):
+        evaluation.write(tmp_path / name)
+    stored = [read_results(tmp_path / name) for name in "ab"]
+    with pytest.raises(ValueError, match="which differ in ssim_covariance:"):
+        Comparisons.of(stored)
+    text = Comparisons.of(stored, across_protocols=True).markdown()
+    assert text.count("SSIM with sample covariance") == 1
 
 
 def test_lpips_fills_its_column_where_it_can(

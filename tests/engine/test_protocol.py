@@ -75,6 +75,7 @@ def test_the_content_of_the_index_is_hashed(
         "views.scale=distance",
         "views.scale_factor=0.5",
         "evaluation.metrics=[lpips]",
+        "evaluation.ssim_covariance=sample",
         "evaluation.tuning_steps=50",
         "data.fov=[60.0, 70.0]",
         "model.renderer.background=[0.0, 0.0, 0.0]",
