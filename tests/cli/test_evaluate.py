@@ -24,7 +24,7 @@ SMALL = (
 )
 
 
-def evaluated(*words: str | Path) -> Result:
+def evaluated(*words: object) -> Result:
     return CliRunner().invoke(app, ["eval", *(str(word) for word in words)])
 
 

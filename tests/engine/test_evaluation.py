@@ -159,7 +159,7 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     assert evaluation.wanted == ("test/000000", "test/000001", "gone")
     summary = evaluation.summary()
     assert summary["missing"] == {
-        "test/000001": "frames 99 are out of range, it has frames 0 to 7",
+        "test/000001": "frame 99 is out of range, it has frames 0 to 7",
         "gone": "not among the test scenes of the data",
     }
     assert (summary["scenes"], summary["scenes_in_protocol"]) == (1, 3)
@@ -304,7 +304,7 @@ def test_the_form_of_ssim_is_named_where_it_is_not_the_default(
     plain, sample = tiny("tokengs"), tiny("tokengs", "evaluation.ssim_covariance=sample")
     model = plain.build_model()
     evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
-    first, second = (evaluation.mean("ssim", "mean_colour") for evaluation in evaluations)
+    first, second = (e.mean_value("mean_colour_ssim") for e in evaluations)
     assert 0 < abs(first - second) < 1e-3
     assert "covariance" not in shown(evaluations[0])
     assert "SSIM (sample covariance) ↑" in shown(evaluations[1])
