@@ -98,11 +98,25 @@ def test_masks_that_are_missing_or_damaged(room):
     room.listing(masked)
     first, second = told(room.path, geometry=0)
     assert first == (
-        "error: room, frame 0 (images/0.jpg): the mask 0.png does not exist: add it, or list no "
+        "error: room, frame 0 (images/0.jpg): its mask does not exist in masks: add it, or list no "
         "mask"
     )
     assert second.startswith("error: room, frame 1 (images/1.jpg): ")
     assert "1.png cannot be read as the mask of a photo" in second
+
+
+def test_many_missing_masks_are_one_line_that_names_no_single_one(room):
+    room.listing(
+        lambda data: [
+            frame.update(mask_path=frame["file_path"].replace("images", "masks"))
+            for frame in data["frames"]
+        ]
+    )
+    (line,) = told(room.path, geometry=0)
+    assert line == (
+        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): its mask does not exist in masks: "
+        "add it, or list no mask"
+    )
 
 
 def test_other_data_sets_beside_scenes_are_named(room, chunks, tmp_path):

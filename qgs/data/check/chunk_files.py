@@ -19,6 +19,7 @@ from qgs.data.chunks.listing import INDEX, SUFFIX, has_chunks, read_index
 from qgs.data.chunks.record import Record, parse_record, unit_faults
 from qgs.data.chunks.store import load_chunk
 from qgs.data.frames import PhotoFrame, Size
+from qgs.data.wording import a_type
 
 _SHOWN = 3
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
@@ -120,7 +121,7 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
         folder.tell(
             folder.label(file.name),
             f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the first "
-            f"is a {type(strange[0]).__name__})" + _lost(folder, file),
+            f"is {a_type(strange[0])})" + _lost(folder, file),
             _REPACK,
         )
 
