@@ -83,9 +83,11 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
 
 
 def curves_of(folder: RunFolder) -> Curves:
-    """The history of a run."""
-    history = folder.history()
-    return Curves(*([record[key] for record in history] for key in ("seconds", "loss", "psnr")))
+    """The history of a run, but for steps that were skipped."""
+    names = ("seconds", "loss", "psnr")
+    records = (record for record in folder.history() if not record.get("skipped"))
+    history = [record for record in records if record.keys() >= set(names)]
+    return Curves(*([record[name] for record in history] for name in names))
 
 
 def mean_of(evaluation: Evaluation, metric: str, method: str = "model") -> float:
