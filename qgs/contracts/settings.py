@@ -16,11 +16,12 @@ class ViewsConfig(ComponentConfig):
     """How views are drawn from a scene and brought into the model's frame (TokenGS release).
 
     inputs, targets: views per sample. gap: [min, max] frames between the first and the last input
-    frame, both ends included; it shrinks to what a scene has. The other inputs lie between, targets
-    are drawn from the same span. frame: the camera that becomes the identity. scale: "constant"
-    multiplies translations by `scale_factor`; "distance" divides them by the largest distance from
-    the first input camera to another one, then multiplies by `scale_factor`. mirror: probability of
-    mirroring a training sample in x.
+    frame, both ends included; it shrinks to what a scene has, and where that is below min, the
+    scene is named in a warning. The other inputs lie between, targets are drawn from the same span.
+    frame: the camera that becomes the identity. scale: "constant" multiplies translations by
+    `scale_factor`; "distance" divides them by the largest distance from the first input camera to
+    another one, then multiplies by `scale_factor`. mirror: probability of mirroring a training
+    sample in x.
     """
 
     inputs: int = Field(default=4, ge=1)
