@@ -53,7 +53,8 @@ def show(evaluation: Evaluation, console: Console) -> None:
 
 def statement(evaluation: Evaluation) -> str:
     """The model's PSNR and over how many scenes, in one line."""
-    line = f"PSNR {_number(evaluation, 'psnr', 'model')} over {coverage(evaluation)} scenes"
+    scenes = "scene" if len(evaluation.wanted) == 1 else "scenes"
+    line = f"PSNR {_number(evaluation, 'psnr', 'model')} over {coverage(evaluation)} {scenes}"
     missing = [failure.scene for failure in evaluation.missing]
     return f"{line}; missing: {listed(missing)}" if missing else line
 
@@ -194,7 +195,7 @@ def _about_protocol(evaluation: Evaluation) -> str:
     counts = sorted({len(inputs) for score in evaluation.scores for inputs, _ in score.views})
     return (
         f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
-        f"input views of {width}x{height} pixels (width x height), poses {poses['frame']}, scale "
+        f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
         f"{poses['scale']} {poses['scale_factor']}"
     )
 

@@ -8,6 +8,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,9 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     assert summary["null_entries"] == ["nil"]
     assert len(summary["not_in_index"]) == 30
     evaluation.write(tmp_path)
+    whole = replace(evaluation, wanted=evaluation.wanted[:1], missing=())
+    assert whole.summary()["statement"].endswith(" over 1 scene")
+    assert "input views of 32 x 32 pixels, poses" in shown(evaluation)
     line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
     table = (tmp_path / "table.md").read_text()
     for text in (shown(evaluation), table, summary["statement"]):
