@@ -15,7 +15,6 @@ from torch import Generator, Tensor
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Queries
-from qgs.contracts.queries import GROWTH_NOISE
 from qgs.engine import train
 from qgs.engine.initial import initialise
 from qgs.io.checkpoint import CheckpointError, save
@@ -25,6 +24,7 @@ from qgs.model import QueryGaussianModel
 
 Tiny = Callable[..., Recipe]
 COUNT = 24
+GROWTH_NOISE = 0.01  # LocusGS release
 PER_QUERY = {"tokengs": ["features"], "locus": ["features", "center", "raw_radius"]}
 
 

@@ -133,9 +133,9 @@ OPTIONS_THAT_FIT = [
     ("model.queries.count=13", "model.queries.count: 12 (the recipe has 13)"),
     ("model.encoder.depth=3", "model.encoder.depth: 1 (the recipe has 3)"),
     ("model.encoder.patch_size=4", "model.encoder.patch_size: 8 (the recipe has 4)"),
-    ("model.encoder.mlp_ratio=2", "model.encoder.mlp_ratio: 4 (the recipe has 2)"),
+    ("model.encoder.mlp_ratio=2", "model.encoder.mlp_ratio: 4.0 (the recipe has 2.0)"),
     ("model.decoder.depth=3", "model.decoder.depth: 2 (the recipe has 3)"),
-    ("model.decoder.feed_forward.ratio=2", "model.decoder.feed_forward.ratio: 4"),
+    ("model.decoder.feed_forward.ratio=2", "model.decoder.feed_forward.ratio: 4.0"),
     ("model.head.gaussians_per_query=5", "model.head.gaussians_per_query: 4"),
     (
         "model.decoder.cross_attention={type: qgs/content}",
@@ -298,6 +298,14 @@ def test_one_prefix_of_all_names_is_taken_off(
     done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
     assert done.notes == (f"took {prefix!r} off all {len(weights)} names",)
     assert done.used == 109
+
+
+def test_the_recipe_that_fits_names_types_first_and_its_losses(
+    imported: Callable[..., Path],
+) -> None:
+    text = imported("locus_full_a").with_suffix(".yaml").read_text(encoding="utf-8")
+    assert "queries:\n    type: locus/anchored\n    count: 12\n" in text
+    assert "#   losses: photometric, visibility, and anchor visibility" in text
 
 
 def test_one_stray_key_is_told_as_one(imported: Callable[..., Path]) -> None:

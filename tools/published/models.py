@@ -12,6 +12,7 @@ from published.files import GoldenFile, GoldenFileError
 from published.recording import model_tensors
 from qgs.components.released import tokengs_recipe
 from qgs.composer import resolve
+from qgs.contracts.layout import real_ratio
 from qgs.io.published import from_published
 from qgs.types import Cameras, Views
 
@@ -42,14 +43,14 @@ def recipe_of(golden: GoldenFile) -> dict[str, Any]:
     if not isinstance(kind, str) or kind not in RECIPES:
         raise GoldenFileError(f"the kind of model is {kind!r}; known are {', '.join(RECIPES)}")
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
-    recipe = RECIPES[kind](golden.config.get("options", {}) | constants)
+    recipe = RECIPES[kind](golden.options("options", constants))
     model = recipe["model"]
     _expect_agreement(golden, "gaussians_per_token", model["head"]["gaussians_per_query"])
     _expect_agreement(golden, "anchor_radius_min", model["queries"].get("radius_min"))
     weights = golden.weights()
     if DECODER_MLP in weights:  # the releases have no option for it
         hidden, width = weights[DECODER_MLP].shape
-        model["decoder"]["feed_forward"] = {"ratio": hidden // width}
+        model["decoder"]["feed_forward"] = {"ratio": real_ratio(hidden, width, DECODER_MLP)}
     return recipe
 
 
