@@ -69,3 +69,12 @@ def test_files_of_no_format_are_told(tmp_path):
     (tmp_path / "transforms.txt").write_text("{}")
     with pytest.raises(FileNotFoundError, match=r"no transforms\.json nor another listing"):
         PhotosSource(photos_config(recipe(type="qgs/rooms"), str(tmp_path)))
+
+
+def test_a_recipe_without_data_takes_the_size_that_is_given(scene):
+    imported = resolve({"recipe": 1, "model": MODEL})
+    with pytest.raises(ValueError, match="such as --size 256x256"):
+        photos_config(imported, str(scene))
+    for source in (imported, recipe(type="qgs/rooms"), recipe(type="qgs/photos", path=str(scene))):
+        opened = only_scene(PhotosSource(photos_config(source, str(scene), (8, 24))), str(scene))
+        assert opened.images([2]).shape == (1, 3, 8, 24)
