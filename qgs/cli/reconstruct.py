@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Scene
-    from qgs.data.photos import PhotosConfig, PhotosSource
+    from qgs.data.photos import PhotosConfig
     from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
     from qgs.types import Gaussians
@@ -121,14 +120,6 @@ def tuned(
         "loss_after": tuning.losses[-1],
     }
     return tuning.prediction.gaussians, record
-
-
-def only_scene(source: PhotosSource, photos: str) -> Scene:
-    """The scene of `source`. Raises ValueError when there are several."""
-    scenes = source.scenes("test")
-    if len(scenes) > 1:
-        raise ValueError(f"{photos} holds {len(scenes)} scenes: give the folder of one of them")
-    return scenes[0]
 
 
 def photos_config(recipe: Recipe, photos: str, size: tuple[int, int] | None = None) -> PhotosConfig:
