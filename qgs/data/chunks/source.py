@@ -33,6 +33,7 @@ class ChunksConfig(SceneSource.Config):
     """Options of `qgs/chunks`.
 
     path: folder or fsspec URL that holds train/ and test/, relative to the working directory.
+    Chunks at a URL are read whole, by every process and worker; copy them to a local disk to train.
     holdout: every n-th frame of each scene is kept for evaluation, from frame n // 2 on; 0 for
     those that `qgs data pack` took over from its source, none in other chunks. max_scenes: only the
     first scenes of each split, 0 for all. min_frames: scenes with fewer frames are left out, which
