@@ -103,8 +103,8 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
 ) -> None:
     recipe = tiny(
         "tokengs",
-        "training.steps=400",
-        "training.warmup=300",
+        "training.steps=300",
+        "training.warmup=150",
         "training.learning_rate=0.5",
         "training.initial_divisor=1e5",
         "training.save_every=25",
