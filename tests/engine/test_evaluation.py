@@ -169,7 +169,7 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     evaluation.write(tmp_path)
     whole = replace(evaluation, wanted=evaluation.wanted[:1], missing=())
     assert whole.summary()["statement"].endswith(" over 1 scene")
-    assert "input views of 32 x 32 pixels, poses" in shown(evaluation)
+    assert "input views of 16 x 16 pixels, poses" in shown(evaluation)
     line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
     table = (tmp_path / "table.md").read_text()
     for text in (shown(evaluation), table, summary["statement"]):
