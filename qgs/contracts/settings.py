@@ -52,7 +52,8 @@ class TrainingConfig(ComponentConfig):
     step and process. accumulate: batches per optimiser step. learning_rate: peak of the one-cycle
     cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
     final_divisor: first rate over last rate (torch's OneCycleLR). clip: gradient norm. precision:
-    autocast dtype. save_every: steps between checkpoints, 0 for never but at the end.
+    autocast dtype. save_every: steps between checkpoints, 0 for
+    none but at the end and before evaluations.
     collapse_window: steps of background-only output after which training stops. workers: processes
     that decode data, 0 for a thread of this one. render_views: target views rendered at a time, 0
     for all; bounds memory and changes no gradient. ema: decay of an exponential moving average of
