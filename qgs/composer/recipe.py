@@ -123,19 +123,17 @@ def _check_components(
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
     context = RecipeContext(dims, size)
     parts = {
-        path: chosen if chosen and _check_options(chosen, context, registry, problems) else None
+        path: chosen if chosen and _check_options(chosen, context, problems) else None
         for path, chosen in parts.items()
     }
     decoded = decoded_layers(parts["model", "supervision"], depth)
     check_flow(list(execution_order(parts, depth, decoded)), registry, problems)
 
 
-def _check_options(
-    chosen: Chosen, context: RecipeContext, registry: Registry, problems: Problems
-) -> bool:
+def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
     """Report what is wrong with a component's options; whether the component could be asked."""
     try:
-        found = check_declarations(chosen, context, registry)
+        found = check_declarations(chosen, context)
     except PluginError as error:
         problems.add(chosen.place.origin, chosen.written_at, error.reason, error.fix)
         return False
