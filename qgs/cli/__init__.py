@@ -7,7 +7,17 @@ import sys
 
 import typer
 
-from qgs.cli import bench, data, demo, evaluate, inspect, reconstruct, train, weights
+from qgs.cli import (
+    bench,
+    data,
+    demo,
+    evaluate,
+    inspect,
+    new_plugin,
+    reconstruct,
+    train,
+    weights,
+)
 
 app = typer.Typer(
     name="qgs",
@@ -17,7 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _group in (inspect, train, evaluate, reconstruct, weights, data, bench, demo):
+for _group in (inspect, train, evaluate, reconstruct, weights, data, bench, demo, new_plugin):
     _group.register(app)
 
 
