@@ -96,9 +96,13 @@ def test_nothing_is_overwritten(kind: str, tmp_path: Path) -> None:
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), new_folder(tmp_path / "a" / "new") as fresh:
-        (fresh / "half").write_text("")
-        raise RuntimeError
+    def fail_halfway() -> None:
+        with new_folder(tmp_path / "a" / "new") as fresh:
+            (fresh / "half").write_text("")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_halfway()
     assert list((tmp_path / "a").iterdir()) == []
 
 
