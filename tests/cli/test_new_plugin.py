@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from qgs.cli import app
 from qgs.cli.new_plugin import check_name, rendered
+from qgs.contracts import ModelDims
 from qgs.io.atomic import new_folder
+from qgs.types import ImageMemory, QueryState
 
 
 @pytest.fixture(autouse=True)
@@ -49,6 +55,14 @@ def test_component_and_test_are_short() -> None:
         if path.endswith(".py"):
             ast.parse(text)
             assert max(map(len, text.splitlines())) <= 100
+
+
+def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
+    CliRunner().invoke(app, ["new-plugin", "tidy"])
+    for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
+        ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
+        done = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("name", ["a", "wide", "far-sighted", "far_sighted", "view2d"])
@@ -118,3 +132,20 @@ def test_a_new_folder_has_the_usual_permissions(tmp_path: Path) -> None:
         pass
     modes = {os.stat(tmp_path / name).st_mode for name in ("usual", "new")}
     assert len(modes) == 1
+
+
+@pytest.mark.parametrize("sink", [-0.5, 1.5])
+def test_its_component_computes_its_formula(sink: float) -> None:
+    (source,) = [text for path, text in rendered("mine") if path.name == "abstaining.py"]
+    names: dict = {}
+    exec(source, names)
+    attention = names["AbstainingAttention"]
+    torch.manual_seed(0)
+    module = attention(attention.Config(sink_init=sink), ModelDims(16, 2, 1))
+    state = QueryState(torch.randn(2, 3, 16))
+    keys, values = torch.randn(2, 2, 2, 6, 8)
+    memory = ImageMemory(keys, values, torch.randn(2, 6, 16), torch.randn(2, 6, 6), (1, 2, 3))
+    logits = module.core.project(state.features) @ keys.transpose(-1, -2) / 8**0.5
+    read = logits.exp() @ values / (math.exp(sink) + logits.exp().sum(-1, keepdim=True))
+    expected = module.core.out_proj(read.transpose(1, 2).flatten(2))
+    torch.testing.assert_close(module(state, memory), expected)

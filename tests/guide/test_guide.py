@@ -81,10 +81,11 @@ def test_the_tutorial_shows_what_new_plugin_writes() -> None:
     assert blocks("plugin.md", "toml").popitem()[1] in written["pyproject.toml"]
 
 
-def test_the_tutorials_components_are_short() -> None:
+def test_the_tutorials_components_and_their_test_are_short() -> None:
     blocks_of = blocks("plugin.md", "python")
     assert len(blocks_of["new: src/qgs_sightline/frustum.py"].splitlines()) < 50
     assert len(blocks_of["src/qgs_sightline/abstaining.py"].splitlines()) < 50
+    assert len(blocks_of["change: tests/test_components.py"].splitlines()) < 10
 
 
 def test_every_reference_to_code_exists() -> None:
