@@ -27,6 +27,7 @@ from qgs.contracts import (
     EvaluationConfig,
     Loss,
     ModelDims,
+    Plugin,
     RecipeContext,
     SceneSource,
     SceneSourceConfig,
@@ -80,11 +81,17 @@ class Recipe:
         return build_plain(self.parts["data",])
 
 
-def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+def resolve(
+    recipe: str | FilePath | Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    plugins: Sequence[Plugin] = (),
+) -> Recipe:
     """Read, merge and check a recipe.
 
     recipe: path of a YAML file, or a mapping of the same form, whose `extends` is relative to the
         working directory. overrides: `a.b=value`, laid over it in order.
+    plugins: what the recipe may name besides the plugins that are installed, such as one under
+        test.
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
@@ -93,7 +100,7 @@ def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str]
     problems.raise_if_stopped()
     tree = _with_default_losses(tree)
     settings = decode_settings(tree, problems)
-    registry = load_plugins(tree, problems)
+    registry = load_plugins(tree, problems, plugins)
     places = expand(tree, settings.decoder.depth, problems)
     places = apply_swaps(tree.child_map("swap"), places, problems)
     parts = decode_places(places, registry, problems)

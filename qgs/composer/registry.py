@@ -91,6 +91,11 @@ def builtin() -> InstalledPlugin:
     return InstalledPlugin(BUILTIN, "qgs", qgs.__version__)
 
 
+def not_installed(plugin: Plugin) -> InstalledPlugin:
+    """A plugin that came with no distribution."""
+    return InstalledPlugin(plugin, "no distribution", "0")
+
+
 def available_plugins() -> dict[str, list[EntryPoint]]:
     """Name to entry points of every installed plugin, by metadata alone."""
     found: dict[str, list[EntryPoint]] = {}
