@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from qgs.composer.slots import SLOTS
 from qgs.testing import CHECKS
 
@@ -24,10 +26,17 @@ def check_list() -> str:
     """The whole page, Markdown."""
     rows = ["| check | tier | slots | what it checks |", "|---|---|---|---|"]
     for check in CHECKS.values():
-        named = [f"`{slot}`" for slot in SLOTS if slot in check.slots]
-        slots = "all" if len(named) == len(SLOTS) else ", ".join(named)
+        slots = _slots_in_words(check.slots)
         rows.append(f"| `{check.name}` | {check.tier} | {slots} | {check.contract} |")
     return INTRODUCTION + "\n".join(rows) + "\n"
+
+
+def _slots_in_words(slots: Collection[str]) -> str:
+    named = [f"`{slot}`" for slot in SLOTS if slot in slots]
+    others = [f"`{slot}`" for slot in SLOTS if slot not in slots]
+    if len(others) < len(named):
+        return f"all but {', '.join(others)}" if others else "all"
+    return ", ".join(named)
 
 
 if __name__ == "__main__":
