@@ -62,3 +62,9 @@ def test_a_broken_plugin_beside_it_harms_nobody(fresh: FreshEnvironment, plugin:
     refused = fresh.run("! qgs compose qgs-broken/recipe.yaml", workshop)
     assert "recipe.yaml:3: plugins.0" in refused
     assert "qgs-broken 0.1.0" in refused
+
+
+def test_locus_passes_the_check_of_the_command_line(
+    fresh: FreshEnvironment, tmp_path: Path
+) -> None:
+    assert "locus/ray_biased" in fresh.run("qgs check-plugin locus", tmp_path)
