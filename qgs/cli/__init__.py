@@ -9,6 +9,7 @@ import typer
 
 from qgs.cli import (
     bench,
+    check_plugin,
     data,
     demo,
     evaluate,
@@ -27,7 +28,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _group in (inspect, train, evaluate, reconstruct, weights, data, bench, demo, new_plugin):
+for _group in (
+    inspect,
+    train,
+    evaluate,
+    reconstruct,
+    weights,
+    data,
+    bench,
+    demo,
+    new_plugin,
+    check_plugin,
+):
     _group.register(app)
 
 

@@ -28,7 +28,7 @@ VARIED = (
 def check_sizes_vary(case: Case) -> None:
     """One instance takes any number of scenes, queries and views, and gives the shapes it must."""
     module = case.lively()
-    for sizes in (*VARIED, Sizes(image=case.size[::-1])):
+    for sizes in (*VARIED, Sizes(image=(case.size[1], case.size[0]))):
         if sizes.image and case.slot == "encoder" and case.problems(sizes.image):
             continue  # the component refuses these images, and says so
         outputs = module(*inputs_of(case, sizes).values())
