@@ -28,18 +28,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _group in (
-    inspect,
-    train,
-    evaluate,
-    reconstruct,
-    weights,
-    data,
-    bench,
-    demo,
-    new_plugin,
-    check_plugin,
-):
+_RECIPES = (inspect, train, evaluate, reconstruct, weights, data, bench, demo)
+_PLUGINS = (new_plugin, check_plugin)
+for _group in (*_RECIPES, *_PLUGINS):
     _group.register(app)
 
 

@@ -54,6 +54,7 @@ MUTANTS: dict[str, tuple[type[Component], dict, str]] = {
     "head_gives_gaussians": (modules.LongQuaternions, {}, "quaternions are 2"),
     "queries_are_shared_by_scenes": (modules.TellsScenesApart, {"count": 6}, "scene 1 of 3"),
     "queries_resize": (modules.NeverResizes, {"count": 6}, "cannot be loaded"),
+    "scenes_repeat": (pictures.NeverTheSame, {"image_size": (16, 24)}, "scene 0 is"),
     "supervision_weights": (pictures.WeighsTwice, {"layers": (1, 2)}, "weights sum to 2"),
     "no_gaussians_give_the_background": (pictures.HasItsOwnBackground, {}, "not the background"),
     "rendering_is_over_the_background": (pictures.MisstatesAlpha, {}, "the background shows"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from qgs.composer.providers import variants
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.recording import recorded
@@ -11,7 +12,7 @@ from qgs.testing.registry import STATEFUL, check
 from qgs.testing.subjects import inputs_of
 from qgs.types import QueryState
 
-UNRELATED = ("unrelated.place", "unrelated.weight")
+UNRELATED: tuple[str, ...] = ("unrelated.place", "unrelated.weight")
 
 
 @check(STATEFUL)
@@ -35,19 +36,13 @@ def _temptations(case: Case) -> dict[str, int]:
 
     Those that its class requires or provides with any other options, and a few of no meaning.
     """
-    fields = dict.fromkeys(UNRELATED, 3)
-    for config in (case.config, *_variants(case)):
+    fields: dict[str, int] = dict.fromkeys(UNRELATED, 3)
+    for config in (case.config, *(config for *_, config in variants(case.config))):
         for declare in (case.component.requires, case.component.provides):
             for name, spec in declare(config).items():
                 size = spec.shape[-1] if spec.shape else 1
                 fields[name] = size if isinstance(size, int) else 1
     return fields
-
-
-def _variants(case: Case) -> list:
-    from qgs.composer.providers import _variants as variants
-
-    return [config for _, _, config in variants(case.config)]
 
 
 def _fields_read(case: Case, others: dict[str, int]) -> set[str]:

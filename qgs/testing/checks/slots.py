@@ -8,10 +8,10 @@ import torch
 
 from qgs.contracts import Loss
 from qgs.testing.case import Case
-from qgs.testing.faults import expect
+from qgs.testing.faults import CannotCheck, expect
 from qgs.testing.registry import check
 from qgs.testing.subjects import inputs_of
-from qgs.testing.trees import distance, mapped, not_finite, tracked
+from qgs.testing.trees import described, difference, distance, mapped, not_finite, tracked
 
 LOGITS = (1.0, 100.0)
 """Factors on the features that a head must turn into valid Gaussians."""
@@ -78,6 +78,26 @@ def check_supervision_weights(case: Case) -> None:
     expect(known and bool(layers), f"of {case.dims.depth} layers it supervises {layers}")
     expect(min(weights.values()) >= 0, f"weights are {weights}")
     expect(abs(sum(weights.values()) - 1) < 1e-6, f"weights sum to {sum(weights.values()):g}")
+
+
+@check({"data"})
+def check_scenes_repeat(case: Case) -> None:
+    """A scene is the same each time: names, cameras, and images of the delivered size in [0, 1]."""
+    try:
+        first, second = (case.build().scenes("train")[0] for _ in range(2))
+    except FileNotFoundError as error:
+        raise CannotCheck(f"the data of this case is not here: {error}") from error
+    expect(first.name == second.name, f"scene 0 is `{first.name}`, then `{second.name}`")
+    frames = list(range(min(2, len(first))))
+    images = first.images(frames)
+    wanted = (len(frames), 3, *first.cameras.size)
+    expect(tuple(images.shape) == wanted, f"images are {described(images)}, not {wanted}")
+    low, high = images.min().item(), images.max().item()
+    expect(images.dtype == torch.float32, f"images are {described(images)}, not float32")
+    expect(low >= 0 and high <= 1, f"images are in [{low:.3g}, {high:.3g}]")
+    found = difference(first.cameras, second.cameras)
+    found = found or difference(images, second.images(frames))
+    expect(not found, f"opened again, {found}")
 
 
 @check({"renderer"})
