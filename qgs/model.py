@@ -109,9 +109,8 @@ class QueryGaussianModel(nn.Module):
 
         layers, state: see `predict`; by default the scenes start from the learned queries.
         """
-        if state is None:
-            state = self.queries(views.images.shape[0])
-        return self.predict(self.encoder(views), state, layers)
+        initial = self.queries(views.images.shape[0]) if state is None else state
+        return self.predict(self.encoder(views), initial, layers)
 
     def predict(
         self, memory: ImageMemory, state: QueryState, layers: Collection[int] | None = None

@@ -5,7 +5,8 @@
 A file of a model: the model is composed from the options in the file's metadata, given the file's
 weights and run on its photos. A file of losses: the loss components are run on its tensors. Every
 tensor of the file is compared but inputs and weights, one row for each. Exit status 1 if any is
-beyond rtol 1e-4 + atol 5e-5, has no counterpart here, or cannot be computed.
+beyond rtol 1e-4 + atol 5e-5, has no counterpart here, or cannot be computed. Options of the file
+that are unknown here are listed below its table.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 from pathlib import Path
 
 from published.comparison import ATOL, RTOL, Row, compare, table
-from published.files import GoldenFileError, read_golden
+from published.files import GoldenFile, GoldenFileError, read_golden
 from published.losses import loss_tensors
 from published.models import golden_tensors
 
@@ -25,7 +26,11 @@ def rows_of(path: Path) -> list[Row]:
 
     Raises ValueError for a file that says or holds something which cannot be computed here.
     """
-    golden = read_golden(path)
+    return compared(read_golden(path))
+
+
+def compared(golden: GoldenFile) -> list[Row]:
+    """The rows of a file that has been read; raises as `rows_of` does."""
     found = loss_tensors(golden) if golden.is_of_losses else golden_tensors(golden)
     expected = golden.expected()
     if not expected:
@@ -37,12 +42,15 @@ def report(path: Path) -> bool:
     """Print the table of one file; whether all of it passed."""
     print(path)
     try:
-        rows = rows_of(path)
+        golden = read_golden(path)
+        rows = compared(golden)
     except (ValueError, RuntimeError) as error:
         print(f"FAIL  {error}\n")
         return False
     failed = sum(bool(row.problem) for row in rows)
     print(*table(rows), sep="\n")
+    if unknown := golden.unknown_options():
+        print(f"options that nothing here reads: {', '.join(unknown)}")
     print(f"{len(rows)} tensors, {failed} failed\n")
     return not failed
 

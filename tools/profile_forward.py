@@ -16,7 +16,7 @@ import qgs  # first: it asks for huge pages before torch allocates
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from qgs.cli.bench import parse_size
+from qgs.cli.options import parse_size
 from qgs.composer import resolve
 from qgs.engine.bench import workload_of
 

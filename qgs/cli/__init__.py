@@ -46,9 +46,15 @@ def main() -> None:
             raise
         if os.environ.get("QGS_DEBUG"):
             raise
-        print(f"error: {error}", file=sys.stderr)
+        for line in (f"error: {error}", *_notes(error)):
+            print(line, file=sys.stderr)
         print("(QGS_DEBUG=1 shows where it was raised)", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _notes(error: Exception) -> list[str]:
+    """What was added to the message, but for traces of other processes."""
+    return [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
 
 
 def _is_a_users_mistake(error: Exception) -> bool:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from qgs.cli.options import Device, Overrides, Threads, use_threads
+from qgs.cli.options import Device, Overrides, Threads, parse_size, use_threads
 
 
 def register(app: typer.Typer) -> None:
@@ -80,13 +79,3 @@ def bench(
     if json is not None:
         report.write(json)
         console.print(f"written to {json}")
-
-
-def parse_size(text: str | None) -> tuple[int, int] | None:
-    """(H, W) of "HxW"; raises ValueError for anything else."""
-    if text is None:
-        return None
-    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
-    if match is None:
-        raise ValueError(f"--size must be HxW in pixels, such as 256x448, got {text!r}")
-    return int(match[1]), int(match[2])

@@ -41,10 +41,15 @@ def bench_tables(report: Report) -> list[Table]:
 
 
 def short_names(paths: Sequence[str]) -> list[str]:
-    """Paths without the folders that all of them share, and without their suffix."""
+    """Paths without the folders that all of them share, and without their suffix.
+
+    A path that comes again is numbered.
+    """
     files = [Path(os.path.abspath(path)) for path in paths]
     shared = os.path.commonpath([file.parent for file in files])
-    return [file.relative_to(shared).with_suffix("").as_posix() for file in files]
+    names = [file.relative_to(shared).with_suffix("").as_posix() for file in files]
+    before = [names[:index].count(name) for index, name in enumerate(names)]
+    return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
 def _table(title: str, headers: Sequence[str]) -> Table:
@@ -75,7 +80,7 @@ def _models(report: Report, names: Sequence[str]) -> Table:
 def _seconds(report: Report, names: Sequence[str], operation: Operation) -> Table:
     base = report.results[0].times[operation]
     unit, scale = ("s", 1.0) if base.median >= 10 else ("ms", 1000.0)
-    headers = (f"median, {unit}", "quartiles", "ratio", "quartiles")
+    headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")
     table = _table(CALLED[operation], headers)
     for name, result in zip(names, report.results, strict=True):
         spread = result.times[operation]

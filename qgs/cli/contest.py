@@ -69,8 +69,8 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
     contender = Contender(
         name=name,
         model=result.model.cpu(),
-        psnr=evaluation.mean("psnr"),
-        ssim=evaluation.mean("ssim"),
+        psnr=mean_of(evaluation, "psnr"),
+        ssim=mean_of(evaluation, "ssim"),
         dispersion_mean=dispersion["mean"]["mean"],
         dispersion_median=dispersion["median"]["median"],
         gaussians=evaluation.gaussians,
@@ -83,15 +83,30 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
 
 
 def curves_of(folder: RunFolder) -> Curves:
-    """The history of a run."""
-    history = folder.history()
-    return Curves(*([record[key] for record in history] for key in ("seconds", "loss", "psnr")))
+    """The history of a run, but for steps that were skipped."""
+    names = ("seconds", "loss", "psnr")
+    records = (record for record in folder.history() if not record.get("skipped"))
+    history = [record for record in records if record.keys() >= set(names)]
+    return Curves(*([record[name] for record in history] for name in names))
+
+
+def mean_of(evaluation: Evaluation, metric: str, method: str = "model") -> float:
+    """The mean over scenes. Raises ValueError for a metric that these images do not have."""
+    value = evaluation.mean(metric, method)
+    if value is None:
+        raise ValueError(
+            f"a contest compares {metric}, which is empty here ({evaluation.empty[metric]}): raise "
+            "data.image_size"
+        )
+    return value
 
 
 def baselines(entry: Entry) -> list[Baseline]:
     """What needs no model, on the views that `entry` was judged on."""
     return [
-        Baseline(name, entry.evaluation.mean("psnr", key), entry.evaluation.mean("ssim", key))
+        Baseline(
+            name, mean_of(entry.evaluation, "psnr", key), mean_of(entry.evaluation, "ssim", key)
+        )
         for name, key in (("Nearest input", "nearest_input"), ("Mean colour", "mean_colour"))
     ]
 

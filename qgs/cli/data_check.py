@@ -96,8 +96,16 @@ def _print(console: Console, result: CheckReport) -> None:
     for note in result.notes:
         _line(console, f"note: {note}")
     warnings = len(result.findings) - result.errors
-    _line(console, f"{result.path}: {len(result.scenes)} scenes, {result.errors} errors, "
-                   f"{warnings} warnings")  # fmt: skip
+    counts = (
+        _counted(len(result.scenes), "scene"),
+        _counted(result.errors, "error"),
+        _counted(warnings, "warning"),
+    )
+    _line(console, f"{result.path}: {', '.join(counts)}")
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _line(console: Console, text: str) -> None:

@@ -47,7 +47,7 @@ def demo(
     from qgs.analysis.report import report_html
     from qgs.cli.contest import StoppedError, compete, resolve_fairly, table_of
     from qgs.cli.contest_report import report_of, write_examples
-    from qgs.engine import CollapseError
+    from qgs.engine import TrainingError
     from qgs.io.atomic import write_text
 
     console = Console()
@@ -60,7 +60,7 @@ def demo(
         except StoppedError as stop:
             typer.echo(f"stopped by {stop}; no report", err=True)
             raise typer.Exit(128 + signal.Signals[str(stop)]) from None
-        except CollapseError as error:
+        except TrainingError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
     console.print(table_of(entries))

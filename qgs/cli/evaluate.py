@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from qgs.composer import Recipe
+    from qgs.engine.scores import Evaluation
     from qgs.model import QueryGaussianModel
 
 
@@ -56,6 +57,10 @@ def evaluate(
         bool,
         typer.Option("--across-protocols", help="Compare results of different protocols."),
     ] = False,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Exit with 1 when a scene of the protocol has no score."),
+    ] = False,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
@@ -67,7 +72,8 @@ def evaluate(
 
     settings = [*(overrides or ()), *_short_forms(index, tune)]
     if compare:
-        _refuse_settings([*settings, *([f"--batch {batch}"] if batch > 1 else [])])
+        more = [f"--batch {batch}"] * (batch > 1) + ["--strict"] * strict
+        _refuse_settings([*settings, *more])
         compare_results(runs, across_protocols, out, Console())
         return
     if len(runs) > 1 or across_protocols:
@@ -87,7 +93,12 @@ def evaluate(
     model = load(checkpoint, choose_device(device))
     folder = out or evaluation_folder(checkpoint, bool(settings))
     step = load_extra(checkpoint).get("step")
-    evaluate_into(model, recipe, None if step is None else int(step), folder, Console(), batch)
+    step, console = None if step is None else int(step), Console()
+    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
+    for line in _about_averaged_weights(checkpoint):
+        console.print(line, soft_wrap=True, markup=False)
+    if strict and not evaluation.is_complete:
+        raise typer.Exit(1)
 
 
 def evaluation_folder(checkpoint: Path, other: bool) -> Path:
@@ -110,7 +121,7 @@ def evaluate_into(
     folder: Path,
     console: Console,
     batch: int = 1,
-) -> None:
+) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
     from rich.progress import Progress
 
@@ -126,6 +137,7 @@ def evaluate_into(
     evaluation.write(folder)
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)
+    return evaluation
 
 
 def compare_results(
@@ -146,6 +158,14 @@ def compare_results(
         return
     comparisons.write(out)
     console.print(f"written to {out}", soft_wrap=True)
+
+
+def _about_averaged_weights(checkpoint: Path) -> Iterator[str]:
+    from qgs.engine.folder import RunFolder
+
+    run = RunFolder(checkpoint.parent)
+    if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
+        yield f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
 
 
 def _short_forms(index: str | None, tune: int | None) -> list[str]:

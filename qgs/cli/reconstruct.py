@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from qgs.cli.options import parse_size
+from qgs.cli.scene_choice import chosen_scene
+
 if TYPE_CHECKING:
     from rich.table import Table
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Scene
-    from qgs.data.photos import PhotosConfig, PhotosSource
+    from qgs.data.photos import PhotosConfig
     from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
     from qgs.types import Gaussians
@@ -28,7 +30,7 @@ def register(app: typer.Typer) -> None:
 def reconstruct(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint file, or the run folder.")],
     photos: Annotated[
-        str, typer.Argument(help="Folder of one scene's photos and their cameras, or its URL.")
+        str, typer.Argument(help="Folder of photos and cameras, chunks or archives, or its URL.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
     inputs: Annotated[
@@ -47,6 +49,15 @@ def reconstruct(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HxW", help="Height and width of the photos; the recipe's data.image_size."
+        ),
+    ] = None,
+    scene_name: Annotated[
+        str | None, typer.Option("--scene", help="Name of the scene, where there are several.")
+    ] = None,
     device: Annotated[
         str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
     ] = "auto",
@@ -58,14 +69,14 @@ def reconstruct(
     check_out(out, overwrite)
     chosen = frame_list(frames, "--frames")
     compared = frame_list(holdout, "--holdout")
+    pixels = parse_size(size)
 
     from rich.console import Console
 
     from qgs.analysis.frames import choose_frames
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.analysis.reconstruction import write_reconstruction
-    from qgs.data.photos import PhotosSource
-    from qgs.data.sampling import make_sample, own_world, training_frames
+    from qgs.data.sampling import make_sample, own_world
     from qgs.engine.device import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.io.checkpoint import load, load_recipe
@@ -73,8 +84,7 @@ def reconstruct(
     file = checkpoint_of(checkpoint)
     device = choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
-    scene = only_scene(PhotosSource(photos_config(recipe, photos)), photos)
-    seen = training_frames(scene) if was_trained_on(recipe, photos) else ()
+    scene, seen = chosen_scene(recipe, photos, pixels, scene_name)
     wanted = inputs or recipe.views.inputs
     span = recipe.views.gap[1] + 1
     picked = choose_frames(len(scene), wanted, span, chosen, compared, held_out=scene.held_out)
@@ -112,35 +122,33 @@ def tuned(
     return tuning.prediction.gaussians, record
 
 
-def only_scene(source: PhotosSource, photos: str) -> Scene:
-    """The scene of `source`. Raises ValueError when there are several."""
-    scenes = source.scenes("test")
-    if len(scenes) > 1:
-        raise ValueError(f"{photos} holds {len(scenes)} scenes: give the folder of one of them")
-    return scenes[0]
-
-
-def photos_config(recipe: Recipe, photos: str) -> PhotosConfig:
-    """How to read `photos` for a model of `recipe`: at the image size that it was trained on.
+def photos_config(recipe: Recipe, photos: str, size: tuple[int, int] | None = None) -> PhotosConfig:
+    """How to read `photos` for a model of `recipe`: at `size`, else as it was trained.
 
     Held-out frames are kept when it was trained on these very photos.
-    Raises ValueError for a recipe without data, which has no image size.
+    Raises ValueError for a recipe without data, which has no image size, when none is given.
     """
     from qgs.contracts import SceneSourceConfig
     from qgs.data.photos import PhotosConfig
 
     if ("data",) not in recipe.parts:
-        raise ValueError("the checkpoint's recipe has no data, so its image size is not known")
+        if size is None:
+            raise ValueError(
+                "the checkpoint's recipe has no data, so its image size is not known; give it, "
+                "such as --size 256x256"
+            )
+        return PhotosConfig(path=photos, image_size=size, holdout=0)
     trained = recipe.parts["data",].config
     assert isinstance(trained, SceneSourceConfig)
+    image_size = size or trained.image_size
     if was_trained_on(recipe, photos):
         assert isinstance(trained, PhotosConfig)
-        return trained.model_copy(update={"path": photos})
+        return trained.model_copy(update={"path": photos, "image_size": image_size})
     if isinstance(trained, PhotosConfig):
         return PhotosConfig(
-            path=photos, image_size=trained.image_size, background=trained.background, holdout=0
+            path=photos, image_size=image_size, background=trained.background, holdout=0
         )
-    return PhotosConfig(path=photos, image_size=trained.image_size, holdout=0)
+    return PhotosConfig(path=photos, image_size=image_size, holdout=0)
 
 
 def was_trained_on(recipe: Recipe, photos: str) -> bool:

@@ -51,7 +51,7 @@ def train(
     index_of(resolved)  # an index that is not there is told now, not after the training
     try:
         result = engine.train(resolved, out, console=console, device=device, resume=resume)
-    except engine.CollapseError as error:
+    except engine.TrainingError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
     if result.main:

@@ -9,8 +9,6 @@ from typing import Annotated
 
 import typer
 
-from qgs.cli.options import Overrides
-
 
 class Layout(StrEnum):
     """Layouts of a state dict besides our own."""
@@ -32,27 +30,34 @@ def import_(
         str, typer.Option(help="Recipe file whose model they are; auto for the one that fits.")
     ],
     out: Annotated[Path, typer.Option(help="New checkpoint; never overwritten.")],
-    overrides: Overrides = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override, such as model.head.scale_cap=0.1; repeatable."),
+    ] = None,
     to_float32: Annotated[
-        bool, typer.Option("--to-float32", help="Convert half precision instead of refusing it.")
+        bool,
+        typer.Option("--to-float32", help="Convert other precisions instead of refusing them."),
     ] = False,
 ) -> None:
     """Turn published weights into a checkpoint; every tensor is accounted for.
 
-    With `--recipe auto` the recipe that fits is written beside the checkpoint, as .yaml.
+    With `--recipe auto` the recipe that fits, after every --set, is written beside the checkpoint,
+    as .yaml. A recipe without data knows no image size: give `--set data.type=qgs/photos --set
+    data.path=PHOTOS --set data.image_size=[256,256]`, or `qgs reconstruct --size`.
     """
     from qgs.composer import resolve
     from qgs.io.transfer import import_weights
 
-    if recipe == "auto" and overrides:
-        raise ValueError("--set changes a recipe; with --recipe auto there is none to change")
     resolved = None if recipe == "auto" else resolve(recipe, overrides or ())
-    done = import_weights(weights, resolved, out, to_float32=to_float32)
+    done = import_weights(weights, resolved, out, overrides=overrides or (), to_float32=to_float32)
     _lines(done.notes)
     typer.echo(f"{done.layout.name} ({done.layout.source}): {done.used} tensors used")
     if done.dropped:
         typer.echo(f"knowingly dropped, {done.layout.name} never reads these {len(done.dropped)}:")
         _lines(f"  {name}" for name in done.dropped)
+    if done.settings:
+        typer.echo(f"the recipe differs from {done.layout.name} in options that no weight shows:")
+        _lines(f"  {setting}" for setting in done.settings)
     typer.echo(f"wrote {out}")
     if done.recipe_file:
         typer.echo(f"wrote {done.recipe_file}; names and shapes could not tell:")

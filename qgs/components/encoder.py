@@ -36,14 +36,14 @@ class EncoderBlock(nn.Module):
     """Pre-norm ViT block with QK-LayerNorm and LayerScale."""
 
     def __init__(
-        self, width: int, heads: int, mlp_ratio: int, layer_scale: float, norm_eps: float
+        self, width: int, heads: int, mlp_ratio: float, layer_scale: float, norm_eps: float
     ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width, norm_eps)
         self.attention = SelfAttentionCore(width, heads, norm_eps)
         self.scale1 = LayerScale(width, layer_scale)
         self.norm2 = nn.LayerNorm(width, norm_eps)
-        self.mlp = Mlp(width, mlp_ratio * width, width)
+        self.mlp = Mlp(width, int(mlp_ratio * width), width)
         self.scale2 = LayerScale(width, layer_scale)
 
     def forward(self, x_BMD: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ class MultiViewViT(Encoder):
 
         patch_size: int = Field(default=8, ge=1)
         depth: int = Field(default=3, ge=0)
-        mlp_ratio: int = Field(default=4, ge=1)
+        mlp_ratio: float = Field(default=4.0, ge=1)
         layer_scale: float = Field(default=0.01, gt=0)
         norm_eps: float = Field(default=NORM_EPS, gt=0)
 

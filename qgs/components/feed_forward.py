@@ -17,15 +17,15 @@ class MlpFeedForward(FeedForward):
     name: ClassVar[str] = "mlp"
 
     class Config(ComponentConfig):
-        """ratio: hidden width over D. norm_eps: of the LayerNorm."""
+        """ratio: hidden width, rounded down, over D. norm_eps: of the LayerNorm."""
 
-        ratio: int = Field(default=4, ge=1)
+        ratio: float = Field(default=4.0, ge=1)
         norm_eps: float = Field(default=NORM_EPS, gt=0)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.norm = nn.LayerNorm(dims.width, config.norm_eps)
-        self.mlp = Mlp(dims.width, config.ratio * dims.width, dims.width)
+        self.mlp = Mlp(dims.width, int(config.ratio * dims.width), dims.width)
 
     def forward(self, features: Tensor) -> Tensor:
         """The update (B, N, D)."""

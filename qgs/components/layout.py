@@ -10,6 +10,7 @@ from qgs.contracts.layout import (
     Shapes,
     WeightLayout,
     layer_count,
+    real_ratio,
     size_at,
     whole_ratio,
 )
@@ -65,8 +66,11 @@ LEGIBLE = (
 """Options that names and shapes of their parameters tell."""
 
 
-def backbone(shapes: Shapes) -> dict[str, Any]:
-    """The `model` section as far as TokenGS and its descendants share it; raises LayoutError."""
+def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
+    """The `model` section as far as TokenGS and its descendants share it; raises LayoutError.
+
+    queries: the type of its queries.
+    """
     count, width = size_at(shapes, "gs_tokens", 0), size_at(shapes, "gs_tokens", 1)
     head_width = size_at(shapes, "enc_dec_backbone.k_proj_norm.weight", 0)
     channels = size_at(shapes, "activation_head.deconv.weight", 0)
@@ -77,15 +81,15 @@ def backbone(shapes: Shapes) -> dict[str, Any]:
     }
     if encoder["depth"]:
         hidden = size_at(shapes, ENCODER + "0.mlp.fc1.weight", 0)
-        encoder["mlp_ratio"] = whole_ratio(hidden, width, "hidden width of the encoder's MLP")
+        encoder["mlp_ratio"] = real_ratio(hidden, width, "hidden width of the encoder's MLP")
     hidden = size_at(shapes, DECODER + "0.mlp.mlp.fc1.weight", 0)
-    ratio = whole_ratio(hidden, width, "hidden width of the decoder's MLP")
+    ratio = real_ratio(hidden, width, "hidden width of the decoder's MLP")
     gaussians = whole_ratio(channels, sum(CHANNELS), "channels of the head")
     return {
         "width": width,
         "heads": whole_ratio(width, head_width, "width over the width of one head"),
         "encoder": encoder,
-        "queries": {"count": count},
+        "queries": {"type": queries, "count": count},
         "decoder": {
             "depth": layer_count(shapes, DECODER),
             "feed_forward": {"type": "qgs/mlp", "ratio": ratio},
@@ -95,8 +99,7 @@ def backbone(shapes: Shapes) -> dict[str, Any]:
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
-    model = backbone(shapes)
-    model["queries"]["type"] = "qgs/latent"
+    model = backbone(shapes, "qgs/latent")
     model["decoder"] |= {
         "cross_attention": {"type": "qgs/content"},
         "self_attention": {"type": "qgs/content"},

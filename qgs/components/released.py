@@ -24,7 +24,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     released = ReleasedOptions(options)
     model = backbone(released)
     model["head"] |= {
-        "gaussians_per_query": released.number("dec_patch_size") ** 2,
+        "gaussians_per_query": released.count("dec_patch_size") ** 2,
         "opacity_bias": -released.number("opacity_bias"),
         "scale_input_limit": None,
         "quat_eps": 1e-12,
@@ -36,27 +36,27 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
         "input_limit": None,
         "output_limit": None,
     }
-    model["supervision"] = {"layers": [released["dec_depth"]]}
+    model["supervision"] = {"layers": [released.count("dec_depth")]}
     return {"recipe": 1, "model": model}
 
 
 def backbone(options: ReleasedOptions) -> dict[str, Any]:
     """What TokenGS and its descendants share: sizes, encoder, decoder depth, scale cap."""
-    width = options["enc_embed_dim"]
+    width = options.count("enc_embed_dim")
     options.only({**UNSUPPORTED_BUT, "token_dim": width})
     return {
         "width": width,
-        "heads": options["enc_num_heads"],
+        "heads": options.count("enc_num_heads"),
         "encoder": {
-            "patch_size": options["patch_size"],
-            "depth": options["enc_depth"],
-            "mlp_ratio": options["mlp_ratio"],
+            "patch_size": options.count("patch_size"),
+            "depth": options.count("enc_depth"),
+            "mlp_ratio": options.number("mlp_ratio"),
         },
-        "decoder": {"depth": options["dec_depth"]},
-        "head": {"scale_cap": options["gaussian_scale_cap"]},
+        "decoder": {"depth": options.count("dec_depth")},
+        "head": {"scale_cap": options.number("gaussian_scale_cap")},
     }
 
 
 def query_options(options: ReleasedOptions) -> dict[str, Any]:
     """Number and initial spread of the queries."""
-    return {"count": options["num_gs_tokens"], "std": options["gs_token_std"]}
+    return {"count": options.count("num_gs_tokens"), "std": options.number("gs_token_std")}

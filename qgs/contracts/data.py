@@ -63,6 +63,10 @@ class SceneSourceConfig(ComponentConfig):
     """Options that change no scene, image or camera: where files lie, how they are kept in memory.
     Hashes of evaluation protocols leave them out."""
 
+    split_options: ClassVar[frozenset[str]] = frozenset()
+    """Options that only choose which scenes and frames are trained on, and which are judged. Where
+    an evaluation index names these, hashes of protocols leave them out too."""
+
     image_size: tuple[Side, Side] = (64, 64)
 
 

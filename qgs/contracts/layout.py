@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -102,3 +103,11 @@ def whole_ratio(size: int, unit: int, what: str) -> int:
     if unit < 1 or size % unit or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     return size // unit
+
+
+def real_ratio(size: int, unit: int, what: str) -> float:
+    """The ratio of which int(ratio * unit) is `size`; raises LayoutError where there is none."""
+    if unit < 1 or not size:
+        raise LayoutError(f"{what}: {size} is no multiple of {unit}")
+    ratio = size / unit
+    return ratio if int(ratio * unit) == size else math.nextafter(ratio, math.inf)

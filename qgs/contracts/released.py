@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -38,9 +39,23 @@ class ReleasedOptions:
     def number(self, name: str) -> int | float:
         """A number; raises ReleasedOptionError for anything else."""
         value = self[name]
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
             raise ReleasedOptionError(f"the option {name} is {value!r}; it must be a number")
         return value
+
+    def count(self, name: str) -> int:
+        """A whole number, 4 or 4.0; raises ReleasedOptionError for anything else."""
+        value = self.number(name)
+        if value != int(value):
+            raise ReleasedOptionError(f"the option {name} is {value!r}; it must be whole")
+        return int(value)
+
+    def counts(self, name: str) -> list[int]:
+        """A list of whole numbers; raises ReleasedOptionError for anything else."""
+        values = self[name]
+        if not isinstance(values, list | tuple):
+            raise ReleasedOptionError(f"the option {name} is {values!r}; it must be a list")
+        return [ReleasedOptions({name: value}).count(name) for value in values]
 
     def flag(self, name: str) -> bool:
         """A value that is true or false; raises ReleasedOptionError for any other."""

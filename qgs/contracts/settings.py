@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
 
+SsimCovariance: TypeAlias = Literal["population", "sample"]
 Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -15,11 +16,12 @@ class ViewsConfig(ComponentConfig):
     """How views are drawn from a scene and brought into the model's frame (TokenGS release).
 
     inputs, targets: views per sample. gap: [min, max] frames between the first and the last input
-    frame, both ends included; it shrinks to what a scene has. The other inputs lie between, targets
-    are drawn from the same span. frame: the camera that becomes the identity. scale: "constant"
-    multiplies translations by `scale_factor`; "distance" divides them by the largest distance from
-    the first input camera to another one, then multiplies by `scale_factor`. scale_factor: see
-    `scale`. mirror: probability of mirroring a training sample in x.
+    frame, both ends included; it shrinks to what a scene has, and where that is below min, the
+    scene is named in a warning. The other inputs lie between, targets are drawn from the same span.
+    frame: the camera that becomes the identity. scale: "constant" multiplies translations by
+    `scale_factor`; "distance" divides them by the largest distance from the first input camera to
+    another one, then multiplies by `scale_factor`. scale_factor: see `scale`. mirror: probability
+    of mirroring a training sample in x.
     """
 
     inputs: int = Field(default=4, ge=1)
@@ -90,10 +92,12 @@ class EvaluationConfig(ComponentConfig):
     instead (pixelSplat's format); then scenes, samples and seed mean nothing. Frames are positions
     in the scene's frames, the path is relative to the working directory. protocol: a name for these
     settings in tables, by default the index's file name; what decides the numbers, the index's
-    content included, is hashed beside it. metrics: besides PSNR and SSIM. lpips_weights: file of
-    VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth), None for torch's cache.
-    tuning_steps, tuning_rate: token tuning on the input views before each scene is judged, with the
-    recipe's photometric loss (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
+    content included, is hashed beside it. metrics: besides PSNR and SSIM. ssim_covariance:
+    population as in Wang et al. 2004, or sample, scikit-image's default, by which pixelSplat's
+    evaluation and those derived from it score. lpips_weights: file of VGG-16 weights (safetensors,
+    or torchvision's vgg16-397923af.pth), None for torch's cache. tuning_steps, tuning_rate: token
+    tuning on the input views before each scene is judged, with the recipe's photometric loss
+    (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
     """
 
     scenes: int = Field(default=32, ge=1)
@@ -102,6 +106,7 @@ class EvaluationConfig(ComponentConfig):
     index: str | None = None
     protocol: str | None = None
     metrics: tuple[Literal["lpips"], ...] = ()
+    ssim_covariance: SsimCovariance = "population"
     lpips_weights: str | None = None
     tuning_steps: int = Field(default=0, ge=0)
     tuning_rate: float = Field(default=1e-4, gt=0)

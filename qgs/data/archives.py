@@ -20,7 +20,10 @@ _OPEN = 8  # archives kept open by a process
 
 
 class Archive:
-    """An open zip file. Raises ValueError for a file that is none, or that leads outside itself."""
+    """An open zip file. Raises ValueError for a file that is none, or that leads outside itself.
+
+    files: to each path, with slashes and without `./`, the name under which the archive has it.
+    """
 
     def __init__(self, path: UPath) -> None:
         try:
@@ -29,29 +32,31 @@ class Archive:
             raise ValueError(
                 f"{path} is no zip archive or is cut off ({error}): download it again"
             ) from error
-        self.files: set[str] = set()
+        self.files: dict[str, str] = {}
         self.folders: dict[str, set[str]] = {"": set()}
         for name in self._zip.namelist():
+            parts = PurePosixPath(name.replace("\\", "/")).parts
+            if not parts:
+                continue
             if not stays_inside(name):
                 raise ValueError(
                     f"{path} holds the name {name!r}, which leads outside the archive: it is not "
                     "read. Get the archive from its publisher again"
                 )
-            self._add(name)
+            self._add(name, parts)
 
-    def _add(self, name: str) -> None:
-        parts = PurePosixPath(name).parts
+    def _add(self, name: str, parts: tuple[str, ...]) -> None:
         for depth, part in enumerate(parts):
             self.folders.setdefault("/".join(parts[:depth]), set()).add(part)
-        if name.endswith("/"):
+        if name.endswith(("/", "\\")):
             self.folders.setdefault("/".join(parts), set())
         else:
-            self.files.add("/".join(parts))
+            self.files["/".join(parts)] = name
 
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
         try:
-            return self._zip.read(member)
+            return self._zip.read(self.files[member])
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error
         except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:

@@ -157,10 +157,9 @@ def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
-        raise ValueError(
-            f"frames {', '.join(map(str, outside))} are out of range, it has frames 0 to "
-            f"{len(scene) - 1}"
-        )
+        numbers = ", ".join(map(str, outside))
+        told = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
+        raise ValueError(f"{told} out of range, it has frames 0 to {len(scene) - 1}")
     return tuple(entry.context), tuple(entry.target)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -25,9 +25,23 @@ class IndexEntry(BaseModel):
     context: FrameList
     target: FrameList
 
+    @property
+    def both(self) -> tuple[int, ...]:
+        """Frames that are context and target, in order; see `given_targets`."""
+        return given_targets(self.context, self.target)
+
 
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
+
+GIVEN = "frames as context and as target"
+"""What `given_targets` are, in words; no score tells anything about them."""
+
+
+def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
+    """Frames, in order, that a model is given and judged on; the nearest input view is perfect."""
+    return tuple(sorted(set(inputs) & set(targets)))
+
 
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
 _ADAPTER = TypeAdapter(dict[str, IndexEntry | None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import overload
+from typing import ClassVar
 
 from pydantic import Field
 from upath import UPath
@@ -12,6 +12,7 @@ from upath import UPath
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.cache import BoundedCache
 from qgs.data.frames import PhotoFrame
+from qgs.data.lazy_scenes import LazyScenes
 from qgs.data.notices import warn_once
 from qgs.data.paths import opened_path
 from qgs.data.photo_scene import Development, PhotoScene, pixel_cache
@@ -35,6 +36,8 @@ class PhotosConfig(SceneSource.Config):
     only the first frames of a listing, 0 for all. background: RGB behind transparent pixels.
     depth_unit: world units per number of a depth map (nerfstudio: 0.001, for millimetres).
     """
+
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     path: str
     format: Format = "auto"
@@ -78,7 +81,7 @@ class PhotosSource(SceneSource):
         return self._scenes[split].names
 
 
-class PhotoScenes(Sequence[Scene]):
+class PhotoScenes(LazyScenes):
     """Scenes by folder, opened when asked for; the last ones stay open.
 
     missing: by folder that was opened, the listed photos that do not exist.
@@ -98,14 +101,9 @@ class PhotoScenes(Sequence[Scene]):
         """Names of the scenes; none is opened."""
         return [name for name, _ in self._folders]
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        name, folder = self._folders[index]
+    def scene(self, place: int) -> PhotoScene:
+        """See `LazyScenes`."""
+        name, folder = self._folders[place]
         return self._opened.get(name, lambda: self._open(name, folder))
 
     def _open(self, name: str, folder: UPath) -> PhotoScene:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.notices import warn_once
 from qgs.geometry.poses import (
     first_camera,
     largest_distance,
@@ -63,6 +64,7 @@ def training_frames(scene: Scene) -> list[int]:
 def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
     """Smallest and largest gap that `count` frames of `scene` allow.
 
+    Where both lie below views.gap, that is logged once for each scene.
     Raises ValueError when the inputs do not fit into the gap, or the scene has too few frames.
     """
     low, high = views.gap
@@ -77,6 +79,11 @@ def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
             f"scene {scene!r} has {count} frames for inputs, but views.inputs is {views.inputs} "
             f"and at least {needed} are needed: use fewer inputs, hold out fewer frames, or drop "
             "the scene"
+        )
+    if count - 1 < low:
+        warn_once(
+            f"scene {scene!r} has {count} frames for inputs, fewer than views.gap [{low}, {high}] "
+            f"asks for: its gap is {count - 1}"
         )
     high = min(high, count - 1)
     return max(min(low, high), views.inputs - 1), high
@@ -183,20 +190,21 @@ def _flipped(images: Tensor) -> Tensor:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size.
-
-    Where only some have masks, the others get masks that are 1 everywhere.
-    """
+    """Stack samples of equal view counts and image size."""
     return Batch(
-        _stack([sample.inputs for sample in samples]),
-        _stack([sample.targets for sample in samples]),
+        stack_views([sample.inputs for sample in samples]),
+        stack_views([sample.targets for sample in samples]),
         tuple(sample.scene for sample in samples),
         tuple(sample.input_frames for sample in samples),
         tuple(sample.target_frames for sample in samples),
     )
 
 
-def _stack(views: Sequence[Views]) -> Views:
+def stack_views(views: Sequence[Views]) -> Views:
+    """Views (B, V) of several (b, V) with equal view counts and image size, on the CPU.
+
+    Where only some have masks, the others get masks that are 1 everywhere.
+    """
     cameras = Cameras(
         torch.cat([v.cameras.c2w for v in views]),
         torch.cat([v.cameras.intrinsics for v in views]),

@@ -6,8 +6,10 @@ import atexit
 import logging
 import os
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +17,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleError
+
+
+class WorkerError(ChildProcessError):
+    """A process that decodes data was killed."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ def decoded_by_workers(
 
     opener: opens the data and returns what makes the batch of a number; it runs in the workers and
         so must be picklable. They are spawned: threads of numba and torch do not survive a fork.
-    Raises SampleError with what a worker raised, RuntimeError when one was killed.
+    Raises SampleError with what a worker raised, WorkerError when one was killed.
     """
     loader = DataLoader(
         _Batches(opener),
@@ -76,15 +82,40 @@ def decoded_by_workers(
         worker_init_fn=_prepare_worker,
         generator=torch.Generator(),  # so that no random number of the training is used up
     )
-    batches = iter(loader)
+    with _signals_of_children_left_alone():
+        batches = iter(loader)
     try:
         while True:
-            batch = next(batches)
+            batch = _next(batches)
             if isinstance(batch, _Failure):
                 raise batch.error()
             yield batch
     finally:
         del batches
+
+
+@contextmanager
+def _signals_of_children_left_alone() -> Iterator[None]:
+    """Keep torch from raising where the training happens to be when a worker dies.
+
+    Asking for a batch raises too, within seconds, between two steps.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGCHLD)
+    yield
+    signal.signal(signal.SIGCHLD, before)
+
+
+def _next(batches: Iterator[Batch | _Failure]) -> Batch | _Failure:
+    try:
+        return next(batches)
+    except RuntimeError as error:  # all that torch tells of a worker's sudden end
+        raise WorkerError(
+            f"a process that decodes data ended suddenly ({error}): often the system was out of "
+            "memory; lower training.workers, or views and image sizes"
+        ) from error
 
 
 def _prepare_worker(number: int) -> None:

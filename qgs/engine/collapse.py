@@ -40,8 +40,16 @@ BROKEN_REMEDIES = (
 )
 
 
-class CollapseError(RuntimeError):
-    """Training stopped because the model died; the last good weights are kept."""
+class TrainingError(RuntimeError):
+    """Training stopped by itself; the message tells why, what is kept and what to do."""
+
+
+class CollapseError(TrainingError):
+    """The model died; the last good weights are kept."""
+
+
+class NonFiniteError(TrainingError):
+    """A step gave NaN or infinity; the run is saved as it was before that step."""
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The first results against others. only_first, only_second: scenes that one alone judged.
+    """The first results against others. wanted: how many scenes their protocols name.
 
-    empty: metrics that one of them lacks. other_frames: shared scenes judged on different frames.
+    missing_first, missing_second: scenes without a score. null: scenes that an index lists without
+    frames. only_first, only_second: scenes that one alone judged. empty: metrics that one of them
+    lacks. other_frames: shared scenes judged on different frames.
     """
 
     first: str
@@ -64,6 +66,10 @@ class Comparison:
     same_protocol: bool
     other_frames: Sequence[str]
     differences: Sequence[Difference]
+    wanted: int
+    missing_first: Sequence[str]
+    missing_second: Sequence[str]
+    null: Sequence[str]
     only_first: Sequence[str]
     only_second: Sequence[str]
     empty: Sequence[str]
@@ -94,7 +100,7 @@ class Comparisons:
             moved = _judged_on_other_frames(first, other)
             if moved and not across_protocols:
                 raise ValueError(_different_frames(first, other, moved))
-        protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
+        protocols = {result.name: _protocol(result) for result in results}
         return cls(protocols, [_compared(first, other) for other in others])
 
     def show(self, console: Console) -> None:
@@ -186,6 +192,10 @@ def _compared(first: StoredResults, second: StoredResults) -> Comparison:
             for metric in COLUMNS
             if metric in ours and metric in theirs
         ],
+        wanted=max(first.wanted, second.wanted),
+        missing_first=first.missing,
+        missing_second=second.missing,
+        null=list(dict.fromkeys([*first.null, *second.null])),
         only_first=[name for name in first.scenes if name not in second.scenes],
         only_second=[name for name in second.scenes if name not in first.scenes],
         empty=[m for m in COLUMNS if m not in ours or m not in theirs],
@@ -216,7 +226,12 @@ def _difference(metric: str, first: np.ndarray, second: np.ndarray) -> Differenc
 
 def _title(pair: Comparison) -> str:
     count = pair.differences[0].scenes
-    return f"{pair.first} against {pair.second}, {count} scene{'s' if count > 1 else ''}"
+    scenes = f"{count} scene{'s' if count > 1 else ''}"
+    if count < pair.wanted:
+        missing = list(dict.fromkeys([*pair.missing_first, *pair.missing_second]))
+        names = f" (missing: {listed(missing)})" if missing else ""
+        scenes = f"{count} of {pair.wanted} scenes{names}"
+    return f"{pair.first} against {pair.second}, {scenes}"
 
 
 def _rows(pair: Comparison) -> list[list[str]]:
@@ -239,6 +254,13 @@ def _notes(pair: Comparison) -> list[str]:
     ]
     if pair.differences[0].low is None:
         lines.append("one scene is too few for an interval")
+    for name, scenes in ((pair.first, pair.missing_first), (pair.second, pair.missing_second)):
+        if scenes:
+            lines.append(f"{name} is incomplete: no score of {listed(scenes)}")
+    if pair.null:
+        lines.append(
+            f"null entries of the index, not judged ({len(pair.null)}): {listed(pair.null)}"
+        )
     for name, scenes in ((pair.first, pair.only_first), (pair.second, pair.only_second)):
         if scenes:
             lines.append(f"{len(scenes)} scenes only in {name}, left out: {listed(scenes)}")
@@ -253,6 +275,12 @@ def _notes(pair: Comparison) -> list[str]:
             f"{listed(pair.other_frames)}"
         )
     return lines
+
+
+def _protocol(result: StoredResults) -> str:
+    text = f"{result.protocol_name}, sha256 {result.sha256}"
+    covariance = result.protocol.get("ssim_covariance", "population")
+    return text if covariance == "population" else f"{text}, SSIM with {covariance} covariance"
 
 
 def _different_protocols(first: StoredResults, other: StoredResults) -> str:

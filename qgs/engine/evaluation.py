@@ -14,7 +14,7 @@ from torch import Tensor
 from qgs.composer import Recipe
 from qgs.contracts import SceneSource
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, told
-from qgs.data.sampling import Frames, Sample, collate
+from qgs.data.sampling import Frames, Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.scores import TUNING, Evaluation, SceneScore, column
 from qgs.engine.tuning import Tuning, tune, tuning_loss
@@ -113,7 +113,10 @@ class _Judge:
     @classmethod
     def of(cls, model: QueryGaussianModel, recipe: Recipe) -> _Judge:
         evaluation = recipe.evaluation
-        metrics: dict[str, Metric] = {"psnr": psnr, "ssim": ssim}
+        metrics: dict[str, Metric] = {
+            "psnr": psnr,
+            "ssim": partial(ssim, covariance=evaluation.ssim_covariance),
+        }
         empty: dict[str, str] = {}
         if "lpips" not in evaluation.metrics:
             empty["lpips"] = _NOT_ASKED
@@ -134,13 +137,14 @@ class _Judge:
         return cls(model, metrics, tuner, empty)
 
     def judged(self, samples: Iterable[Sample | SceneFailure], batch: int) -> Iterator[_Outcome]:
-        """An outcome of every sample, up to `batch` of equal view counts at a time."""
+        """An outcome of every sample, up to `batch` with inputs of one shape at a time."""
         waiting: list[Sample] = []
         for sample in samples:
             if isinstance(sample, SceneFailure):
                 yield sample
                 continue
-            alike = not waiting or _shapes(waiting[0]) == _shapes(sample)
+            shape = sample.inputs.images.shape
+            alike = not waiting or waiting[0].inputs.images.shape == shape
             if len(waiting) == batch or not alike:
                 yield from self._together(waiting)
                 waiting = []
@@ -152,7 +156,7 @@ class _Judge:
         if len(samples) < 2 or self.tuner:
             return [self._alone(sample) for sample in samples]
         try:
-            inputs = collate(samples).inputs.to(_device(self.model))
+            inputs = stack_views([sample.inputs for sample in samples]).to(_device(self.model))
             gaussians = self.model(inputs).gaussians
         except Exception:  # one of them is to blame: each again by itself, which tells whose
             return [self._alone(sample) for sample in samples]
@@ -262,10 +266,6 @@ def _without_folder(reason: str, recipe: Recipe) -> str:
     for folder in folders:
         reason = reason.replace(folder.rstrip("/") + "/", "")
     return reason
-
-
-def _shapes(sample: Sample) -> tuple[torch.Size, torch.Size]:
-    return sample.inputs.images.shape, sample.targets.images.shape
 
 
 def _device(model: QueryGaussianModel) -> torch.device:

@@ -12,6 +12,7 @@ from typing import TextIO
 from qgs.composer import Recipe
 from qgs.composer.show import annotated
 from qgs.io.atomic import is_leftover, write_text
+from qgs.io.records import read_records
 
 
 class RunFolder:
@@ -116,20 +117,19 @@ class RunFolder:
             os.fsync(self._history.fileno())
 
     def history(self) -> list[dict[str, float]]:
-        """All records so far, one per optimiser step."""
+        """All records so far, one per optimiser step.
+
+        A step that was left out is `skipped`, and tells only those of its numbers that are finite.
+        """
         self.flush()
-        lines = self._history_file.read_text(encoding="utf-8").splitlines()
-        return [json.loads(line) for line in lines]
+        return read_records(self._history_file)
 
     def cut_history(self, step: int) -> None:
-        """Drop the records of later steps than `step`, and a last line that is not whole."""
+        """Drop the records of later steps than `step`, and lines that are damaged."""
         if not self._history_file.exists():
             return
-        text = self._history_file.read_text(encoding="utf-8")
-        lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
-        write_text(
-            self._history_file, "".join(line for line in lines if json.loads(line)["step"] <= step)
-        )
+        kept = (record for record in read_records(self._history_file) if record["step"] <= step)
+        write_text(self._history_file, "".join(json.dumps(record) + "\n" for record in kept))
 
     def close(self) -> None:
         """Close the history and leave the folder to others."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
 from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from qgs.data.sampling import Batch
@@ -21,8 +20,9 @@ from qgs.engine.gradients import Gradients
 from qgs.engine.nonfinite import Finding, Watch
 from qgs.engine.objective import Objective
 from qgs.engine.state import Weights
-from qgs.io.atomic import replacing, replacing_entries
+from qgs.io.atomic import replacing_entries
 from qgs.io.checkpoint import save
+from qgs.io.tensors import write_tensors
 from qgs.types import Cameras, Views
 
 PATIENCE = 10
@@ -30,6 +30,18 @@ PATIENCE = 10
 
 KEPT = 20
 """Incidents of a run that are saved; later ones are told and counted."""
+
+
+@dataclass(frozen=True)
+class Incident:
+    """What was found of a bad step, in words. in_data: whether it came with the images and cameras
+    of a batch, and so from nothing that the model did."""
+
+    words: str
+    in_data: bool
+
+    def __str__(self) -> str:
+        return self.words
 
 
 class Incidents:
@@ -55,11 +67,11 @@ class Incidents:
         """Take note of a step that was fine."""
         self.in_a_row = 0
 
-    def look_into(self, step: int, batches: Sequence[Batch], symptom: str) -> str:
+    def look_into(self, step: int, batches: Sequence[Batch], symptom: str) -> Incident:
         """Find the first bad tensor of a step and save what it takes to see it again.
 
-        symptom: what the step showed. Returns what was found, in words. All processes must call
-        this; gradients are those of the repeated step afterwards.
+        symptom: what the step showed. All processes must call this; gradients are those of the
+        repeated step afterwards.
         """
         self.total += 1
         self.in_a_row += 1
@@ -70,10 +82,11 @@ class Incidents:
         reports = self._gathered(own)
         found = [report for report in reports if report["first"]]
         words = f"{symptom}; {_in_words(found)}"
+        in_data = bool(found) and all(_is_data(report["first"]["tensor"]) for report in found)
         if self.total > KEPT:
-            return f"{words}; not saved, as {KEPT} incidents of this run are"
+            return Incident(f"{words}; not saved, as {KEPT} incidents of this run are", in_data)
         place = self._save(step, batches, {"step": step, "symptom": symptom, "found": reports}, own)
-        return f"{words}; batch and weights are in {place}"
+        return Incident(f"{words}; batch and weights are in {place}", in_data)
 
     def state(self) -> dict[str, int]:
         """See `qgs.engine.state.Stateful`."""
@@ -122,8 +135,7 @@ def write_batches(path: str | os.PathLike[str], batches: Sequence[Batch]) -> Non
         name: json.dumps([item for batch in batches for item in getattr(batch, name)])
         for name in ("scenes", "input_frames", "target_frames")
     }
-    with replacing(path) as temporary:
-        save_file(tensors, temporary, shown)
+    write_tensors(path, tensors, shown)
 
 
 def read_batch(path: str | os.PathLike[str]) -> Batch:
@@ -160,6 +172,10 @@ def _report_of(first: Finding | None, batches: Sequence[Batch]) -> dict[str, Any
             for batch in batches
         ],
     }
+
+
+def _is_data(tensor: str) -> bool:
+    return tensor.startswith(("inputs.", "targets."))
 
 
 def _in_words(found: Sequence[Mapping[str, Any]]) -> str:

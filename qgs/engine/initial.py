@@ -10,9 +10,9 @@ from safetensors import safe_open
 from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.composer.show import flat
 from qgs.engine.folder import checkpoint_of
 from qgs.io.checkpoint import CheckpointError, load_recipe, load_weights, unique_tensors
+from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
 from qgs.model import QueryGaussianModel
 
 QUERIES = "queries."
@@ -25,7 +25,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     it the model stays as it is. Queries grow or shrink by their own rule (`Queries.resized`) with
     random numbers of the recipe's seed; everything else must have the same names and shapes.
 
-    Returns what was done, line by line. Raises FileNotFoundError, and CheckpointError with every
+    Returns what was done, line by line, with the options that make the same weights predict other
+    Gaussians than where they were learned. Raises FileNotFoundError, and CheckpointError with every
     difference and with the options that would fit.
     """
     if recipe.init_from is None:
@@ -34,19 +35,22 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     learned_by = load_recipe(path)
     with safe_open(path, "pt") as file:
         learned = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    options = _differing_options(learned_by, recipe)
     found = _differences(learned, model, learned_by.build_model("meta").queries.count)
     if found:
-        raise CheckpointError(_refusal(path, found, _differing_options(learned_by, recipe)))
+        raise CheckpointError(_refusal(path, found, options))
     generator = torch.Generator().manual_seed(recipe.seed)
     queries = {k.removeprefix(QUERIES): v for k, v in learned.items() if k.startswith(QUERIES)}
     resized = model.queries.resized(queries, generator)
     weights = learned | {QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, str(path))
-    return [f"weights start from {path}"] + [
+    resizings = [
         _told(name, len(learned[name]), len(values))
         for name, values in weights.items()
         if values.shape != learned[name].shape
     ]
+    others = [f"learned with {option}" for option in options]
+    return [f"weights start from {path}", *resizings, *others]
 
 
 def _told(name: str, old: int, new: int) -> str:
@@ -57,23 +61,13 @@ def _told(name: str, old: int, new: int) -> str:
 
 def _differences(learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int) -> list[str]:
     """In what the weights of a model of `count` queries differ, besides that number."""
-    own = {name: tuple(tensor.shape) for name, tensor in unique_tensors(model).items()}
-    theirs = {name: tuple(tensor.shape) for name, tensor in learned.items()}
+    own, theirs = shapes_of(unique_tensors(model)), shapes_of(learned)
     for name in own.keys() & theirs.keys():
         ours, shape = own[name], theirs[name]
-        if (
-            name.startswith(QUERIES)
-            and ours[:1] == (model.queries.count,)
-            and shape[:1] == (count,)
-        ):
-            theirs[name] = (*ours[:1], *shape[1:])
-    found = [f"missing: {name}" for name in own if name not in theirs]
-    found += [f"unexpected: {name}" for name in theirs if name not in own]
-    return found + [
-        f"shape of {name}: {tuple(learned[name].shape)} in the checkpoint, {shape} here"
-        for name, shape in own.items()
-        if name in theirs and theirs[name] != shape
-    ]
+        per_query = ours[:1] == (model.queries.count,) and shape[:1] == (count,)
+        if name.startswith(QUERIES) and per_query and ours[1:] == shape[1:]:
+            del own[name], theirs[name]
+    return differing_tensors(theirs, own)
 
 
 def _refusal(path: Path, found: Iterable[str], options: Iterable[str]) -> str:
@@ -86,9 +80,9 @@ def _refusal(path: Path, found: Iterable[str], options: Iterable[str]) -> str:
 
 def _differing_options(learned_by: Recipe, recipe: Recipe) -> list[str]:
     """Options of the model, the number of queries aside, in which two recipes differ."""
-    theirs, ours = flat(learned_by.tree["model"]), flat(recipe.tree["model"])
+    apart = options_beside_weights(learned_by.tree, recipe.tree)
     return [
-        f"model.{path}: {theirs.get(path, 'none')} (here {ours.get(path, 'none')})"
-        for path in dict.fromkeys([*theirs, *ours])
-        if theirs.get(path) != ours.get(path) and path != "queries.count"
+        f"{path}: {theirs} (here {ours})"
+        for path, (theirs, ours) in apart.items()
+        if path != "model.queries.count"
     ]

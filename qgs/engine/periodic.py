@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -18,6 +19,8 @@ from qgs.data.evaluation import EvaluationPlan
 from qgs.data.sampling import Sample
 from qgs.engine.ema import MovingAverage
 from qgs.engine.evaluation import evaluate
+from qgs.engine.interrupt import StopRequest
+from qgs.engine.processes import mean
 from qgs.engine.protocol import index_of
 from qgs.engine.scores import METRICS
 from qgs.engine.seeds import RandomStates
@@ -25,12 +28,20 @@ from qgs.engine.trackers import Trackers
 from qgs.io.atomic import write_text
 from qgs.io.drawing import Picture, depth_picture, depth_range, rgb_picture, side_by_side
 from qgs.io.pictures import write_png
+from qgs.io.records import read_records
 from qgs.model import QueryGaussianModel
 
 SAMPLES = 4
 """Samples that are drawn, the same ones each time."""
 
 _GAP = 4
+
+
+_log = logging.getLogger(__name__)
+
+
+class _StoppedError(Exception):
+    """Training was asked to stop in the middle of an evaluation."""
 
 
 class PeriodicEvaluation:
@@ -60,18 +71,43 @@ class PeriodicEvaluation:
         self._folder = folder
         self._trackers = trackers
         self._random = RandomStates(accelerator)
+        self._stop = StopRequest()
 
-    def run(self, step: int) -> None:
-        """Evaluate after `step` optimiser steps. All processes must call this."""
+    def run(self, step: int, stop: StopRequest | None = None) -> None:
+        """Evaluate after `step` optimiser steps. All processes must call this.
+
+        stop: given up between two scenes once this is asked for. An evaluation that fails is told
+        in a warning and ends no training.
+        """
         self.latest = step
         states = self._random.state()
-        main = self._accelerator.is_main_process
-        if main or any(isinstance(p, DTensor) for p in self._model.parameters()):
-            records, picture = self._judge(step), self._picture()
-            if main:
-                self._tell(records, picture, step)
+        try:
+            if self._accelerator.is_main_process or self._in_shards:
+                self._evaluate(step, stop)
+        except _StoppedError:
+            _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
+        except Exception as error:  # the run is saved, and worth more than an evaluation
+            kind = type(error).__name__
+            _log.warning("the evaluation at step %d failed: %s: %s", step, kind, error)
+            _log.debug("where it failed", exc_info=True)
         self._accelerator.wait_for_everyone()
         self._random.load_state(states)
+
+    def _evaluate(self, step: int, stop: StopRequest | None) -> None:
+        self._stop = StopRequest() if stop is None else stop
+        records, picture = self._judge(step), self._picture()
+        if self._accelerator.is_main_process:
+            self._tell(records, picture, step)
+
+    @property
+    def _in_shards(self) -> bool:
+        return any(isinstance(p, DTensor) for p in self._model.parameters())
+
+    def _between_scenes(self, done: int, wanted: int) -> None:
+        """Raise _StoppedError when a stop was asked for, of any process where all take part."""
+        asked = torch.tensor(float(bool(self._stop)), device=self._accelerator.device)
+        if float(mean(self._accelerator, asked) if self._in_shards else asked):
+            raise _StoppedError
 
     def _judge(self, step: int) -> list[dict[str, Any]]:
         """A record for the present weights and one for the averaged ones."""
@@ -82,7 +118,8 @@ class PeriodicEvaluation:
         return records
 
     def _record(self, weights: str, step: int) -> dict[str, Any]:
-        summary = evaluate(self._model, self._recipe, step).summary()
+        evaluation = evaluate(self._model, self._recipe, step, observe=self._between_scenes)
+        summary = evaluation.summary()
         told = ("statement", "scenes", "scenes_in_protocol", "samples")
         return {
             "step": step,
@@ -139,7 +176,5 @@ def _stacked(rows: Sequence[Picture]) -> Picture:
 def _append(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
     """Add records of one step; those of that step and later ones, from before a resume, go."""
     step = records[0]["step"]
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    kept = [line for line in lines if json.loads(line)["step"] < step]
-    lines = [*kept, *(json.dumps(record) for record in records)]
-    write_text(path, "\n".join(lines) + "\n")
+    kept = [record for record in read_records(path) if record["step"] < step]
+    write_text(path, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))

@@ -5,13 +5,22 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 from accelerate import Accelerator
+from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 from torch.distributed.fsdp import FSDPModule, fully_shard
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from qgs.model import QueryGaussianModel
+
+PATIENCE = timedelta(hours=24)
+"""How long processes wait for each other: while one evaluates or saves, the others do.
+
+torch's own 10 minutes with NCCL would end such runs. A process that died is none of this: the
+launcher notices it and ends the others.
+"""
 
 
 def make_accelerator(device: str) -> Accelerator:
@@ -19,7 +28,8 @@ def make_accelerator(device: str) -> Accelerator:
 
     device: "cpu" or "cuda". Autocast is the trainer's own, so no mixed precision is asked for.
     """
-    return Accelerator(cpu=device == "cpu", mixed_precision="no")
+    patience = InitProcessGroupKwargs(timeout=PATIENCE)
+    return Accelerator(cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[patience])
 
 
 def wants_shards(accelerator: Accelerator) -> bool:

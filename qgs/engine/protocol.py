@@ -22,7 +22,10 @@ class Protocol:
     """Settings of an evaluation under a name; results with one hash are comparable.
 
     content: everything that decides a score of given Gaussians, and nothing else: no path, no name
-    of a file. `canonical` is its JSON with sorted keys and no spaces, `sha256` the hash of that.
+    of a file. That is the data's images and cameras, which views are judged, their poses, the
+    metrics, tuning, and the settings that every renderer obeys; not the renderer's type, as all of
+    them render alike, on whichever device. `canonical` is its JSON with sorted keys and no
+    spaces, `sha256` the hash of that.
     """
 
     name: str
@@ -60,14 +63,15 @@ def protocol_of(
 ) -> Protocol:
     """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
 
-    With an index the kind of data and options at their defaults say nothing, so that one data set
-    in two formats has one protocol.
+    With an index the kind of data, how it is split, and options at their defaults say nothing, so
+    that one data set in two formats has one protocol.
     """
     config = recipe.parts["data",].config
     assert isinstance(config, SceneSourceConfig)
+    undecisive = config.undecisive | (config.split_options if index is not None else set())
     options = config.model_dump(
         mode="json",
-        exclude={"image_size", *config.undecisive},
+        exclude={"image_size", *undecisive},
         exclude_defaults=index is not None,
     )
     evaluation = recipe.evaluation
@@ -78,7 +82,9 @@ def protocol_of(
         "data": options if index is not None else {"type": recipe.tree["data"]["type"], **options},
         "poses": recipe.views.model_dump(include={"frame", "scale", "scale_factor"}),
         "views": _indexed(index) if index is not None else _drawn(recipe, scenes),
+        "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
         "metrics": {m: IMAGE_METRICS[m] for m in ("psnr", "ssim", *evaluation.metrics)},
+        "ssim_covariance": evaluation.ssim_covariance,
         "tuning": _tuning(recipe),
     }
     return Protocol(evaluation.protocol or _name(evaluation.index), content)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from qgs.data.index import GIVEN
 from qgs.io.atomic import write_text
 from qgs.metrics import OPACITY_USED
 
@@ -52,7 +53,8 @@ def show(evaluation: Evaluation, console: Console) -> None:
 
 def statement(evaluation: Evaluation) -> str:
     """The model's PSNR and over how many scenes, in one line."""
-    line = f"PSNR {_number(evaluation, 'psnr', 'model')} over {coverage(evaluation)} scenes"
+    scenes = "scene" if len(evaluation.wanted) == 1 else "scenes"
+    line = f"PSNR {_number(evaluation, 'psnr', 'model')} over {coverage(evaluation)} {scenes}"
     missing = [failure.scene for failure in evaluation.missing]
     return f"{line}; missing: {listed(missing)}" if missing else line
 
@@ -66,6 +68,9 @@ def coverage(evaluation: Evaluation) -> str:
 def score_rows(evaluation: Evaluation) -> list[list[str]]:
     """The table, headers first: a row per method, in it how many scenes it is over."""
     header = ["method", *HEADERS.values(), "scenes"]
+    covariance = evaluation.protocol.content["ssim_covariance"]
+    if covariance != "population":
+        header[header.index(HEADERS["ssim"])] = f"SSIM ({covariance} covariance) ↑"
     rows = [
         [
             method.replace("_", " "),
@@ -121,6 +126,7 @@ def notes(evaluation: Evaluation) -> list[str]:
     ):
         if names:
             lines.append(f"{what}, not judged ({len(names)}): {listed(names)}")
+    lines += _about_given(evaluation)
     lines += [f"{HEADERS[m].split()[0]} is empty: {why}" for m, why in evaluation.empty.items()]
     if evaluation.held_out:
         lines.append("judged on {} of {} held-out frames".format(*evaluation.held_out))
@@ -154,6 +160,16 @@ def _number(evaluation: Evaluation, metric: str, method: str) -> str:
     return EMPTY if value is None else f"{value:.{DIGITS[metric]}f}"
 
 
+def _about_given(evaluation: Evaluation) -> Iterable[str]:
+    given = {score.scene: score.given for score in evaluation.scores if score.given}
+    if given:
+        named = [f"{scene} ({' '.join(map(str, frames))})" for scene, frames in given.items()]
+        yield (
+            f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the nearest "
+            f"input view is perfect: {listed(named)}"
+        )
+
+
 def _about_gaussians(evaluation: Evaluation) -> Iterable[str]:
     summary = evaluation.summary()
     used = summary["gaussians_used"]
@@ -179,7 +195,7 @@ def _about_protocol(evaluation: Evaluation) -> str:
     counts = sorted({len(inputs) for score in evaluation.scores for inputs, _ in score.views})
     return (
         f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
-        f"input views of {width}x{height} pixels (width x height), poses {poses['frame']}, scale "
+        f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
         f"{poses['scale']} {poses['scale_factor']}"
     )
 

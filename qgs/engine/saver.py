@@ -33,9 +33,9 @@ class Saver:
         parts: Mapping[str, Stateful],
     ) -> None:
         self._accelerator = accelerator
-        self._folder = folder
-        self._model = model
-        self._good = good
+        self.folder = folder
+        self.model = model
+        self.good = good
         self._weights = Weights(model)
         self._parts = {"weights": self._weights, "good": good, **parts}
 
@@ -43,13 +43,13 @@ class Saver:
         """Save the run after `step` optimiser steps. All processes must call this."""
         parts = self._states()
         if self._accelerator.is_main_process:
-            if not self._folder.state.exists():
+            if not self.folder.state.exists():
                 self._write(parts)  # a checkpoint alone is a run that cannot be continued
             extra = {"step": str(step)}
-            save(self._model, self._folder.checkpoint, extra=extra, weights=parts["weights"])
+            save(self.model, self.folder.checkpoint, extra=extra, weights=parts["weights"])
             if "ema" in parts:
                 averages = parts["ema"]
-                save(self._model, self._folder.checkpoint_ema, extra=extra, weights=averages)
+                save(self.model, self.folder.checkpoint_ema, extra=extra, weights=averages)
             self._write(parts)
         self._accelerator.wait_for_everyone()
 
@@ -64,23 +64,23 @@ class Saver:
         return {name: part.state() for name, part in self._parts.items()}
 
     def _write(self, parts: Mapping[str, State]) -> None:
-        self._folder.synchronise()
-        assert self._model.recipe is not None
-        write_state(self._folder.state, self._model.recipe, parts)
+        self.folder.synchronise()
+        assert self.model.recipe is not None
+        write_state(self.folder.state, self.model.recipe, parts)
 
     def save_good(self) -> None:
         """Save a checkpoint of the last good weights. All processes must call this."""
         if self._accelerator.is_main_process:
-            extra = {"step": str(self._good.step)}
-            save(self._model, self._folder.checkpoint, extra=extra, weights=self._good.tensors)
+            extra = {"step": str(self.good.step)}
+            save(self.model, self.folder.checkpoint, extra=extra, weights=self.good.tensors)
         self._accelerator.wait_for_everyone()
 
     def whole_model(self) -> QueryGaussianModel:
         """The model, as a copy of its own where its weights lie in shards. All must call this."""
-        if not sharded(self._model):
-            return self._model
-        assert self._model.recipe is not None
-        copy = resolve(self._model.recipe).build_model()
+        if not sharded(self.model):
+            return self.model
+        assert self.model.recipe is not None
+        copy = resolve(self.model.recipe).build_model()
         load_weights(copy, self._weights.state(), "the model in shards")
         return copy.to(self._accelerator.device)
 
@@ -92,7 +92,7 @@ class Saver:
         missing = [name for name in self._parts if name not in saved.parts]
         if missing:
             raise CheckpointError(
-                f"{self._folder.state} lacks {', '.join(missing)}: another version of qgs wrote "
+                f"{self.folder.state} lacks {', '.join(missing)}: another version of qgs wrote "
                 "it; continue the run with that version"
             )
         for name, part in self._parts.items():

@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 
 from qgs.data.evaluation import SceneFailure
+from qgs.data.index import given_targets
 from qgs.data.sampling import Frames
 from qgs.engine import results
 from qgs.engine.protocol import Protocol
@@ -39,6 +40,12 @@ class SceneScore:
     scene: str
     views: Sequence[tuple[Frames, Frames]]
     values: Mapping[str, float]
+
+    @property
+    def given(self) -> tuple[int, ...]:
+        """Frames that one of the samples has as input and as target."""
+        both = [given_targets(*frames) for frames in self.views]
+        return tuple(sorted({frame for frames in both for frame in frames}))
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,7 @@ class Evaluation:
             "missing": {failure.scene: failure.reason for failure in self.missing},
             "null_entries": list(self.null),
             "not_in_index": list(self.unlisted),
+            "context_and_target": {s.scene: list(s.given) for s in self.scores if s.given},
             **{method: {m: self.mean(m, method) for m in METRICS} for method in METHODS},
             "empty": dict(self.empty),
             "dispersion_over_gaussians": {

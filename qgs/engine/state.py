@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.engine.processes import placed_like, whole
-from qgs.io.atomic import replacing
 from qgs.io.checkpoint import CheckpointError, unique_tensors
+from qgs.io.tensors import opened_tensors, write_tensors
 
 FORMAT_VERSION = 1
 """Raised when the layout of the file changes."""
@@ -53,7 +51,10 @@ class SavedState:
 def write_state(
     path: str | os.PathLike[str], recipe: Mapping[str, Any], parts: Mapping[str, State]
 ) -> None:
-    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree."""
+    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree.
+
+    Raises OSError when the disk is full.
+    """
     tensors: dict[str, Tensor] = {}
     values: dict[str, dict[str, Any]] = {}
     for part, state in parts.items():
@@ -67,8 +68,7 @@ def write_state(
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
     }
-    with replacing(path) as temporary:
-        save_file(tensors, temporary, metadata)
+    write_tensors(path, tensors, metadata)
 
 
 def read_state(path: str | os.PathLike[str]) -> SavedState:
@@ -78,14 +78,9 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no training state at {path}")
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise CheckpointError(
-            f"{path} is not a whole safetensors file ({error}); it may be cut off: copy it again"
-        ) from error
+    with opened_tensors(path) as file:
+        metadata = file.metadata() or {}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     if _PARTS not in metadata:
         raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
     if int(metadata[_FORMAT]) > FORMAT_VERSION:

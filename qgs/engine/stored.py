@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ class StoredResults:
     """Results of one evaluation. name: the folder, as it was given. protocol: its content.
 
     scenes: name to values as `SceneScore.values`, of the scenes that were judged. frames: their
-    input and target frames, as scenes.csv writes them.
+    input and target frames, as scenes.csv writes them. wanted: how many scenes the protocol names.
+    missing: those without a score. null: scenes that the index lists without frames.
     """
 
     name: str
@@ -24,6 +25,9 @@ class StoredResults:
     protocol: Mapping[str, Any]
     scenes: Mapping[str, Mapping[str, float]]
     frames: Mapping[str, tuple[str, str]]
+    wanted: int
+    missing: Sequence[str] = ()
+    null: Sequence[str] = ()
 
 
 def read_results(path: str | Path) -> StoredResults:
@@ -61,4 +65,14 @@ def _read(folder: Path, name: str) -> StoredResults:
     }
     frames = {s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()}
     stated = summary["protocol"]
-    return StoredResults(name, stated["name"], stated["sha256"], protocol, scenes, frames)
+    return StoredResults(
+        name=name,
+        protocol_name=stated["name"],
+        sha256=stated["sha256"],
+        protocol=protocol,
+        scenes=scenes,
+        frames=frames,
+        wanted=summary["scenes_in_protocol"],
+        missing=list(summary["missing"]),
+        null=summary["null_entries"],
+    )

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import torch
 from rich.console import Console
@@ -18,22 +16,17 @@ from torch import Tensor
 from qgs.composer import Recipe
 from qgs.data.loader import Share, scenes_fingerprint, training_batches
 from qgs.data.sampling import Batch
+from qgs.data.stream import SampleError
 from qgs.engine.clock import Clock
-from qgs.engine.collapse import (
-    BROKEN_REMEDIES,
-    COLLAPSE_REMEDIES,
-    CollapseDetector,
-    CollapseError,
-    GoodWeights,
-    Vitals,
-    broken_tensors,
-    not_finite,
-)
+from qgs.engine.collapse import CollapseDetector, GoodWeights, Vitals, not_finite
+from qgs.engine.counters import Counters
 from qgs.engine.device import choose_device
 from qgs.engine.ema import MovingAverage
+from qgs.engine.endings import Endings
+from qgs.engine.feed import Feed
 from qgs.engine.folder import RunFolder
 from qgs.engine.gradients import Gradients
-from qgs.engine.incidents import PATIENCE, Incidents
+from qgs.engine.incidents import Incidents
 from qgs.engine.initial import initialise
 from qgs.engine.interrupt import StopRequest, stop_requests
 from qgs.engine.objective import Objective
@@ -41,7 +34,7 @@ from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.prepare import prepared
 from qgs.engine.processes import make_accelerator, mean
 from qgs.engine.progress import TrainingProgress
-from qgs.engine.resume import refuse_other_conditions, saved_state
+from qgs.engine.resume import saved_state
 from qgs.engine.saver import Saver
 from qgs.engine.schedule import OneCycle
 from qgs.engine.seeds import RandomStates, set_seed
@@ -49,7 +42,8 @@ from qgs.engine.state import Moments, SavedState, Stateful
 from qgs.engine.trackers import Trackers
 from qgs.model import QueryGaussianModel
 
-_log = logging.getLogger(__name__)
+_FLAGS = ("stop", "failed")
+"""Of a step's record: whether a process was asked to stop, and whether one has no next batch."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +85,9 @@ def train(
 
     Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
     as `choose_device` and `OneCycle`, `qgs.engine.resume.OtherRunError` for another recipe or data
-    than the run's, what the data source raises, and CollapseError when the model died; the
-    checkpoint then holds the last good weights.
+    than the run's, what the data source raises, CollapseError when the model died, the checkpoint
+    then holding the last good weights, and NonFiniteError for a step that gave NaN. An error of the
+    data, between two steps, leaves the run saved where it stood; a note of the error says so.
     """
     if not resume:
         RunFolder(run).refuse_used()
@@ -104,7 +99,7 @@ def train(
             terminal = Console(quiet=True)
         for note in trainer.notes:
             terminal.print(note, highlight=False)
-        with TrainingProgress(terminal) as progress, stop_requests() as stop:
+        with TrainingProgress(terminal) as progress, stop_requests(terminal.quiet) as stop:
             return trainer.run(progress, stop)
 
 
@@ -113,8 +108,7 @@ class Trainer:
 
     Making one opens the data and draws the first batch, but touches no file of `run`; the folder is
     made after the first step, when nothing is missing any more. What must survive an interruption
-    is in `parts`, each with `state` and `load_state`, and counted here: optimiser steps and samples
-    drawn, over all processes.
+    is in parts that the saver knows, each with `state` and `load_state`.
     """
 
     def __init__(
@@ -136,7 +130,10 @@ class Trainer:
             self.resumed_at = self._restore(saved) if saved else None
             self._stream = self._open_stream()
             resources.callback(self._stream.close)
-            self._batches = chain([next(self._stream)], self._stream)
+            self.feed = Feed(self._stream, self.config.accumulate)
+            self.feed.fetch()
+            if self.feed.error:
+                raise self.feed.error
             self._resources = resources.pop_all()
         self._folder_is_open = False
 
@@ -167,14 +164,13 @@ class Trainer:
         )
         self.source = self.recipe.build_data()
         batches = self.config.accumulate * self.accelerator.num_processes
-        self._conditions = {
+        conditions = {
             "step_size": self.config.batch_size * batches,
             "scenes": scenes_fingerprint(self.source),
         }
-        self.step = 0
-        self.samples = 0
-        self.parts: dict[str, Stateful] = {
-            "counters": self,
+        self.counters = Counters(conditions, self.folder)
+        parts: dict[str, Stateful] = {
+            "counters": self.counters,
             "moments": Moments(objective, self.optimizer),
             "schedule": self.schedule,
             "clock": self.clock,
@@ -183,13 +179,15 @@ class Trainer:
             "random": RandomStates(self.accelerator),
         }
         if self.average:
-            self.parts["ema"] = self.average
-        self.saver = Saver(self.accelerator, self.folder, self.model, self.good, self.parts)
+            parts["ema"] = self.average
+        self.saver = Saver(self.accelerator, self.folder, self.model, self.good, parts)
+        skips = self.config.on_nonfinite == "skip"
+        self.endings = Endings(self.saver, self.counters, self.detector, self.incidents, skips)
 
     def _restore(self, saved: SavedState) -> int:
         """Continue from `saved`; the step at which that is."""
         self.saver.restore(saved)
-        return self.step
+        return self.counters.step
 
     def _open_stream(self) -> Generator[Batch, None, None]:
         """Batches from the first one that no optimiser step has seen."""
@@ -199,7 +197,7 @@ class Trainer:
             self.recipe.views,
             self.config.batch_size,
             self.recipe.seed,
-            start=self.samples // (self.config.batch_size * processes),
+            start=self.counters.samples // (self.config.batch_size * processes),
             share=Share(self.accelerator.process_index, processes),
             workers=self.config.workers,
         )
@@ -208,42 +206,37 @@ class Trainer:
         """Stop reading ahead, close the history and leave the folder to others."""
         self._resources.close()
 
-    def state(self) -> dict[str, Any]:
-        """See `qgs.engine.state.Stateful`."""
-        return {"step": self.step, "samples": self.samples, **self._conditions}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.state.Stateful`. Raises OtherRunError."""
-        refuse_other_conditions(state, self._conditions, self.folder)
-        self.step, self.samples = state["step"], state["samples"]
-
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
         if self.used >= 1:
             if not self.folder.checkpoint.exists():
-                self._save()
+                self.endings.save()
             return self._result(None)
-        while self.used < 1:
+        stopped_by = None
+        while self.used < 1 and not stopped_by:
             record = self._optimise(stop)
             self._open_folder()
             self._report(record, progress)
-            if self.detector.collapsed:
-                symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
-                self._give_up(symptom, COLLAPSE_REMEDIES)
+            self.endings.refuse_collapse()
             self._keep_good_weights()
-            if self.config.evaluate_every and self.step % self.config.evaluate_every == 0:
-                self._evaluate()
-            if record["stop"]:
-                break
-        stopped_by = self._stopped_by(stop)
-        self._finish(stopped_by)
+            if self._every(self.config.evaluate_every):
+                self._evaluate(stop)
+            if record["stop"] or self._every(self.config.evaluate_every):
+                stopped_by = self._stopped_by(stop)
+            if record["failed"] and self.used < 1 and not stopped_by:
+                self._end_without_data()
+        stopped_by = stopped_by or self._stopped_by(stop)
+        self.endings.finish(stopped_by)
+        if self.average and not stopped_by and self.evaluations.latest != self.counters.step:
+            self._evaluate(stop)
+            stopped_by = self._stopped_by(stop)
         return self._result(stopped_by)
 
     def _result(self, stopped_by: str | None) -> TrainingResult:
         return TrainingResult(
             self.saver.whole_model().eval(),
             self.folder,
-            self.step,
+            self.counters.step,
             self.clock.seconds,
             stopped_by,
             self.accelerator.is_main_process,
@@ -253,7 +246,7 @@ class Trainer:
     @property
     def used(self) -> float:
         """Fraction of the budget that is used, the larger of steps and seconds."""
-        of_steps = self.step / self.config.steps
+        of_steps = self.counters.step / self.config.steps
         budget = self.config.seconds
         of_seconds = self.clock.seconds / budget if budget else 0.0
         return max(of_steps, of_seconds)
@@ -277,23 +270,27 @@ class Trainer:
 
     def _optimise(self, stop: StopRequest) -> dict[str, float]:
         """One optimiser step; returns its record for the history."""
-        rate = self.schedule.rate(self.step, self.clock.seconds)
+        rate = self.schedule.rate(self.counters.step, self.clock.seconds)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        batches = list(islice(self._batches, self.config.accumulate))
+        batches = self.feed.batches
         measured = self.gradients.compute(batches)
+        if not stop and self.counters.step + 1 < self.config.steps:
+            self.feed.fetch()
         scenes = sum(len(batch.scenes) for batch in batches)
         record = self._read(measured, stop)
         symptom = self._nonfinite(record)
         if symptom:
-            self._leave_out(batches, symptom)
+            self._open_folder()
+            self.endings.leave_out(batches, symptom)
+            record["skipped"] = True
         else:
             self._apply(record)
-        self.step += 1
-        self.samples += scenes * self.accelerator.num_processes
+        self.counters.step += 1
+        self.counters.samples += scenes * self.accelerator.num_processes
         self.clock.tick()
-        return {"step": self.step, "seconds": self.clock.seconds, "lr": rate, **record}
+        return {"step": self.counters.step, "seconds": self.clock.seconds, "lr": rate, **record}
 
     def _apply(self, record: Mapping[str, float]) -> None:
         """Let the optimiser use the gradients of a step that `record` tells of."""
@@ -303,92 +300,57 @@ class Trainer:
         self.incidents.passed()
         self.detector.observe(Vitals(record["alpha"], record["deviation"], record["gradient"]))
 
-    def _leave_out(self, batches: Sequence[Batch], symptom: str) -> None:
-        """Save a step that is not finite; end, or go on without it, as the recipe says."""
-        self._open_folder()
-        found = self.incidents.look_into(self.step + 1, batches, symptom)
-        if self.config.on_nonfinite == "skip" and self.incidents.in_a_row <= PATIENCE:
-            _log.warning("step %d is skipped: %s", self.step + 1, found)
-            return
-        if self.incidents.in_a_row > PATIENCE:
-            found = f"{PATIENCE} steps in a row were skipped; {found}"
-        if self.detector.dead_steps or broken_tensors(self.model):
-            self._give_up(found, BROKEN_REMEDIES)
-        self._save()
-        self._fail(found, self.step, BROKEN_REMEDIES)
+    def _end_without_data(self) -> NoReturn:
+        """Save the run and raise what kept this process, or another one, from its next batch."""
+        self.endings.keep()
+        error = self.feed.error or SampleError(
+            "another process of this training has no next batch; its own message tells why"
+        )
+        error.add_note(f"The run is saved at step {self.counters.step}; continue with --resume")
+        raise error
 
-    def _evaluate(self) -> None:
+    def _evaluate(self, stop: StopRequest) -> None:
         with self.clock.stopped():
-            self.evaluations.run(self.step)
+            self.evaluations.run(self.counters.step, stop)
+
+    def _every(self, steps: int) -> bool:
+        """Whether this step is one of every `steps`; none is where that is 0."""
+        return bool(steps) and self.counters.step % steps == 0
 
     def _report(self, record: dict[str, float], progress: TrainingProgress) -> None:
         if self.accelerator.is_main_process:
-            told = {name: value for name, value in record.items() if math.isfinite(value)}
+            numbers = {name: value for name, value in record.items() if name not in _FLAGS}
+            told = {name: value for name, value in numbers.items() if math.isfinite(value)}
             self.folder.append(told)
-            self.trackers.log(told, self.step)
-        images, seconds = self.samples * self.recipe.views.targets, self.clock.seconds
-        if progress.update(self.step, record["loss"], record["psnr"], images, seconds, self.used):
+            self.trackers.log(told, self.counters.step)
+        images, seconds = self.counters.samples * self.recipe.views.targets, self.clock.seconds
+        shown = record["loss"], record["psnr"], images, seconds, self.used
+        if progress.update(self.counters.step, *shown):
             self.folder.flush()
 
     def _read(self, measured: dict[str, Tensor], stop: StopRequest) -> dict[str, float]:
         """Numbers of one step, the mean over processes; the only synchronisation of a step."""
-        asked = torch.tensor(float(bool(stop)), device=self.device)
-        values = torch.stack([v.float() for v in (*measured.values(), asked)])
+        flags = torch.tensor([bool(stop), bool(self.feed.error)], device=self.device).float()
+        values = torch.stack([v.float() for v in (*measured.values(), *flags)])
         numbers = mean(self.accelerator, values).tolist()
-        return dict(zip([*measured, "stop"], numbers, strict=True))
+        return dict(zip([*measured, *_FLAGS], numbers, strict=True))
 
     def _nonfinite(self, record: dict[str, float]) -> str:
         """What of a step is NaN or infinite; "" if nothing is."""
-        terms = {k: v for k, v in record.items() if k not in ("gradient", "stop", "psnr")}
+        terms = {k: v for k, v in record.items() if k not in ("gradient", "psnr", *_FLAGS)}
         return not_finite(terms, self.model, record["gradient"])
 
     def _keep_good_weights(self) -> None:
         if self.detector.dead_steps:
             return
-        if self.step % self.config.collapse_window == 0:
-            self._refuse_broken_weights()
-            self.good.refresh(self.step)
-        if self.config.save_every and self.step % self.config.save_every == 0:
-            self._save()
-
-    def _refuse_broken_weights(self) -> None:
-        problem = broken_tensors(self.model)
-        if problem:
-            self._give_up(problem, BROKEN_REMEDIES)
+        if self._every(self.config.collapse_window):
+            self.endings.refuse_broken_weights()
+            self.good.refresh(self.counters.step)
+        if self._every(self.config.save_every) or self._every(self.config.evaluate_every):
+            self.endings.save()
 
     def _stopped_by(self, stop: StopRequest) -> str | None:
         """The signal's name when any process was asked to stop."""
         asked = mean(self.accelerator, torch.tensor(float(bool(stop)), device=self.device))
         name = stop.signal.name if stop.signal else "SIGTERM"
         return name if float(asked) else None
-
-    def _finish(self, stopped_by: str | None) -> None:
-        dead = self.detector.dead_steps
-        symptom = f"for the last {dead} steps {self.detector.symptom}"
-        if self.detector.dead_after(self.step) and not stopped_by:
-            self._give_up(symptom, COLLAPSE_REMEDIES)
-        if self.detector.dead_after(self.step):
-            self.saver.save_good()
-            self.saver.save_state()
-            return
-        if dead:
-            _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
-        self._save()
-        if self.average and not stopped_by and self.evaluations.latest != self.step:
-            self._evaluate()
-
-    def _give_up(self, problem: str, causes: Sequence[str]) -> NoReturn:
-        self._open_folder()
-        self.saver.save_good()
-        self._fail(problem, self.good.step, causes)
-
-    def _fail(self, problem: str, kept: int, causes: Sequence[str]) -> NoReturn:
-        remedies = "".join(f"\n  - {cause}" for cause in causes)
-        raise CollapseError(
-            f"training collapsed at step {self.step}: {problem}. The weights of step "
-            f"{kept} are kept in {self.folder.checkpoint}. Likely causes:{remedies}"
-        )
-
-    def _save(self) -> None:
-        self._refuse_broken_weights()
-        self.saver.save(self.step)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.contracts import CONTRACT_VERSION
-from qgs.io.atomic import replacing
+from qgs.io.differences import differing_tensors, shapes_of
+from qgs.io.tensors import CheckpointError, opened_tensors, write_tensors
 from qgs.model import QueryGaussianModel
 
 FORMAT_VERSION = 1
@@ -26,10 +25,6 @@ _RECIPE, _PLUGINS, _CONTRACT = "qgs.recipe", "qgs.plugins", "qgs.contract_versio
 _FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
 
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
-
-
-class CheckpointError(ValueError):
-    """A file that is no usable checkpoint; the message says why and what to do."""
 
 
 def save(
@@ -43,7 +38,7 @@ def save(
 
     extra: more metadata, such as the training step. weights: take these, named as by
     `unique_tensors`, instead of the model's present ones.
-    Raises ValueError for a model that was not composed from a recipe.
+    Raises ValueError for a model that was not composed from a recipe, OSError for a full disk.
     """
     if model.recipe is None:
         raise ValueError(
@@ -74,8 +69,7 @@ def write_checkpoint(
         _VERSION: qgs.__version__,
         **{_EXTRA + key: value for key, value in extra.items()},
     }
-    with replacing(path) as temporary:
-        save_file(dict(tensors), temporary, metadata)
+    write_tensors(path, tensors, metadata)
 
 
 def load(
@@ -87,7 +81,7 @@ def load(
     """
     metadata = _read_metadata(path)
     model = resolve(json.loads(metadata[_RECIPE])).build_model()
-    with safe_open(path, "pt") as file:
+    with opened_tensors(path) as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     load_weights(model, tensors, str(path))
     return (model if device is None else model.to(device)).eval()
@@ -119,13 +113,7 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
     Raises CheckpointError that lists all differences; `origin` names the source in it.
     """
     own = unique_tensors(model)
-    differences = [f"missing: {name}" for name in own if name not in tensors]
-    differences += [f"unexpected: {name}" for name in tensors if name not in own]
-    differences += [
-        f"shape of {name}: {tuple(tensors[name].shape)} in the file, {tuple(own[name].shape)} here"
-        for name in own
-        if name in tensors and tensors[name].shape != own[name].shape
-    ]
+    differences = differing_tensors(shapes_of(tensors), shapes_of(own))
     if differences:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
@@ -141,17 +129,13 @@ def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
     if not Path(path).is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
     _refuse_pickle(path)
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-    except SafetensorError as error:
-        raise CheckpointError(
-            f"{path} is not a whole safetensors file ({error}); it may be cut off: copy it again"
-        ) from error
+    with opened_tensors(path) as file:
+        metadata: dict[str, str] = file.metadata() or {}
     if _RECIPE not in metadata:
         raise CheckpointError(
             f"{path} is a safetensors file without a qgs recipe; only files written by qgs.save "
-            "or `qgs train` can be loaded"
+            "or `qgs train` can be loaded. If it holds published weights, turn them into a "
+            f"checkpoint: `qgs import {path} --recipe auto --out CHECKPOINT.safetensors`"
         )
     _refuse_newer(path, metadata)
     return metadata

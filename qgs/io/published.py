@@ -12,6 +12,7 @@ from qgs.composer.registry import load_registry
 from qgs.contracts import LayoutError, WeightLayout
 from qgs.contracts.layout import Shapes
 from qgs.io.checkpoint import unique_tensors
+from qgs.io.differences import differing_tensors, shapes_of
 
 
 class PublishedError(ValueError):
@@ -34,14 +35,16 @@ class Names:
     def mismatches(self, shapes: Shapes) -> list[str]:
         """What stands against taking a published state dict of these `shapes`, line by line."""
         found = [f"no published name: {name}" for name in self.unnamed]
-        found += [f"missing: {name}" for name in self.published.values() if name not in shapes]
-        known = {*self.published.values(), *self.unused}
-        found += [f"unexpected: {name}" for name in shapes if name not in known]
-        return found + [
-            f"shape of {theirs}: {shapes[theirs]} in the file, {self.shapes[ours]} in the recipe"
-            for ours, theirs in self.published.items()
-            if theirs in shapes and shapes[theirs] != self.shapes[ours]
-        ]
+        named = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
+        return found + differing_tensors(shapes, named, set(self.unused))
+
+    def from_published(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A published state dict without mismatches under our names, `unused` left out."""
+        return {ours: weights[theirs] for ours, theirs in self.published.items()}
+
+    def to_published(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Our parameters under their published names; the inverse of `from_published`."""
+        return {theirs: weights[ours] for ours, theirs in self.published.items()}
 
 
 def layouts_of(recipe: Recipe) -> list[WeightLayout]:
@@ -109,7 +112,7 @@ def from_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, T
         raise PublishedError(
             f"the weights do not fit the recipe, {len(found)} differences:\n  " + "\n  ".join(found)
         )
-    return {ours: weights[theirs] for ours, theirs in names.published.items()}
+    return names.from_published(weights)
 
 
 def to_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
@@ -117,8 +120,7 @@ def to_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, Ten
 
     The inverse of `from_published`. Raises PublishedError for a model that no layout can hold.
     """
-    names = names_in(recipe, exact_layout_of(recipe))
-    return {theirs: weights[ours] for ours, theirs in names.published.items()}
+    return names_in(recipe, exact_layout_of(recipe)).to_published(weights)
 
 
 def exact_layout_of(recipe: Recipe) -> WeightLayout:
@@ -152,11 +154,6 @@ def _differences(names: Names, layout: WeightLayout) -> list[str]:
         for name, shape in theirs.shapes.items()
         if names.shapes.get(name) != shape
     ]
-
-
-def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-    """Names to shapes."""
-    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
 def _or(words: tuple[str, ...]) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,18 +13,18 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from qgs.composer import Recipe, resolve
-from qgs.composer.show import flat
 from qgs.contracts import WeightLayout
+from qgs.contracts.layout import Shapes
 from qgs.io.atomic import replacing, write_text
 from qgs.io.checkpoint import CheckpointError, load_recipe, write_checkpoint
-from qgs.io.fitting import advice, fitting_recipe, recipe_text
+from qgs.io.differences import options_beside_weights, shapes_of
+from qgs.io.fitting import advice, fitting_recipe, recipe_text, without_prefix
 from qgs.io.published import (
     Names,
     PublishedError,
     exact_layout_of,
     layout_of,
     names_in,
-    shapes_of,
 )
 from qgs.io.weight_file import WeightFile, read_weight_file
 
@@ -38,7 +37,7 @@ class Imported:
     """What `import_weights` did.
 
     used: parameters installed. dropped: published names that nothing reads. notes: what was made of
-    the file. recipe_file: the recipe that was written, if one was.
+    the file. recipe_file: the recipe that was written, if one was. settings: as of `Exported`.
     """
 
     layout: WeightLayout
@@ -47,6 +46,7 @@ class Imported:
     dropped: tuple[str, ...]
     notes: tuple[str, ...]
     recipe_file: Path | None
+    settings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -65,35 +65,45 @@ class Exported:
 
 
 def import_weights(
-    weights: str | Path, recipe: Recipe | None, out: str | Path, *, to_float32: bool = False
+    weights: str | Path,
+    recipe: Recipe | None,
+    out: str | Path,
+    *,
+    overrides: Sequence[str] = (),
+    to_float32: bool = False,
 ) -> Imported:
     """Write a checkpoint of `recipe` with published weights.
 
-    recipe: None for the one that fits, which is then also written beside `out`, as .yaml.
+    recipe: None for the one that fits, changed by `overrides` (such as "data.image_size=[64, 64]"),
+        which is then also written beside `out`, as .yaml.
+    out: a new .safetensors file.
     to_float32: convert weights of other floating-point types instead of refusing them.
-    Raises FileNotFoundError, FileExistsError, WeightFileError and PublishedError; nothing is
-    written then.
+    Raises FileNotFoundError, FileExistsError, ValueError for another suffix, RecipeError about
+    `overrides`, WeightFileError and PublishedError; nothing is written then.
     """
-    out = Path(out)
+    out = safetensors_path(out)
     recipe_file = out.with_suffix(".yaml") if recipe is None else None
     for target in filter(None, (out, recipe_file)):
         refuse_taken(target)
-    file = read_weight_file(weights)
+    file = without_prefix(read_weight_file(weights))
     text = ""
     if recipe is None:
         layout, tree = fitting_recipe(shapes_of(file.tensors), str(weights))
-        text = recipe_text(tree, layout, Path(weights).name)
-        recipe = resolve(tree)
+        recipe = resolve(tree, overrides)
+        tree = recipe.tree if overrides else tree
+        text = recipe_text(tree, layout, file.path.name, overrides)
     layout, names = _fitting_names(file, recipe)
-    tensors = {ours: file.tensors[theirs] for ours, theirs in names.published.items()}
+    tensors = names.from_published(file.tensors)
     tensors, converted = _as_float32(tensors, names, file.path, to_float32)
     _refuse_nonfinite(tensors, names, file.path)
     origin = {"imported": f"{layout.name} weights {file.path.name}"}
+    settings = _settings(recipe, layout, shapes_of(file.tensors))
     write_checkpoint(out, tensors, recipe.tree, origin)
     if recipe_file:
-        write_text(recipe_file, text)
+        _write_beside(out, recipe_file, text)
     dropped = tuple(name for name in names.unused if name in file.tensors)
-    return Imported(layout, recipe, len(tensors), dropped, (*file.notes, *converted), recipe_file)
+    notes = (*file.notes, *converted)
+    return Imported(layout, recipe, len(tensors), dropped, notes, recipe_file, settings)
 
 
 def export_weights(checkpoint: str | Path, out: str | Path) -> Exported:
@@ -103,9 +113,7 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Exported:
     ValueError for another suffix, and PublishedError for a model that no published layout can hold;
     nothing is written then.
     """
-    out = Path(out)
-    if out.suffix.lower() != ".safetensors":
-        raise ValueError(f"{out}: weights are written as safetensors; name it .safetensors")
+    out = safetensors_path(out)
     refuse_taken(out)
     recipe = load_recipe(checkpoint)
     layout = exact_layout_of(recipe)
@@ -114,16 +122,34 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Exported:
         stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     if shapes_of(stored) != names.shapes:
         raise CheckpointError(f"{checkpoint} does not fit the model of its recipe; see qgs.load")
-    published = {theirs: stored[ours] for ours, theirs in names.published.items()}
+    published = names.to_published(stored)
     with replacing(out) as temporary:
         save_file(published, temporary, {"format": "pt"})
-    return Exported(layout, len(published), names.unused, _settings(recipe, layout, published))
+    settings = _settings(recipe, layout, shapes_of(published))
+    return Exported(layout, len(published), names.unused, settings)
+
+
+def safetensors_path(path: str | Path) -> Path:
+    """`path`; raises ValueError unless it is named .safetensors."""
+    path = Path(path)
+    if path.suffix.lower() != ".safetensors":
+        raise ValueError(f"{path}: weights are written as safetensors; name it .safetensors")
+    return path
 
 
 def refuse_taken(path: Path) -> None:
     """Raise FileExistsError for a path at which something lies already."""
     if path.exists():
         raise FileExistsError(f"{path} exists and is never overwritten; choose another name")
+
+
+def _write_beside(checkpoint: Path, recipe_file: Path, text: str) -> None:
+    """Write the recipe of a new checkpoint, or take the checkpoint away again."""
+    try:
+        write_text(recipe_file, text)
+    except BaseException:
+        checkpoint.unlink()
+        raise
 
 
 def _fitting_names(file: WeightFile, recipe: Recipe) -> tuple[WeightLayout, Names]:
@@ -161,11 +187,18 @@ def _as_float32(
         raise PublishedError(f"{path} holds weights that are no real numbers: {listed} ({told})")
     if others and not allowed:
         raise PublishedError(
-            f"{path} holds weights that are not float32 ({told}); half precision has lost digits "
-            "that no conversion brings back. Take the float32 file, or convert with --to-float32"
+            f"{path} holds weights that are not float32 ({told}); {_loss(others.values())}"
         )
     notes = [f"converted to float32: {told}"] if others else []
     return _apart({name: t.to(torch.float32).contiguous() for name, t in tensors.items()}), notes
+
+
+def _loss(dtypes: Iterable[torch.dtype]) -> str:
+    """What converting weights of these types to float32 means, and what to do."""
+    if any(dtype.itemsize < torch.float32.itemsize for dtype in dtypes):
+        lost = "half precision has lost digits that no conversion brings back"
+        return f"{lost}. Take the float32 file, or convert with --to-float32"
+    return "--to-float32 rounds them to the float32 that models here compute in"
 
 
 def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -187,22 +220,12 @@ def _refuse_nonfinite(tensors: Mapping[str, Tensor], names: Names, path: Path) -
         )
 
 
-def _settings(
-    recipe: Recipe, layout: WeightLayout, published: Mapping[str, Tensor]
-) -> tuple[str, ...]:
-    """Options of the model, initial values aside, in which it differs from the published one."""
-    own = flat(recipe.tree["model"])
-    theirs = flat(resolve(layout.read(shapes_of(published))).tree["model"])
-    elsewhere = re.compile(r"^(supervision|renderer)\.|(\b|_)(init|std|layer_scale)(\b|_)")
+def _settings(recipe: Recipe, layout: WeightLayout, shapes: Shapes) -> tuple[str, ...]:
+    """Options of the model in which it predicts otherwise than the published one of its sizes."""
+    apart = options_beside_weights(recipe.tree, resolve(layout.read(shapes)).tree)
     return tuple(
-        f"{path}: {_word(own, path)} ({layout.name}: {_word(theirs, path)})"
-        for path in dict.fromkeys([*own, *theirs])
-        if own.get(path) != theirs.get(path) and not elsewhere.search(path)
+        f"{path}: {own} ({layout.name}: {theirs})" for path, (own, theirs) in apart.items()
     )
-
-
-def _word(options: Mapping[str, object], path: str) -> str:
-    return str(options[path]) if path in options else "-"
 
 
 def _listed(names: Iterable[str]) -> str:

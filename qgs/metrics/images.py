@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from kornia.metrics import ssim as kornia_ssim
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
+from qgs.contracts.settings import SsimCovariance
 from qgs.geometry.precision import full_precision
 
 _WINDOW = 11
+_SIGMA = 1.5
+_STABILISERS = (0.01**2, 0.03**2)
+"""C1 and C2 of Wang et al. 2004 for a data range of 1."""
 _MSE_FLOOR = 1e-10
 """Identical images get 100 dB."""
 
@@ -16,7 +20,7 @@ IMAGE_METRICS = {
     "ssim": "scikit-image: Gaussian window of 11, sigma 1.5, data range 1, borders left out",
     "lpips": "VGG-16, version 0.1, images in [-1, 1]",
 }
-"""What each metric is, in words that are part of an evaluation protocol."""
+"""What each metric is, in words that are part of a protocol; `ssim` has two forms beside them."""
 
 
 @full_precision
@@ -27,12 +31,14 @@ def psnr(images: Tensor, truth: Tensor) -> Tensor:
 
 
 @full_precision
-def ssim(images: Tensor, truth: Tensor) -> Tensor:
+def ssim(images: Tensor, truth: Tensor, covariance: SsimCovariance = "population") -> Tensor:
     """Structural similarity of images (..., 3, H, W), clipped to [0, 1] -> (...).
 
-    Equals scikit-image's `structural_similarity` with gaussian_weights, sigma 1.5, data_range 1
-    and use_sample_covariance=False, which leaves out the 5 pixels at the border. Computed in
-    float64: the variances of flat images are small differences of squares.
+    Wang et al. 2004, eq. 13. Equals scikit-image's `structural_similarity` with gaussian_weights,
+    sigma 1.5 and data_range 1, which leaves out the 5 pixels at the border; with
+    use_sample_covariance=False for the covariance "population", True, its default, for "sample",
+    where the N = 11 * 11 pixels of a window give variances times N / (N - 1). Computed in float64:
+    the variances of flat images are small differences of squares.
     Raises ValueError when a side is shorter than the window of 11 pixels.
     """
     if min(images.shape[-2:]) < _WINDOW:
@@ -40,6 +46,20 @@ def ssim(images: Tensor, truth: Tensor) -> Tensor:
             f"SSIM needs images of at least {_WINDOW} pixels a side, got "
             f"{images.shape[-2]}x{images.shape[-1]}"
         )
-    flat = [x.clamp(0, 1).double().reshape(-1, *x.shape[-3:]) for x in (images, truth)]
-    similarity = kornia_ssim(*flat, window_size=_WINDOW, padding="valid", eps=0.0)
+    x, y = (image.clamp(0, 1).double().reshape(-1, *image.shape[-3:]) for image in (images, truth))
+    samples = _WINDOW**2
+    correction = samples / (samples - 1) if covariance == "sample" else 1.0
+    mean_x, mean_y = _windowed(x), _windowed(y)
+    variances = correction * (_windowed(x * x + y * y) - mean_x.square() - mean_y.square())
+    shared = correction * (_windowed(x * y) - mean_x * mean_y)
+    c1, c2 = _STABILISERS
+    similarity = (2 * mean_x * mean_y + c1) * (2 * shared + c2)
+    similarity /= (mean_x.square() + mean_y.square() + c1) * (variances + c2)
     return similarity.mean((-3, -2, -1)).reshape(images.shape[:-3]).to(images.dtype)
+
+
+def _windowed(images: Tensor) -> Tensor:
+    """Gaussian means (B, 3, H - 10, W - 10) over the windows within images (B, 3, H, W)."""
+    border = _WINDOW // 2
+    blurred = gaussian_blur2d(images, (_WINDOW, _WINDOW), (_SIGMA, _SIGMA))
+    return blurred[..., border:-border, border:-border]

@@ -86,4 +86,4 @@ def test_mistakes_are_told(words: list[str], message: str) -> None:
 def test_short_names(tmp_path: Path) -> None:
     assert short_names(["a/tiny/x.yaml", "a/tiny/y.yaml"]) == ["x", "y"]
     assert short_names(["a/tiny/x.yaml", "a/big/x.yaml"]) == ["tiny/x", "big/x"]
-    assert short_names([str(tmp_path / "x.yaml")] * 2) == ["x", "x"]
+    assert short_names([str(tmp_path / "x.yaml")] * 3) == ["x", "x (2)", "x (3)"]

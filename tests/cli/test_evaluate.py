@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ SMALL = (
 )
 
 
-def evaluated(*words: str | Path) -> Result:
+def evaluated(*words: object) -> Result:
     return CliRunner().invoke(app, ["eval", *(str(word) for word in words)])
 
 
@@ -126,6 +127,17 @@ def test_different_protocols_compare_only_when_told(
     assert "test/000000" in allowed.output
 
 
+def test_a_comparison_of_incomplete_results_names_what_is_missing(
+    runs: Path, index: Path, tmp_path: Path
+) -> None:
+    outs = [tmp_path / name for name in ("locus", "tokengs")]
+    for out in outs:
+        assert evaluated(runs / out.name, "--index", index, "--out", out).exit_code == 0
+    result = evaluated("--compare", *outs)
+    assert result.exit_code == 0, result.output
+    assert "2 of 3 scenes (missing: absent)" in " ".join(result.output.split())
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
@@ -133,6 +145,7 @@ def test_different_protocols_compare_only_when_told(
         (["RUN", "--across-protocols"], "add --compare"),
         (["--compare", "RUN"], "takes two or more different results"),
         (["--compare", "RUN", "RUN", "--tune", "3"], "evaluation.tuning_steps=3 has no effect"),
+        (["--compare", "RUN", "RUN", "--strict"], "--strict has no effect"),
         (["RUN", "--set", "training.steps=1"], "would change the trained model"),
     ],
 )
@@ -140,6 +153,31 @@ def test_words_without_effect_are_refused(runs: Path, words: list[str], reason: 
     result = evaluated(*(str(runs / "locus") if word == "RUN" else word for word in words))
     assert isinstance(result.exception, ValueError)
     assert reason in str(result.exception)
+
+
+def test_strict_evaluations_that_lack_a_scene_exit_with_1(
+    runs: Path, index: Path, tmp_path: Path
+) -> None:
+    words = (runs / "locus", "--index", index, "--out", tmp_path / "out")
+    assert evaluated(*words).exit_code == 0
+    strict = evaluated(*words, "--strict")
+    assert strict.exit_code == 1
+    assert "over 2 of 3 scenes; missing: absent" in strict.output
+    assert len(summary(tmp_path / "out")["missing"]) == 1
+    index.write_text(json.dumps({"test/000001": {"context": [0, 3], "target": [1]}}))
+    assert evaluated(*words, "--strict").exit_code == 0
+
+
+def test_averaged_weights_of_a_run_are_told(runs: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("checkpoint", "checkpoint_ema"):
+        shutil.copy(runs / "locus" / "checkpoint.safetensors", run / f"{name}.safetensors")
+    hint = f"qgs eval {run / 'checkpoint_ema.safetensors'}"
+    few = ("--set", "evaluation.scenes=1")
+    assert hint in evaluated(run, *few).output
+    assert hint not in evaluated(run / "checkpoint_ema.safetensors", *few).output
+    assert hint not in evaluated(runs / "locus", *few, "--out", tmp_path / "out").output
 
 
 def test_a_missing_index_is_told(runs: Path, tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from qgs.cli.reconstruct import only_scene, photos_config, was_trained_on
+from qgs.cli.reconstruct import photos_config, was_trained_on
+from qgs.cli.scene_choice import scene_of
 from qgs.composer import resolve
 from qgs.data import PhotosSource
 
@@ -43,7 +44,7 @@ def test_photos_of_any_format_are_opened_for_a_model_of_other_data(scene):
     trained = recipe(type="qgs/photos", path="elsewhere", format="nerfstudio", images="images_2")
     for source in (trained, recipe(type="qgs/rooms")):
         config = photos_config(source, str(scene))
-        opened = only_scene(PhotosSource(config), str(scene))
+        opened = scene_of(PhotosSource(config), str(scene), None)
         assert opened.frame_name(2) == "images/2.png"
         assert len(opened.held_out) == 0
         assert opened.images([2])[0, :, 3, 3].mul(255).round().tolist() == [20, 0, 0]
@@ -62,10 +63,20 @@ def test_several_scenes_are_refused(scene):
     shutil.copytree(scene, scene.parent / "b")
     root = str(scene.parent)
     with pytest.raises(ValueError, match="holds 2 scenes"):
-        only_scene(PhotosSource(photos_config(recipe(type="qgs/rooms"), root)), root)
+        scene_of(PhotosSource(photos_config(recipe(type="qgs/rooms"), root)), root, None)
 
 
 def test_files_of_no_format_are_told(tmp_path):
     (tmp_path / "transforms.txt").write_text("{}")
     with pytest.raises(FileNotFoundError, match=r"no transforms\.json nor another listing"):
         PhotosSource(photos_config(recipe(type="qgs/rooms"), str(tmp_path)))
+
+
+def test_a_recipe_without_data_takes_the_size_that_is_given(scene):
+    imported = resolve({"recipe": 1, "model": MODEL})
+    with pytest.raises(ValueError, match="such as --size 256x256"):
+        photos_config(imported, str(scene))
+    for source in (imported, recipe(type="qgs/rooms"), recipe(type="qgs/photos", path=str(scene))):
+        config = photos_config(source, str(scene), (8, 24))
+        opened = scene_of(PhotosSource(config), str(scene), None)
+        assert opened.images([2]).shape == (1, 3, 8, 24)

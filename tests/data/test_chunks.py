@@ -203,7 +203,7 @@ def test_transparent_pixels_show_the_background(tmp_path):
 
 BROKEN = {
     "no list": ({"key": "s0"}, "holds a dict, expected a list of mappings"),
-    "no mappings": ([1], "holds a int, expected a mapping with 'key'"),
+    "no mappings": ([1], "holds an int, expected a mapping with 'key'"),
     "too many cameras": (
         [record("s0", cameras=torch.zeros(5, 18))],
         r"scene 's0': 'cameras' must be a tensor of shape \[4, 18\].*got \[5, 18\]",
@@ -289,3 +289,15 @@ def test_folders_that_are_not_there(tmp_path):
         opened(tmp_path)
     with pytest.raises(ValueError, match="cannot be opened as a path or URL"):
         opened("nosuch://bucket")
+
+
+def test_a_chunk_with_python_objects_is_told_without_torchs_advice(tmp_path):
+    file = tmp_path / "0.torch"
+    torch.save([UPath(tmp_path)], file)
+    with pytest.raises(ValueError, match="holds Python objects, whose reading could run code") as e:
+        load_chunk(UPath(file))
+    assert "\x1b" not in str(e.value)
+    assert "cut off" not in str(e.value)
+    file.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(ValueError, match="it is cut off or no torch file"):
+        load_chunk(UPath(file))

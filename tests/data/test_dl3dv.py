@@ -135,6 +135,16 @@ def test_archives_that_lead_outside_are_refused_by_name(tmp_path, name):
     assert repr(name) in str(error.value) or repr(told) in str(error.value)
 
 
+def test_archives_of_other_writers(tmp_path):
+    file = tmp_path / "abc.zip"
+    archive(file, {"./": b"", "./abc/a.txt": b"a", "abc\\images\\b.txt": b"b"})
+    folder = ArchivePath(UPath(file)) / "abc"
+    assert [path.name for path in folder.iterdir()] == ["a.txt", "images"]
+    assert (folder / "a.txt").read_bytes() == b"a"
+    assert (folder / "images" / "b.txt").read_bytes() == b"b"
+    assert (folder / "images").is_dir()
+
+
 @pytest.mark.parametrize(
     ("files", "message"),
     [

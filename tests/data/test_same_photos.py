@@ -59,6 +59,19 @@ def test_pixels_masks_intrinsics_and_poses(tmp_path, name, read):
     assert (before.cameras.c2w - after.cameras.c2w).abs().max() <= 1e-5
 
 
+def test_a_photo_sets_own_llff_poses():
+    one, other = (
+        PhotosSource(
+            PhotosSource.Config(path=str(PHOTOS / "mary_rose"), format=kind, image_size=SIZE)
+        ).scenes("train")[0]
+        for kind in ("nerfstudio", "llff")
+    )
+    places = {other.frame_name(frame): frame for frame in range(len(other))}
+    order = [places[one.frame_name(frame)] for frame in range(len(one))]
+    assert sorted(order) == list(range(len(other)))
+    assert torch.equal(one.cameras.c2w, other.cameras[order].c2w)
+
+
 @pytest.mark.parametrize(
     ("name", "split", "key", "crop"),
     [

@@ -204,3 +204,13 @@ def test_training_resumes_exactly():
     assert len(set(names)) == 5, "an epoch visits every scene once"
     assert through[0].inputs.images.is_contiguous()
     assert through[0].targets.images.shape == (2, 3, 3, 8, 8)
+
+
+def test_a_gap_below_the_smallest_is_told_once(caplog):
+    views = ViewsConfig(inputs=2, targets=1, gap=(10, 40))
+    for seed in range(3):
+        draw_frames(Line(7), views, np.random.default_rng(seed))
+    assert [record.message for record in caplog.records] == [
+        "scene 'line7' has 7 frames for inputs, fewer than views.gap [10, 40] asks for: its gap is "
+        "6"
+    ]

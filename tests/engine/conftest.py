@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from qgs.composer import Recipe, resolve
 
@@ -16,13 +17,22 @@ SMALL = (
     "model.heads=2",
     "model.queries.count=24",
     "model.head.gaussians_per_query=4",
-    "data.image_size=[32, 32]",
+    "data.image_size=[16, 16]",
     "views.targets=2",
     "evaluation.scenes=2",
     "training.steps=4",
     "training.seconds=null",
     "training.warmup=2",
 )
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Small models lose more by sharing work between threads than they gain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -103,8 +103,8 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
 ) -> None:
     recipe = tiny(
         "tokengs",
-        "training.steps=400",
-        "training.warmup=300",
+        "training.steps=300",
+        "training.warmup=150",
         "training.learning_rate=0.5",
         "training.initial_divisor=1e5",
         "training.save_every=25",
@@ -152,7 +152,7 @@ def test_nan_stops_at_once_with_finite_weights(tiny: Callable[..., Recipe], tmp_
     trainer = Trainer(tiny("locus"), tmp_path / "run")
     with torch.no_grad():
         trainer.model.decoder[0].feed_forward_scale.gamma.fill_(torch.nan)
-    with closing(trainer), pytest.raises(CollapseError, match=r"step 0: .*nan") as caught:
+    with closing(trainer), pytest.raises(CollapseError, match=r"step 1: .*nan") as caught:
         trainer.run(TrainingProgress(QUIET), StopRequest())
     for cause in ("learning_rate", "precision", "images, poses"):
         assert cause in str(caught.value)

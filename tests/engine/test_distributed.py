@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -39,8 +40,8 @@ def train_in_two_processes(recipe: Recipe, run: Path, **environment: str) -> lis
         timeout=240,
     )
     assert done.returncode == 0, done.stderr
-    lines = [line.split() for line in done.stdout.splitlines()]
-    return [words for words in lines if words and words[0] in ("True", "False")]
+    # wherever they stand: what libraries print meanwhile lands in the same lines
+    return [list(words) for words in re.findall(r"(True|False) (\d+) (\d+\.\d+)", done.stdout)]
 
 
 def losses(run: Path) -> list[float]:

@@ -8,6 +8,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,9 @@ from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.rooms import RoomsSource
 from qgs.engine import evaluate
+from qgs.engine.comparison import Comparisons
 from qgs.engine.scores import METHODS, Evaluation
+from qgs.engine.stored import read_results
 from qgs.metrics import mean_colour, nearest_input, psnr, ssim, token_dispersion
 from qgs.metrics.lpips import LpipsUnavailableError
 
@@ -122,6 +125,31 @@ def test_batches_pass_through_the_model_together(
     assert sizes == [(2, 2), (1, 3), (1, 1)]
 
 
+def test_scenes_with_other_numbers_of_targets_pass_together(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [2]), room1=([0, 4], [1, 2, 3])))
+    model = recipe.build_model()
+    alone = evaluate(model, recipe)
+    sizes = []
+    model.register_forward_hook(lambda module, args, out: sizes.append(len(args[0].images)))
+    together = evaluate(model, recipe, batch=2)
+    assert sizes == [2]
+    for first, second in zip(alone.scores, together.scores, strict=True):
+        assert second.values == pytest.approx(first.values, rel=1e-4, abs=1e-5)
+
+
+def test_frames_that_a_model_is_given_and_judged_on_are_told(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [4, 2, 0]), room1=([0, 4], [2])))
+    evaluation = evaluate(recipe.build_model(), recipe)
+    assert evaluation.summary()["context_and_target"] == {"test/000000": [0, 4]}
+    expected = "1 scene with frames as context and as target"
+    (line,) = (line for line in shown(evaluation).splitlines() if expected in line)
+    assert line.endswith("test/000000 (0 4)")
+
+
 def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     tiny: Callable[..., Recipe], tmp_path: Path
 ) -> None:
@@ -132,13 +160,16 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     assert evaluation.wanted == ("test/000000", "test/000001", "gone")
     summary = evaluation.summary()
     assert summary["missing"] == {
-        "test/000001": "frames 99 are out of range, it has frames 0 to 7",
+        "test/000001": "frame 99 is out of range, it has frames 0 to 7",
         "gone": "not among the test scenes of the data",
     }
     assert (summary["scenes"], summary["scenes_in_protocol"]) == (1, 3)
     assert summary["null_entries"] == ["nil"]
     assert len(summary["not_in_index"]) == 30
     evaluation.write(tmp_path)
+    whole = replace(evaluation, wanted=evaluation.wanted[:1], missing=())
+    assert whole.summary()["statement"].endswith(" over 1 scene")
+    assert "input views of 16 x 16 pixels, poses" in shown(evaluation)
     line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
     table = (tmp_path / "table.md").read_text()
     for text in (shown(evaluation), table, summary["statement"]):
@@ -269,6 +300,25 @@ def test_the_table_shows_all_three_and_why_a_column_is_empty(
     for word in ("model", "nearest input", "mean colour", "PSNR", "SSIM", "dispersion"):
         assert word in text
     assert "LPIPS is empty: there are no VGG-16 weights here" in text
+
+
+def test_the_form_of_ssim_is_named_where_it_is_not_the_default(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    plain, sample = tiny("tokengs"), tiny("tokengs", "evaluation.ssim_covariance=sample")
+    model = plain.build_model()
+    evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
+    first, second = (e.mean_value("mean_colour_ssim") for e in evaluations)
+    assert 0 < abs(first - second) < 1e-3
+    assert "covariance" not in shown(evaluations[0])
+    assert "SSIM (sample covariance) ↑" in shown(evaluations[1])
+    for name, evaluation in zip("ab", evaluations, strict=True):
+        evaluation.write(tmp_path / name)
+    stored = [read_results(tmp_path / name) for name in "ab"]
+    with pytest.raises(ValueError, match="which differ in ssim_covariance:"):
+        Comparisons.of(stored)
+    text = Comparisons.of(stored, across_protocols=True).markdown()
+    assert text.count("SSIM with sample covariance") == 1
 
 
 def test_lpips_fills_its_column_where_it_can(

@@ -19,7 +19,7 @@ def results(name: str, protocol: str = "rooms", **psnr: float) -> StoredResults:
     scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
     content = {"format": 1, "views": protocol}
     frames = dict.fromkeys(scenes, ("0 3", "1 2"))
-    return StoredResults(name, protocol, HASHES[protocol], content, scenes, frames)
+    return StoredResults(name, protocol, HASHES[protocol], content, scenes, frames, len(scenes))
 
 
 def test_the_interval_is_that_of_scipy() -> None:
@@ -92,6 +92,19 @@ def test_scenes_judged_on_other_frames_are_refused_although_protocols_agree() ->
         Comparisons.of([first, moved])
     text = Comparisons.of([first, moved], across_protocols=True).markdown()
     assert "1 scenes judged on different frames: b" in text
+
+
+def test_incomplete_results_say_so_in_one_line_with_the_count() -> None:
+    first, second = (
+        replace(results(name, a=1.0, b=2.0), wanted=3, missing=["c"], null=["d"]) for name in "xy"
+    )
+    text = Comparisons.of([first, second]).markdown()
+    assert "x against y, 2 of 3 scenes (missing: c)" in text
+    for name in "xy":
+        assert f"{name} is incomplete: no score of c" in text
+    assert "null entries of the index, not judged (1): d" in text
+    complete = Comparisons.of([results("x", a=1.0), results("y", a=2.0)]).markdown()
+    assert "x against y, 1 scene**" in complete
 
 
 def test_tables_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

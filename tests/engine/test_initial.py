@@ -15,7 +15,6 @@ from torch import Generator, Tensor
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Queries
-from qgs.contracts.queries import GROWTH_NOISE
 from qgs.engine import train
 from qgs.engine.initial import initialise
 from qgs.io.checkpoint import CheckpointError, save
@@ -25,6 +24,7 @@ from qgs.model import QueryGaussianModel
 
 Tiny = Callable[..., Recipe]
 COUNT = 24
+GROWTH_NOISE = 0.01  # LocusGS release
 PER_QUERY = {"tokengs": ["features"], "locus": ["features", "center", "raw_radius"]}
 
 
@@ -141,15 +141,41 @@ def test_every_difference_is_told_with_the_options_that_fit(
         initialise(model, recipe)
     for words in (
         "init_from",
-        "shape of head.linear.weight: (56, 32) in the checkpoint, (70, 32) here",
-        "shape of head.linear.bias: (56,) in the checkpoint, (70,) here",
+        "shape of head.linear.weight: (56, 32) in the file, (70, 32) in the recipe",
+        "shape of head.linear.bias: (56,) in the file, (70,) in the recipe",
         "unexpected: head.norm.weight",
         "model.head.gaussians_per_query: 4 (here 5)",
-        "model.head.norm: True (here False)",
+        "model.head.norm: true (here false)",
     ):
         assert words in str(caught.value)
     assert "queries" not in str(caught.value).split("only the number of queries may differ")[1]
     assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
+
+
+def test_a_refusal_lists_no_options_that_play_no_part(
+    tiny: Tiny, learned: Callable[[str], Path]
+) -> None:
+    recipe = tiny("locus", f"init_from={learned('locus')}", "model.head.gaussians_per_query=5",
+                  "model.queries.std=0.3", "model.queries.init_radius=0.7",
+                  "model.encoder.layer_scale=0.3")  # fmt: skip
+    with pytest.raises(CheckpointError) as caught:
+        initialise(recipe.build_model(), recipe)
+    options = str(caught.value).split("was trained with:")[1]
+    assert options.split() == ["model.head.gaussians_per_query:", "4", "(here", "5)"]
+
+
+def test_options_that_no_weight_shows_are_told(tiny: Tiny, learned: Callable[[str], Path]) -> None:
+    options = ("model.head.scale_cap=0.3", "model.queries.init_radius=0.7")
+    _, told = started(tiny("locus", f"init_from={learned('locus')}", *options))
+    cap = tiny("locus").tree["model"]["head"]["scale_cap"]
+    assert told[1:] == [f"learned with model.head.scale_cap: {cap} (here 0.3)"]
+
+
+def test_published_weights_are_to_be_imported_first(tiny: Tiny, tmp_path: Path) -> None:
+    save_file({"gs_tokens": torch.zeros(2)}, tmp_path / "w.safetensors")
+    recipe = tiny("tokengs", f"init_from={tmp_path / 'w.safetensors'}")
+    with pytest.raises(CheckpointError, match=r"`qgs import .* --recipe auto"):
+        initialise(recipe.build_model(), recipe)
 
 
 def test_another_width_is_no_other_number_of_queries(
@@ -157,7 +183,9 @@ def test_another_width_is_no_other_number_of_queries(
 ) -> None:
     path = learned("tokengs")
     recipe = tiny("tokengs", f"init_from={path}", "model.width=64", "model.queries.count=48")
-    with pytest.raises(CheckpointError, match=r"queries\.features: \(24, 32\).*\(48, 64\) here"):
+    with pytest.raises(
+        CheckpointError, match=r"queries\.features: \(24, 32\).*\(48, 64\) in the rec"
+    ):
         initialise(recipe.build_model(), recipe)
 
 

@@ -163,7 +163,7 @@ def incidents_of(step: Step, folder: Path) -> Incidents:
 
 def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
     step.batches[1].targets.images[0, 0, 0, 0, 0] = NAN
-    told = incidents_of(step, tmp_path).look_into(7, step.batches, "loss term mse is nan")
+    told = str(incidents_of(step, tmp_path).look_into(7, step.batches, "loss term mse is nan"))
     place = tmp_path / "incidents" / "step-7"
     names = {"batch.safetensors", "weights.safetensors", "report.json"}
     assert {path.name for path in place.iterdir()} == names
@@ -188,8 +188,9 @@ def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_repeated_is_told_so(step: Step, tmp_path: Path) -> None:
-    told = incidents_of(step, tmp_path).look_into(3, step.batches, "loss is nan")
-    assert "repeating the step gave finite numbers" in told
+    incident = incidents_of(step, tmp_path).look_into(3, step.batches, "loss is nan")
+    assert "repeating the step gave finite numbers" in str(incident)
+    assert not incident.in_data
 
 
 def test_the_number_of_saved_incidents_is_bounded(
@@ -199,7 +200,7 @@ def test_the_number_of_saved_incidents_is_bounded(
     incidents = incidents_of(step, tmp_path)
     told = [incidents.look_into(n, step.batches[:1], "loss is nan") for n in range(KEPT + 2)]
     assert len(list((tmp_path / "incidents").iterdir())) == KEPT
-    assert "not saved" in told[-1]
+    assert "not saved" in str(told[-1])
     assert incidents.in_a_row == incidents.total == KEPT + 2
     incidents.passed()
     assert (incidents.in_a_row, incidents.total) == (0, KEPT + 2)

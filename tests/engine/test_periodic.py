@@ -77,7 +77,7 @@ def test_a_picture_shows_inputs_truth_rendering_and_depth(recipe: Recipe, tmp_pa
     )
     periodic.run(5)
     picture = np.asarray(Image.open(tmp_path / "pictures" / "step-5.png"))
-    side, gap, columns, rows = 32, 4, 5, 3
+    side, gap, columns, rows = 16, 4, 5, 3
     assert picture.shape == (rows * (side + gap) - gap, columns * (side + gap) - gap, 3)
     scene = recipe.build_data().scenes("test")[0]
     first_input = scene.images([frame_of(recipe)])[0]

@@ -8,10 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 
-from qgs.composer import Recipe
+from qgs.composer import Recipe, resolve
+from qgs.data.index import read_index
 from qgs.engine.protocol import Protocol, index_of, protocol_of
 
+RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
 INDEX = {"a": {"context": [0, 3], "target": [1, 2]}, "b": None}
 
 
@@ -72,8 +75,13 @@ def test_the_content_of_the_index_is_hashed(
         "views.scale=distance",
         "views.scale_factor=0.5",
         "evaluation.metrics=[lpips]",
+        "evaluation.ssim_covariance=sample",
         "evaluation.tuning_steps=50",
         "data.fov=[60.0, 70.0]",
+        "model.renderer.background=[0.0, 0.0, 0.0]",
+        "model.renderer.near=0.5",
+        "model.renderer.far=50.0",
+        "model.renderer.dilation=0.1",
     ],
 )
 def test_whatever_decides_the_numbers_is_hashed(
@@ -91,6 +99,7 @@ def test_whatever_decides_the_numbers_is_hashed(
         "data.cache_mb=1",
         "views.mirror=0.25",
         "seed=4",
+        "model.renderer.type=qgs/cpu",
     ],
 )
 def test_nothing_else_is_hashed(tiny: Callable[..., Recipe], file: Path, override: str) -> None:
@@ -116,3 +125,31 @@ def test_settings_tell_a_long_index_shortly(tiny: Callable[..., Recipe], file: P
     views = indexed(tiny, file).settings()["views"]
     assert views["index"]["scenes"] == 2
     assert "a" not in views["index"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "override"),
+    [
+        ("qgs/photos", "data.holdout=4"),
+        ("qgs/photos", "data.max_frames=9"),
+        ("qgs/chunks", "data.holdout=4"),
+        ("qgs/dl3dv", "data.holdout=4"),
+    ],
+)
+def test_splits_count_only_where_no_index_names_the_frames(
+    file: Path, kind: str, override: str
+) -> None:
+    def recipe(*more: str) -> Recipe:
+        tree = yaml.safe_load((RECIPES / "tokengs.yaml").read_text())
+        return resolve({**tree, "data": {"type": kind, "path": "x"}}, more)
+
+    plain, split = recipe(), recipe(override)
+    index = read_index(str(file))
+    assert protocol_of(split, index).sha256 == protocol_of(plain, index).sha256
+    assert protocol_of(split, None, ["x"]).sha256 != protocol_of(plain, None, ["x"]).sha256
+
+
+def test_the_number_of_rooms_does_not_count_beside_an_index(
+    tiny: Callable[..., Recipe], file: Path
+) -> None:
+    assert indexed(tiny, file, "data.test_scenes=9").sha256 == indexed(tiny, file).sha256

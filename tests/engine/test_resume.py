@@ -130,7 +130,7 @@ def test_a_stopped_run_goes_on_where_it_stopped(
 
     trainer.run(Stopping(QUIET), stop)
     trainer.close()
-    assert trainer.step == 3, "a request is seen at the end of the step in which it comes"
+    assert trainer.counters.step == 3, "a request is seen at the end of the step in which it comes"
     assert resumed(recipe, tmp_path / "stopped").resumed_at == 3
     assert_equal_runs(tmp_path / "through", tmp_path / "stopped")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from rich.console import Console
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.data.loader import training_batches
-from qgs.engine import RunFolder, train
+from qgs.engine import RunFolder, interrupt, train
 from qgs.engine.folder import checkpoint_of
 from qgs.engine.interrupt import stop_requests
 from qgs.engine.schedule import OneCycle
@@ -109,14 +110,15 @@ def test_a_signal_saves_and_ends(
     history = tmp_path / "run" / "history.jsonl"
 
     def interrupt_once_training() -> None:
-        while not history.exists():
+        ends = time.monotonic() + 60
+        while not history.exists() and time.monotonic() < ends:
             threading.Event().wait(0.05)
         os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=interrupt_once_training, daemon=True)
     thread.start()
     result = train(tiny("tokengs", "training.steps=100000"), history.parent, console=QUIET)
-    thread.join()
+    thread.join(timeout=60)
     assert result.stopped_by == number.name
     assert result.steps == len(result.folder.history())
     assert load_extra(result.folder.checkpoint)["step"] == str(result.steps)
@@ -129,7 +131,7 @@ def test_a_folder_in_use_is_refused_untouched(tiny: Callable[..., Recipe], tmp_p
         train(tiny("tokengs"), tmp_path, console=QUIET)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(FileExistsError, match="is a file"):
-        RunFolder.create(tmp_path / "notes.txt")
+        RunFolder(tmp_path / "notes.txt").refuse_used()
 
 
 def test_a_start_that_fails_leaves_no_folder(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
@@ -151,12 +153,21 @@ def test_the_thread_that_reads_ahead_ends_with_the_run(
     assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
 
 
-def test_a_second_signal_is_not_caught() -> None:
+def test_only_a_later_second_ctrl_c_is_not_caught(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(interrupt.time, "monotonic", lambda: now)
     with stop_requests() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.signal is signal.SIGINT
+        for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+            signal.raise_signal(number)
+        assert stop.signal is signal.SIGTERM
+        now += interrupt.PAUSE
+        signal.raise_signal(signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+    told = "SIGTERM: finishing the step, saving; Ctrl-C again to give up"
+    assert capfd.readouterr().err.count(told) == 1
 
 
 def test_the_checkpoint_of_a_run_is_found(tmp_path: Path) -> None:

@@ -13,11 +13,12 @@ import torch
 from rich.console import Console
 
 import qgs
+from qgs.cli.contest import curves_of
 from qgs.composer import Recipe
 from qgs.contracts.extras import MissingExtraError
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleStream
-from qgs.engine import CollapseError, TrainingResult, trackers, train
+from qgs.engine import NonFiniteError, TrainingResult, trackers, train
 from qgs.engine.incidents import PATIENCE, read_batch
 
 QUIET = Console(quiet=True)
@@ -111,7 +112,7 @@ def test_a_bad_step_ends_the_run_before_the_optimiser(
 ) -> None:
     bad_batches(2)
     folder = tmp_path / "run"
-    with pytest.raises(CollapseError, match=r"targets\.images \(1 NaN of") as error:
+    with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
         run(tiny("tokengs"), folder)
     incident = folder / "incidents" / "step-3"
     assert str(incident) in str(error.value)
@@ -138,7 +139,7 @@ def test_a_bad_gradient_ends_the_run_too(
         return model
 
     monkeypatch.setattr(Recipe, "build_model", poisoned)
-    with pytest.raises(CollapseError, match="the first bad tensor is gradient of"):
+    with pytest.raises(NonFiniteError, match="the first bad tensor is gradient of"):
         run(tiny("tokengs"), tmp_path / "run")
     assert not (tmp_path / "run" / "history.jsonl").exists()
 
@@ -159,6 +160,8 @@ def test_a_bad_step_is_skipped_on_demand(
     records = lines(result.folder.path / "history.jsonl")
     assert [record["step"] for record in records] == [1, 2, 3, 4]
     assert ["loss" in record for record in records] == [True, False, True, False]
+    assert [record.get("skipped", False) for record in records] == [False, True, False, True]
+    assert len(curves_of(result.folder).loss) == 2
     incidents = {path.name for path in (result.folder.path / "incidents").iterdir()}
     assert incidents == {"step-2", "step-4"}
     for file in (result.folder.checkpoint, result.folder.checkpoint_ema):
@@ -173,9 +176,9 @@ def test_a_run_that_a_bad_step_ended_goes_on_without_it(
     skipping = tiny("locus", *options, "training.on_nonfinite=skip")
     through = run(skipping, tmp_path / "through")
     stopping = tiny("locus", *options)
-    with pytest.raises(CollapseError, match="collapsed at step 2"):
+    with pytest.raises(NonFiniteError, match="step 3 is not finite"):
         run(stopping, tmp_path / "stopped")
-    with pytest.raises(CollapseError, match="collapsed at step 2"):
+    with pytest.raises(NonFiniteError, match="step 3 is not finite"):
         train(stopping, tmp_path / "stopped", console=QUIET, device="cpu", resume=True)
     again = train(skipping, tmp_path / "stopped", console=QUIET, device="cpu", resume=True)
     assert again.resumed_at == 2
@@ -189,7 +192,7 @@ def test_skipping_comes_to_an_end(
 ) -> None:
     bad_batches(*range(1, 100))
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
-    with pytest.raises(CollapseError, match=f"{PATIENCE} steps in a row were skipped"):
+    with pytest.raises(NonFiniteError, match=f"{PATIENCE} steps in a row were skipped"):
         run(recipe, tmp_path / "run")
     steps = [record["step"] for record in lines(tmp_path / "run" / "history.jsonl")]
     assert steps == list(range(1, PATIENCE + 2))

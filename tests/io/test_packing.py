@@ -271,6 +271,24 @@ def test_a_killed_packing_goes_on(tmp_path):
     assert all(len(scene.images([1])) for scene in after.scenes("train"))
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", r"packing\.json is not valid JSON .*: move it away .*, or give a new folder"),
+        ("{}", r"packing\.json was not written by a packing: move it away"),
+        ("[1]", "was not written by a packing"),
+        ('{"settings": {}, "files": {"train": []}}', "was not written by a packing"),
+    ],
+)
+def test_a_journal_that_packing_did_not_write(tmp_path, content, message):
+    before = source(many(tmp_path / "scenes"))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "packing.json").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        pack(before, tmp_path / "out")
+    assert (tmp_path / "out" / "packing.json").read_text() == content
+
+
 def test_the_command(tmp_path):
     many(tmp_path / "scenes")
     words = ["data", "pack", tmp_path / "scenes", "--out", tmp_path / "out", "--test-every", "3"]

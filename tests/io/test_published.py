@@ -12,13 +12,13 @@ from torch import Tensor
 
 from qgs.components import TOKENGS
 from qgs.composer import Recipe, resolve
+from qgs.io.differences import shapes_of
 from qgs.io.published import (
     PublishedError,
     exact_layout_of,
     from_published,
     layout_of,
     names_in,
-    shapes_of,
     to_published,
 )
 

@@ -89,8 +89,9 @@ def test_other_precisions_are_converted_only_on_demand(
     path, out = tmp_path / "w.safetensors", tmp_path / "o.safetensors"
     save_file(weights, path)
     kind = str(dtype).removeprefix("torch.")
-    with pytest.raises(PublishedError, match=f"{len(weights)} are {kind}.*--to-float32"):
+    with pytest.raises(PublishedError, match=f"{len(weights)} are {kind}.*--to-float32") as caught:
         import_weights(path, None, out)
+    assert ("half precision" in str(caught.value)) is (dtype != torch.float64)
     assert list(tmp_path.iterdir()) == [path]
     done = import_weights(path, None, out, to_float32=True)
     assert any(kind in note for note in done.notes)
@@ -132,9 +133,9 @@ OPTIONS_THAT_FIT = [
     ("model.queries.count=13", "model.queries.count: 12 (the recipe has 13)"),
     ("model.encoder.depth=3", "model.encoder.depth: 1 (the recipe has 3)"),
     ("model.encoder.patch_size=4", "model.encoder.patch_size: 8 (the recipe has 4)"),
-    ("model.encoder.mlp_ratio=2", "model.encoder.mlp_ratio: 4 (the recipe has 2)"),
+    ("model.encoder.mlp_ratio=2", "model.encoder.mlp_ratio: 4.0 (the recipe has 2.0)"),
     ("model.decoder.depth=3", "model.decoder.depth: 2 (the recipe has 3)"),
-    ("model.decoder.feed_forward.ratio=2", "model.decoder.feed_forward.ratio: 4"),
+    ("model.decoder.feed_forward.ratio=2", "model.decoder.feed_forward.ratio: 4.0"),
     ("model.head.gaussians_per_query=5", "model.head.gaussians_per_query: 4"),
     (
         "model.decoder.cross_attention={type: qgs/content}",
@@ -196,7 +197,7 @@ def test_extra_and_missing_keys_stay_whatever_the_recipe(
     with pytest.raises(PublishedError) as caught:
         imported("tokengs_a", extra=torch.zeros(2), another=torch.zeros(()))
     message = str(caught.value)
-    assert "2 of the differences stay whatever the recipe says" in message
+    assert "whatever the recipe says, the file has 2 keys that TokenGS has not" in message
     assert "unexpected: extra" in message
     assert "unexpected: another" in message
     assert "options that would fit" not in message
@@ -232,8 +233,8 @@ def test_options_that_the_file_cannot_carry_are_told(
     other = tmp_path / "other.safetensors"
     import_weights(tmp_path / "locus_full_a.safetensors", resolve(fitting, changed), other)
     settings = export_weights(other, tmp_path / "w.safetensors").settings
-    assert "centers.type: qgs/free (LocusGS: locus/radius_scaled)" in settings
-    assert "head.scale_cap: 0.2 (LocusGS: 0.075)" in settings
+    assert "model.centers.type: qgs/free (LocusGS: locus/radius_scaled)" in settings
+    assert "model.head.scale_cap: 0.2 (LocusGS: 0.075)" in settings
 
 
 def test_models_without_a_published_form_are_not_exported(tmp_path: Path) -> None:
@@ -243,3 +244,70 @@ def test_models_without_a_published_form_are_not_exported(tmp_path: Path) -> Non
     with pytest.raises(PublishedError, match=r"head\.norm\.weight: TokenGS has no such parameter"):
         export_weights(tmp_path / "c.safetensors", tmp_path / "w.safetensors")
     assert not (tmp_path / "w.safetensors").exists()
+
+
+@pytest.mark.parametrize("name", ["bla.yaml", "bla.pth", "bla"])
+def test_a_checkpoint_is_named_safetensors(published: Published, tmp_path: Path, name: str) -> None:
+    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match=r"name it \.safetensors"):
+        import_weights(tmp_path / "w.safetensors", None, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_no_checkpoint_stays_without_its_recipe(
+    published: Published, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, text: str) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("qgs.io.transfer.write_text", full)
+    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
+    with pytest.raises(OSError, match="no space left"):
+        import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
+    assert [path.name for path in tmp_path.iterdir()] == ["w.safetensors"]
+
+
+def test_the_recipe_that_fits_takes_overrides(published: Published, tmp_path: Path) -> None:
+    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
+    out = tmp_path / "c.safetensors"
+    options = ["data={type: qgs/photos, path: photos, image_size: [16, 24]}", "views.inputs=3"]
+    done = import_weights(tmp_path / "w.safetensors", None, out, overrides=options)
+    written = resolve(out.with_suffix(".yaml"))
+    assert written.tree == done.recipe.tree == qgs.load(out).recipe
+    assert (written.views.inputs, written.tree["data"]["image_size"]) == (3, [16, 24])
+    assert "# Given beside: views.inputs=3" in out.with_suffix(".yaml").read_text(encoding="utf-8")
+
+
+def test_options_that_no_weight_shows_are_told_on_import(
+    imported: Callable[..., Path], tmp_path: Path
+) -> None:
+    fitting = resolve(imported("tokengs_a").with_suffix(".yaml")).tree
+    weights = tmp_path / "tokengs_a.safetensors"
+    changed = ["model.head.quat_eps=1e-4", "model.queries.std=0.5", "seed=3"]
+    done = import_weights(weights, resolve(fitting, changed), tmp_path / "o.safetensors")
+    assert done.settings == ("model.head.quat_eps: 0.0001 (TokenGS: 1.0e-12)",)
+    assert import_weights(weights, resolve(fitting), tmp_path / "p.safetensors").settings == ()
+
+
+@pytest.mark.parametrize("prefix", ["model.", "ema_model.module.", "net._orig_mod."])
+def test_one_prefix_of_all_names_is_taken_off(
+    published: Published, tmp_path: Path, prefix: str
+) -> None:
+    weights = {prefix + name: tensor for name, tensor in published("locus_full_a").items()}
+    save_file(weights, tmp_path / "w.safetensors")
+    done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
+    assert done.notes == (f"took {prefix!r} off all {len(weights)} names",)
+    assert done.used == 109
+
+
+def test_the_recipe_that_fits_names_types_first_and_its_losses(
+    imported: Callable[..., Path],
+) -> None:
+    text = imported("locus_full_a").with_suffix(".yaml").read_text(encoding="utf-8")
+    assert "queries:\n    type: locus/anchored\n    count: 12\n" in text
+    assert "#   losses: photometric, visibility, and anchor visibility" in text
+
+
+def test_one_stray_key_is_told_as_one(imported: Callable[..., Path]) -> None:
+    with pytest.raises(PublishedError, match="the file has 1 key that LocusGS has not"):
+        imported("locus_full_a", stray=torch.zeros(1))

@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 from upath import UPath
 
@@ -35,6 +37,20 @@ def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
     assert not is_local(opened_path("memory://a"))
     with pytest.raises(ValueError, match="nosuch://a cannot be opened as a path or URL"):
         opened_path("nosuch://a")
+
+
+@pytest.mark.parametrize(
+    ("url", "module", "command"),
+    [
+        ("http://host/a", "aiohttp", "pip install requests aiohttp"),
+        ("s3://bucket/a", "s3fs", "pip install s3fs"),
+    ],
+)
+def test_the_package_of_a_file_system_is_told(monkeypatch, url, module, command):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "fsspec.implementations.http", raising=False)
+    with pytest.raises(ValueError, match=f"{url} cannot be opened: .*: {command}$"):
+        opened_path(url)
 
 
 @pytest.mark.parametrize("name", ["a", "a/b.torch", "a..b", ".hidden", "a\\b"])

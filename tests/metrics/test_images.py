@@ -6,6 +6,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from qgs.contracts.settings import SsimCovariance
 from qgs.metrics import psnr, ssim
 
 
@@ -64,8 +65,11 @@ def test_images_smaller_than_the_window_are_refused() -> None:
         ssim(*pair(0.1, (10, 20)))
 
 
+@pytest.mark.parametrize("covariance", ["population", "sample"])
 @pytest.mark.parametrize("size", [(11, 11), (11, 40), (13, 17), (64, 33)])
-def test_ssim_equals_scikit_image_at_odd_sizes(size: tuple[int, int]) -> None:
+def test_ssim_equals_scikit_image_at_odd_sizes(
+    size: tuple[int, int], covariance: SsimCovariance
+) -> None:
     images, truth = pair(0.1, size)
     expected = [
         structural_similarity(
@@ -74,10 +78,17 @@ def test_ssim_equals_scikit_image_at_odd_sizes(size: tuple[int, int]) -> None:
             channel_axis=0,
             data_range=1.0,
             gaussian_weights=True,
-            use_sample_covariance=False,
+            use_sample_covariance=covariance == "sample",
         )
         for a, b in zip(images, truth, strict=True)
     ]
     torch.testing.assert_close(
-        ssim(images, truth).double(), torch.tensor(expected), rtol=0, atol=1e-5
+        ssim(images, truth, covariance).double(), torch.tensor(expected), rtol=0, atol=1e-6
     )
+
+
+def test_the_two_forms_of_ssim_differ() -> None:
+    images, truth = pair(0.1)
+    difference = ssim(images, truth, "sample") - ssim(images, truth)
+    assert (difference.abs() > 1e-5).all()
+    assert (difference.abs() < 1e-3).all()

@@ -15,7 +15,8 @@ RTOL, ATOL = 1e-4, 5e-5
 class Row:
     """One tensor: its largest absolute and relative error, and what is wrong with it, if anything.
 
-    Errors are over the elements that both have as finite numbers; None where nothing was compared.
+    Errors are infinite where one has NaN or infinity and the other has not; None where nothing was
+    compared. Relative errors leave out elements that are expected to be 0.
     """
 
     name: str
@@ -43,12 +44,20 @@ def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
     if found.shape != expected.shape:
         return Row(name, shape, problem=f"shape {tuple(found.shape)} here")
     ours, theirs = found.detach().double(), expected.double()
-    both = ours.isfinite() & theirs.isfinite()
-    error = (ours - theirs).abs()[both]
-    size = theirs.abs()[both]
-    absolute = float(error.max()) if error.numel() else 0.0
-    relative = float((error[size > 0] / size[size > 0]).max()) if (size > 0).any() else 0.0
-    return Row(name, shape, absolute, relative, _verdict(ours, theirs))
+    error = _error(ours, theirs)
+    nonzero = theirs != 0
+    relative = (error / theirs.abs()).nan_to_num(torch.inf)[nonzero & (error > 0)]
+    return Row(name, shape, _largest(error), _largest(relative), _verdict(ours, theirs))
+
+
+def _error(ours: Tensor, theirs: Tensor) -> Tensor:
+    """Absolute errors: 0 where both are the same infinity or NaN, infinite where one alone is."""
+    same = (ours == theirs) | (ours.isnan() & theirs.isnan())
+    return (ours - theirs).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0)
+
+
+def _largest(errors: Tensor) -> float:
+    return float(errors.max()) if errors.numel() else 0.0
 
 
 def _verdict(ours: Tensor, theirs: Tensor) -> str:

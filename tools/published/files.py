@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from published.idle_options import IDLE_OPTIONS
 from qgs.contracts.released import ReleasedOptions
 
 WEIGHTS = "weights."
@@ -22,26 +24,46 @@ class GoldenFileError(ValueError):
 
 @dataclass
 class GoldenFile:
-    """tensors: by name. config: the JSON in the metadata. read: names given out as inputs."""
+    """tensors: by name. config: the JSON in the metadata.
+
+    read: names given out as inputs. known: options that were asked for.
+    """
 
     tensors: dict[str, Tensor]
     config: dict[str, Any]
     read: set[str] = field(default_factory=set)
+    known: set[str] = field(default_factory=set)
 
     @property
     def size(self) -> tuple[int, int]:
         """(H, W) of the images, in pixels."""
-        options = self.config.get("options", self.config)
-        if "img_size" not in options:
-            raise GoldenFileError("img_size is missing in the metadata")
-        height, width = options["img_size"]
-        return height, width
+        options = self.options("options") if "options" in self.config else self.config
+        size = options.get("img_size")
+        if not isinstance(size, list) or [type(side) for side in size] != [int, int]:
+            raise GoldenFileError(f"img_size must be [height, width] in pixels, got {size!r}")
+        return size[0], size[1]
 
-    def released(self, group: str) -> ReleasedOptions:
-        """The published options in the metadata under `group`."""
+    def options(self, group: str, beside: Mapping[str, Any] | None = None) -> Mapping[str, Any]:
+        """The published options under `group`, with those `beside`; what is read is noted.
+
+        Raises GoldenFileError when the metadata has no such group, or something else there.
+        """
         if group not in self.config:
             raise GoldenFileError(f"the metadata has no `{group}`")
-        return ReleasedOptions(self.config[group])
+        options = self.config[group]
+        if not isinstance(options, dict):
+            raise GoldenFileError(f"`{group}` must be a mapping of options, got {options!r}")
+        return _Noting({**options, **(beside or {})}, self.known)
+
+    def released(self, group: str) -> ReleasedOptions:
+        """The published options in the metadata under `group`; raises as `options` does."""
+        return ReleasedOptions(self.options(group))
+
+    def unknown_options(self) -> list[str]:
+        """Options that nothing has read, and that are not known to decide nothing here."""
+        groups = (value for name, value in self.config.items() if name.endswith("options"))
+        names = {name for group in groups for name in group}
+        return sorted(names - self.known - IDLE_OPTIONS)
 
     @property
     def is_of_losses(self) -> bool:
@@ -49,11 +71,19 @@ class GoldenFile:
         return any(name.startswith(EXPECTED) for name in self.tensors)
 
     def input(self, name: str) -> Tensor:
-        """A tensor to compute from, which is not compared; raises GoldenFileError without it."""
+        """A tensor to compute from, in float32, which is not compared.
+
+        Raises GoldenFileError without it.
+        """
         if name not in self.tensors:
             raise GoldenFileError(f"the input `{name}` is missing")
         self.read.add(name)
-        return self.tensors[name]
+        tensor = self.tensors[name]
+        return tensor.float() if tensor.is_floating_point() else tensor
+
+    def input_or(self, name: str, otherwise: Tensor) -> Tensor:
+        """The tensor to compute from, or `otherwise` where the file has none."""
+        return self.input(name) if name in self.tensors else otherwise
 
     def weights(self) -> dict[str, Tensor]:
         """The published state dict."""
@@ -66,7 +96,27 @@ class GoldenFile:
 
     def promised(self) -> list[str]:
         """Names that the metadata lists as outputs."""
-        return self.config.get("outputs", [])
+        outputs = self.config.get("outputs", [])
+        if not isinstance(outputs, list) or not all(isinstance(name, str) for name in outputs):
+            raise GoldenFileError(f"`outputs` must be a list of names, got {outputs!r}")
+        return outputs
+
+
+class _Noting(Mapping[str, Any]):
+    """Options; the names that were asked for go into `asked`."""
+
+    def __init__(self, options: Mapping[str, Any], asked: set[str]) -> None:
+        self._options, self._asked = options, asked
+
+    def __getitem__(self, name: str) -> Any:
+        self._asked.add(name)
+        return self._options[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._options)
+
+    def __len__(self) -> int:
+        return len(self._options)
 
 
 def read_golden(path: Path) -> GoldenFile:
@@ -80,4 +130,7 @@ def read_golden(path: Path) -> GoldenFile:
         raise GoldenFileError(f"not a readable safetensors file: {error}") from error
     if "config" not in metadata:
         raise GoldenFileError("the metadata has no `config`, which says how to compose the model")
-    return GoldenFile(tensors, json.loads(metadata["config"]))
+    config = json.loads(metadata["config"])
+    if not isinstance(config, dict):
+        raise GoldenFileError(f"`config` in the metadata must be a mapping, got {config!r}")
+    return GoldenFile(tensors, config)

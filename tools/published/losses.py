@@ -51,26 +51,43 @@ class LossInputs:
         return term
 
 
-def read_inputs(golden: GoldenFile) -> LossInputs:
-    """The inputs of a loss file; outside of its mask the truth is white, as in both releases."""
-    points, opacity = golden.input("points"), golden.input("opacity")
-    rgb, alpha = golden.input("images_pred"), golden.input("alphas_pred")
-    masks = golden.input("masks_gt")
-    truth = golden.input("images_gt") * masks + (1 - masks)
+def read_inputs(golden: GoldenFile, images: bool) -> LossInputs:
+    """The inputs of a loss file; outside of its mask the truth is white, as in both releases.
+
+    images: whether losses of images are among the expected tensors; else blanks do for what is not
+        in the file.
+    """
+    points = golden.input("points")
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
+
+    def read(name: str, *shape: int) -> Tensor:
+        return golden.input(name) if images else golden.input_or(name, torch.ones(shape))
+
+    views = cameras.c2w.shape[:2]
+    colours, pixels = (*views, 3, *golden.size), (*views, 1, *golden.size)
+    opacity = read("opacity", *points.shape[:2], 1)
+    rgb, alpha = read("images_pred", *colours), read("alphas_pred", *pixels)
+    masks = read("masks_gt", *pixels)
+    truth = read("images_gt", *colours) * masks + (1 - masks)
     quats = torch.zeros(*points.shape[:2], 4)
     gaussians = Gaussians(points, torch.ones_like(points), quats, opacity[..., 0], points)
     return LossInputs(
         LayerPrediction(gaussians, QueryState(points, {CENTER: points})),
         Rendering(rgb, alpha, torch.zeros_like(alpha)),
         Views(truth, cameras, masks),
-        golden.input("has_mask"),
+        read("has_mask", len(points)),
     )
 
 
 def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Whatever the file may hold, under its names."""
-    inputs = read_inputs(golden)
+    """Whatever the file may hold, under its names; of whole losses those that are in it."""
+    wholes = [
+        (release, ssim)
+        for release in RGB_TERM
+        for ssim in ("nossim", "refssim")
+        if any(name.startswith(f"{EXPECTED}{release}.{ssim}.") for name in golden.tensors)
+    ]
+    inputs = read_inputs(golden, images=bool(wholes))
     cameras = inputs.target.cameras
     found = {
         "cam_view": cameras.w2c.transpose(-1, -2),
@@ -78,17 +95,16 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     }
     for threshold in _thresholds(golden):
         found |= _visibility(inputs, threshold)
-    for release in RGB_TERM:
-        for ssim in ("nossim", "refssim"):
-            terms = _whole_loss(inputs, release, golden.released(f"{release}_options"), ssim)
-            found |= {f"{EXPECTED}{release}.{ssim}.{name}": term for name, term in terms.items()}
+    for release, ssim in wholes:
+        terms = _whole_loss(inputs, release, golden.released(f"{release}_options"), ssim)
+        found |= {f"{EXPECTED}{release}.{ssim}.{name}": term for name, term in terms.items()}
     return found
 
 
 def _pixels(inputs: LossInputs, cam_view: Tensor | None) -> Tensor:
     """Pixels of the points, unguarded: near z = 0 they hang on the last bit of the file's view."""
     cameras, points = inputs.target.cameras, inputs.prediction.gaussians.means
-    seen = cameras.w2c.transpose(-1, -2) if cam_view is None else cam_view
+    seen = cameras.w2c.transpose(-1, -2) if cam_view is None else cam_view.to(points)
     camera_points = points[:, None] @ seen[..., :3, :3] + seen[..., 3:, :3]
     return to_pixels(camera_points, cameras.intrinsics)
 
@@ -178,9 +194,14 @@ def _terms(release: str, options: ReleasedOptions, ssim: str) -> Iterator[tuple[
 
 
 def _ssim_weight(options: ReleasedOptions, ssim: str) -> float:
-    """A number, or text with one for each kind, such as "0 (nossim) / 0.2 (refssim)"."""
-    text = str(options["lambda_ssim"])
-    match = re.search(rf"([\d.]+) \({ssim}\)", text) or re.fullmatch(r"([\d.]+)", text)
+    """A number, which `nossim` leaves out, or text with one for each kind.
+
+    Such as "0 (nossim) / 0.2 (refssim)".
+    """
+    text = options["lambda_ssim"]
+    if not isinstance(text, str):
+        return 0.0 if ssim == "nossim" else float(options.number("lambda_ssim"))
+    match = re.search(rf"([\d.]+) \({ssim}\)", text)
     if not match:
         raise GoldenFileError(f"the option lambda_ssim is {text!r}; it tells no weight of {ssim}")
     return float(match[1])

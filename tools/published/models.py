@@ -11,9 +11,9 @@ from torch import Tensor
 from published.files import GoldenFile, GoldenFileError
 from published.recording import model_tensors
 from qgs.components.released import tokengs_recipe
-from qgs.composer import Recipe, resolve
+from qgs.composer import resolve
+from qgs.contracts.layout import real_ratio
 from qgs.io.published import from_published
-from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -30,7 +30,9 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
     for options that no recipe stands for.
     """
-    model = _filled(resolve(recipe_of(golden)), golden.weights())
+    recipe = resolve(recipe_of(golden))
+    model = recipe.build_model().eval()
+    model.load_state_dict(from_published(golden.weights(), recipe), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
     return model_tensors(model, Views(golden.input("rgb"), cameras))
 
@@ -41,14 +43,14 @@ def recipe_of(golden: GoldenFile) -> dict[str, Any]:
     if not isinstance(kind, str) or kind not in RECIPES:
         raise GoldenFileError(f"the kind of model is {kind!r}; known are {', '.join(RECIPES)}")
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
-    recipe = RECIPES[kind](golden.config.get("options", {}) | constants)
+    recipe = RECIPES[kind](golden.options("options", constants))
     model = recipe["model"]
     _expect_agreement(golden, "gaussians_per_token", model["head"]["gaussians_per_query"])
     _expect_agreement(golden, "anchor_radius_min", model["queries"].get("radius_min"))
     weights = golden.weights()
     if DECODER_MLP in weights:  # the releases have no option for it
         hidden, width = weights[DECODER_MLP].shape
-        model["decoder"]["feed_forward"] = {"ratio": hidden // width}
+        model["decoder"]["feed_forward"] = {"ratio": real_ratio(hidden, width, DECODER_MLP)}
     return recipe
 
 
@@ -58,13 +60,3 @@ def _expect_agreement(golden: GoldenFile, name: str, from_options: Any) -> None:
         raise GoldenFileError(
             f"the metadata contradicts itself: {name} is {stated}, by its options {from_options}"
         )
-
-
-def _filled(recipe: Recipe, weights: dict[str, Tensor]) -> QueryGaussianModel:
-    """The model of `recipe` with published weights; raises ValueError for ones that do not fit."""
-    model = recipe.build_model().eval()
-    try:
-        model.load_state_dict(from_published(weights, recipe), strict=True)
-    except RuntimeError as error:
-        raise GoldenFileError(f"the weights do not fit the options: {error}") from error
-    return model

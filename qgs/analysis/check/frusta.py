@@ -33,7 +33,7 @@ def frusta_figure(scene: SceneReport) -> Figure | None:
     lines = _frusta(poses, scene.fov[kept].astype(float), _extent(poses[:, :, 3]) * _DEPTH)
     with figure_style():
         figure = Figure(figsize=(5.2, 4.4))
-        axes: Any = figure.add_axes((-0.06, -0.02, 0.98, 1.04), projection="3d")
+        axes: Any = figure.add_axes((0.0, -0.03, 0.95, 1.02), projection="3d")
         colors = _colors(len(poses))
         centres = poses[:, :, 3]
         axes.plot(*centres.T, color=hex_color(INK), linewidth=0.6, alpha=0.5)
@@ -91,7 +91,7 @@ def _frame(axes: Any, points: np.ndarray) -> None:
     axes.set_xlim(middle[0] - sides[0] / 2, middle[0] + sides[0] / 2)
     axes.set_ylim(middle[1] - sides[1] / 2, middle[1] + sides[1] / 2)
     axes.set_zlim(middle[2] - sides[2] / 2, middle[2] + sides[2] / 2)
-    axes.set_box_aspect(sides, zoom=1.15)
+    axes.set_box_aspect(sides, zoom=1.02)
     axes.view_init(elev=28, azim=-62)
     axes.tick_params(labelsize=6, pad=-2)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):

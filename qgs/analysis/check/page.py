@@ -51,7 +51,7 @@ def check_html(report: CheckReport) -> str:
         report=report,
         scenes=scenes[:ROWS],
         hidden=len(scenes[ROWS:]),
-        general=report.general[:ROWS],
+        general=sorted(report.general, key=lambda finding: finding.severity)[:ROWS],
         pictured=[_pictured(scene) for scene in scenes[:PICTURED]],
     )
 

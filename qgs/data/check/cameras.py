@@ -13,7 +13,10 @@ from qgs.data.check.photo import Photo
 from qgs.data.frames import Fault, Intrinsics, Size
 from qgs.data.validation import intrinsics_faults, pose_faults
 
-_SAME = 2e-6  # of the coordinates, and of a rotation's entries: what float32 keeps
+_SAME = 2e-6  # of a rotation's entries, and of coordinates that float32 holds
+_DOUBLE = 1e-9  # of coordinates that float64 holds, after they were computed
+_FLOAT32 = 2e-7  # of coordinates that were float32 before they were written
+_OF_EXTENT = 1e-4  # of the cameras' extent: farther apart, they stand apart
 _FAR_OFF_CENTRE = 0.25  # of a side, from the middle
 
 
@@ -66,9 +69,17 @@ class _Camera:
 
 
 def sharing_findings(
-    scene: str, photos: Sequence[Photo], decoded: Sequence[Decoded], sound: Sequence[int]
+    scene: str,
+    photos: Sequence[Photo],
+    decoded: Sequence[Decoded],
+    sound: Sequence[int],
+    *,
+    float32: bool,
 ) -> list[Finding]:
-    """Photos that share a pose, or only a place, among the frames whose poses are `sound`."""
+    """Photos that share a pose, or only a place, among the frames whose poses are `sound`.
+
+    float32: whether the format holds poses in float32.
+    """
     cameras = [
         _Camera(frame, photos[frame].listed.name, photos[frame].listed.c2w, decoded[frame].digest)
         for frame in sound
@@ -76,8 +87,9 @@ def sharing_findings(
     if len(cameras) < 2:
         return []
     centres = np.stack([camera.c2w[:3, 3] for camera in cameras])
-    near = float(np.abs(centres).max()) * max(_SAME, _rigidity(cameras))
-    if float(np.ptp(centres, axis=0).max()) <= near:
+    extent = float(np.ptp(centres, axis=0).max())
+    near, one_point = _tolerances(centres, extent, _rigidity(cameras), float32)
+    if extent <= one_point:
         return [
             Finding(
                 scene,
@@ -95,6 +107,20 @@ def sharing_findings(
         if len(groups) > 1:
             findings.append(_zero_baseline(scene, [alike[0] for alike in groups]))
     return findings
+
+
+def _tolerances(
+    centres: np.ndarray, extent: float, rigidity: float, float32: bool
+) -> tuple[float, float]:
+    """How far apart two cameras, and all cameras, may be on one point, in the world's units.
+
+    Coordinates are as precise as the format, or as the rotations beside them; far from the origin
+    such errors exceed the steps between cameras, so that the extent bounds what is one place.
+    """
+    distance = float(np.abs(centres).max())
+    precision = max(_SAME if float32 else _DOUBLE, rigidity)
+    together = _SAME if float32 else min(precision, _FLOAT32)
+    return min(distance * precision, extent * _OF_EXTENT), distance * together
 
 
 def _together(

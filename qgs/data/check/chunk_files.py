@@ -19,6 +19,7 @@ from qgs.data.chunks.listing import INDEX, SUFFIX, has_chunks, read_index
 from qgs.data.chunks.record import Record, parse_record, unit_faults
 from qgs.data.chunks.store import load_chunk
 from qgs.data.frames import PhotoFrame, Size
+from qgs.data.wording import a_type
 
 _SHOWN = 3
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
@@ -28,14 +29,17 @@ _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 class ChunkFolder:
     """What one folder of chunks holds.
 
-    index: scene to file name, as index.json has it. keys: scenes of each file that could be read.
-    broken: those of these files with entries that are no scenes.
+    index: scene to file name, as index.json has it; placed: the scenes of each file there. keys:
+    scenes of each file that could be read; found: all of them. broken: those of these files with
+    entries that are no scenes.
     """
 
     split: str
     folder: UPath
     index: Mapping[str, str] = field(default_factory=dict)
-    keys: dict[str, list[str]] = field(default_factory=dict)
+    placed: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    keys: dict[str, set[str]] = field(default_factory=dict)
+    found: set[str] = field(default_factory=set)
     broken: set[str] = field(default_factory=set)
     candidates: list[Candidate] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
@@ -78,6 +82,10 @@ def _read_index(folder: ChunkFolder) -> bool:
     except (OSError, ValueError) as error:
         folder.tell(folder.label(INDEX), str(error), "write it anew: scene to chunk file, in JSON")
         return False
+    placed: dict[str, list[str]] = {}
+    for key, name in folder.index.items():
+        placed.setdefault(name, []).append(key)
+    folder.placed = placed
     return True
 
 
@@ -88,30 +96,34 @@ def _add_chunk(folder: ChunkFolder, file: UPath) -> None:
     except (OSError, ValueError) as error:
         folder.tell(folder.label(file.name), _reason(error, file) + _lost(folder, file), _REPACK)
         return
-    strange = [entry for entry in entries if not _has_key(entry)]
-    if strange:
-        folder.broken.add(file.name)
-        folder.tell(
-            folder.label(file.name),
-            f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the first "
-            f"is a {type(strange[0]).__name__})" + _lost(folder, file),
-            _REPACK,
-        )
-    keys = folder.keys[file.name] = []
+    keys = folder.keys[file.name] = set()
+    if not entries:
+        folder.tell(folder.label(file.name), "the chunk holds no scene", _REPACK)
+    strange: list[Any] = []
     for place, entry in enumerate(entries):
         if not _has_key(entry):
+            strange.append(entry)
             continue
         key = entry["key"]
-        if any(key in held for held in folder.keys.values()):
+        if key in folder.found:
             folder.tell(
                 key,
                 f"the scene is in {folder.label(file.name)}, and was in this split before",
                 "remove one of the two, or pack the data set again with `qgs data pack`",
             )
             continue
-        keys.append(key)
+        keys.add(key)
+        folder.found.add(key)
         photos = partial(_photos, file, place)
         folder.candidates.append(Candidate(key, key, "chunks", OPENCV, photos, folder.split))
+    if strange:
+        folder.broken.add(file.name)
+        folder.tell(
+            folder.label(file.name),
+            f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the first "
+            f"is {a_type(strange[0])})" + _lost(folder, file),
+            _REPACK,
+        )
 
 
 def _has_key(entry: Any) -> bool:
@@ -120,7 +132,8 @@ def _has_key(entry: Any) -> bool:
 
 def _lost(folder: ChunkFolder, file: UPath) -> str:
     """The scenes that a broken file was to hold, in words."""
-    keys = [key for key, name in folder.index.items() if name == file.name]
+    read = folder.keys.get(file.name, ())
+    keys = [key for key in folder.placed.get(file.name, ()) if key not in read]
     return f"; {INDEX} places there {_listed(keys)}" if keys else ""
 
 
@@ -138,9 +151,9 @@ def _reason(error: Exception, file: UPath) -> str:
 def _compare_index(folder: ChunkFolder) -> None:
     index = folder.index
     files = {item.name for item in folder.folder.iterdir()}
-    absent = [name for name in dict.fromkeys(index.values()) if name not in files]
-    for name in absent:
-        _tell_absent(folder, name, [key for key, file in index.items() if file == name])
+    for name, keys in folder.placed.items():
+        if name not in files:
+            _tell_absent(folder, name, keys)
     for key, name in index.items():
         if name in folder.keys and key not in folder.keys[name] and name not in folder.broken:
             folder.tell(
@@ -149,15 +162,14 @@ def _compare_index(folder: ChunkFolder) -> None:
                 f"take the scene out of {INDEX}, or get the chunk that holds it",
             )
     for name, keys in folder.keys.items():
-        for key in keys:
-            if key not in index:
-                folder.tell(
-                    key,
-                    f"{folder.label(name)} holds the scene, but {folder.label(INDEX)} does not "
-                    "name it, so that it is never read",
-                    f"add it to {INDEX}",
-                    warning=True,
-                )
+        for key in sorted(keys - index.keys()):
+            folder.tell(
+                key,
+                f"{folder.label(name)} holds the scene, but {folder.label(INDEX)} does not name "
+                "it, so that it is never read",
+                f"add it to {INDEX}",
+                warning=True,
+            )
 
 
 def _tell_absent(folder: ChunkFolder, name: str, keys: Sequence[str]) -> None:
@@ -169,7 +181,7 @@ def _tell_absent(folder: ChunkFolder, name: str, keys: Sequence[str]) -> None:
 
 
 def _tell_shared(folders: Sequence[ChunkFolder]) -> None:
-    splits = [{key for keys in folder.keys.values() for key in keys} for folder in folders]
+    splits = [folder.found for folder in folders]
     for key in sorted(set.intersection(*splits)) if len(splits) > 1 else ():
         folders[0].tell(
             key,

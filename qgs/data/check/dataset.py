@@ -25,6 +25,9 @@ CheckedFormat: TypeAlias = Literal[
 ]
 
 
+_LISTINGS = (".json", ".npy")
+
+
 @dataclass(frozen=True)
 class Options:
     """How thorough a check is.
@@ -75,11 +78,14 @@ def check(
     """Check the data set at `path`, and evaluation indices: those given and those beside it.
 
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
-    is no data set at `path`.
+    is no data set at `path`, or no file at one of `indices`.
     """
+    if path.is_file() and path.suffix in _LISTINGS:
+        path = path.parent
     candidates, general, told = _candidates(path, options)
     if not candidates and not general:
-        read_listing(path)  # tells what is missing
+        read_listing(path, _photo_format(options))  # tells what is missing
+        raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
     chosen, notes = _geometry_scenes(len(candidates), options)
     scenes: list[SceneReport] = []
     for number, candidate in enumerate(candidates):
@@ -94,7 +100,7 @@ def check(
         )
     summaries: list[IndexSummary] = []
     held = _held(scenes)
-    for file in dict.fromkeys([*indices, *found_indices(path)]):
+    for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         findings, summary = index_findings(file, held, told)
         general += findings
         summaries += [summary] if summary else []
@@ -113,13 +119,16 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
         )
     if kind == "dl3dv":
         return dl3dv_scenes(path, options.images), [], set()
-    wanted = cast(Format, options.format if options.format in READERS else "auto")
-    items = list(photo_folders(path, wanted, options.images))
+    items = list(photo_folders(path, _photo_format(options), options.images))
     return (
         [item for item in items if isinstance(item, Candidate)],
         [item for item in items if isinstance(item, Finding)],
         set(),
     )
+
+
+def _photo_format(options: Options) -> Format:
+    return cast(Format, options.format if options.format in READERS else "auto")
 
 
 def _kind(path: UPath, wanted: CheckedFormat) -> str:

@@ -97,7 +97,8 @@ def _file_faults(photo: Photo, result: Decoded, where: str) -> list[tuple[str, s
         )
     if not photo.mask_exists:
         assert listed.mask is not None
-        faults.append((f"the mask {listed.mask.name} does not exist", "add it, or list no mask"))
+        folder = listed.mask.parent.name
+        faults.append((f"its mask does not exist in {folder}", "add it, or list no mask"))
     if result.mask_error is not None:
         faults.append((result.mask_error, "replace the mask"))
     return faults

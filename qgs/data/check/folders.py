@@ -16,6 +16,7 @@ from qgs.data.frames import PhotoFrame
 from qgs.data.photos import folder_name
 from qgs.data.readers import Format, formats_of, read_listing
 from qgs.data.readers.listing import existing
+from qgs.data.recognition import recognised
 
 _CONVENTIONS = {"nerfstudio": OPENGL, "blender": OPENGL, "colmap": OPENCV, "llff": LLFF}
 
@@ -46,12 +47,18 @@ def photo_folders(root: UPath, wanted: Format, images: str | None) -> Iterator[C
         if not scenes and folder.name in ("train", "test"):
             yield from photo_folders(folder, wanted, images)
         elif scenes:
-            yield Finding(
-                folder.name,
-                "the folder lists no cameras and is no scene",
-                "make poses for it, check it by itself if it is another data set, or move it away",
-                severity="warning",
-            )
+            yield _no_scene(folder)
+
+
+def _no_scene(folder: UPath) -> Finding:
+    kind = recognised(folder).removeprefix("qgs/")
+    if kind != "photos":
+        reason = f"the folder is another data set ({kind}) and is not checked with the photos"
+        return Finding(
+            folder.name, f"{reason} beside it", f"run `qgs data check {folder}`", severity="warning"
+        )
+    reason = "the folder lists no cameras and is no scene"
+    return Finding(folder.name, reason, "make poses for it, or move it away", severity="warning")
 
 
 def dl3dv_scenes(path: UPath, images: str | None) -> list[Candidate]:

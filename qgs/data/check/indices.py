@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from upath import UPath
 
 from qgs.data.check.finding import Finding, spans
-from qgs.data.index import IndexEntry, read_index
+from qgs.data.index import GIVEN, IndexEntry, read_index
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ def index_findings(
 ) -> tuple[list[Finding], IndexSummary | None]:
     """What the index names and is not there, less scenes whose absence is `told` already.
 
-    The summary is None for a file that is no index.
+    The summary is None for a file that is no index. Raises FileNotFoundError without a file.
     """
     try:
         index = read_index(str(file))
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         fix = "correct the file, or get it again"
         return [Finding(str(file.name), str(error), fix)], None
     findings: list[Finding] = []
@@ -94,12 +94,11 @@ def _entry_findings(
                 "correct the index, or add the missing frames to the scene",
                 tuple(outside),
             )
-    both = set(entry.context) & set(entry.target)
-    if both:
+    if entry.both:
         yield Finding(
             name,
-            f"the index {file} has frames as context and as target",
+            f"the index {file} has {GIVEN}",
             "judge models on frames that they are not given",
-            tuple(sorted(both)),
+            entry.both,
             severity="warning",
         )

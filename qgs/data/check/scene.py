@@ -76,6 +76,9 @@ def check_scene(
         photos = candidate.photos()
     except (OSError, ValueError) as error:
         return replace(report, findings=[Finding(candidate.name, *_reason_and_fix(error))])
+    if not photos:
+        nothing = Finding(candidate.name, "no photos are listed", "export the scene again")
+        return replace(report, findings=[nothing])
     decoded = decode_all(photos, threads, headers_only)
     return _judged(report, candidate, photos, decoded, with_geometry)
 
@@ -93,7 +96,7 @@ def _judged(
     poses, others = camera_findings(name, photos, decoded, _frames(sizes))
     placed = [frame for frame in range(len(photos)) if frame not in _frames(poses)]
     placed = [frame for frame in placed if np.isfinite(photos[frame].listed.c2w).all()]
-    sharing = sharing_findings(name, photos, decoded, placed)
+    sharing = sharing_findings(name, photos, decoded, placed, float32=candidate.kind == "chunks")
     findings = merged([*files, *sizes, *poses, *others, *sharing])
     geometry = None
     if with_geometry:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from qgs.data.frames import Fault
 from qgs.data.validation import intrinsics_faults, pose_faults
+from qgs.data.wording import a_type
 
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_faults` tells
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
@@ -109,7 +110,7 @@ def parse_record(where: str, data: Any) -> Record:
 def _kind(data: Any) -> str:
     if isinstance(data, Mapping):
         return f"a mapping with the keys {', '.join(map(repr, list(data)[:6])) or 'none'}"
-    return f"a {type(data).__name__}"
+    return a_type(data)
 
 
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:

@@ -6,7 +6,7 @@ import io
 import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import ClassVar, overload
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from qgs.data.chunks.store import ChunkStore
 from qgs.data.encoded import EncodedFrame, EncodedScene
 from qgs.data.frames import Size
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
+from qgs.data.lazy_scenes import LazyScenes
 from qgs.data.paths import opened_path
 from qgs.types import Cameras
 
@@ -32,6 +33,7 @@ class ChunksConfig(SceneSource.Config):
     """Options of `qgs/chunks`.
 
     path: folder or fsspec URL that holds train/ and test/, relative to the working directory.
+    Chunks at a URL are read whole, by every process and worker; copy them to a local disk to train.
     holdout: every n-th frame of each scene is kept for evaluation, from frame n // 2 on; 0 for
     those that `qgs data pack` took over from its source, none in other chunks. max_scenes: only the
     first scenes of each split, 0 for all. min_frames: scenes with fewer frames are left out, which
@@ -42,11 +44,7 @@ class ChunksConfig(SceneSource.Config):
         "max_scenes",
         "min_frames",
     }
-
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {
-        "max_scenes",
-        "min_frames",
-    }
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
     holdout: int = Field(default=0, ge=0)
@@ -176,7 +174,7 @@ def _check_aspect(record: Record, frame: int, size: tuple[int, int]) -> None:
         )
 
 
-class ChunkScenes(Sequence[Scene]):
+class ChunkScenes(LazyScenes):
     """The scenes of a split, made when they are asked for."""
 
     def __init__(self, store: ChunkStore, files: Mapping[str, UPath], config: ChunksConfig) -> None:
@@ -186,14 +184,9 @@ class ChunkScenes(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._keys)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        key = self._keys[index]
+    def scene(self, place: int) -> ChunkScene:
+        """See `LazyScenes`."""
+        key = self._keys[place]
         return ChunkScene(self._store, self._files[key], key, self._config)
 
     def groups(self) -> list[list[int]]:

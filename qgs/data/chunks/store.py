@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -14,6 +15,9 @@ from upath import UPath
 
 from qgs.data.chunks.record import Record, parse_record
 from qgs.data.paths import is_local
+from qgs.data.wording import a_type
+
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def load_chunk(path: UPath) -> list[Any]:
@@ -30,17 +34,26 @@ def load_chunk(path: UPath) -> list[Any]:
             f"chunk {path} does not exist: download it, or take its scenes out of index.json"
         ) from None
     except Exception as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(
-            f"{path} cannot be read as a torch file of tensors and lists ({reason}): it may be cut "
-            "off, so copy or pack it again"
+            f"{path} cannot be read as a torch file of tensors and lists ({_told(error)}): copy or "
+            "pack it again"
         ) from error
     if not isinstance(data, list):
         raise ValueError(
-            f"{path} holds a {type(data).__name__}, expected a list of mappings: is it a chunk of "
+            f"{path} holds {a_type(data)}, expected a list of mappings: is it a chunk of "
             "RealEstate10K's format?"
         )
     return data
+
+
+def _told(error: Exception) -> str:
+    """Why torch refuses a file, without its advice to trust it and without its colours."""
+    said = str(error)
+    if "Unsupported" in said:
+        return "it holds Python objects, whose reading could run code"
+    if type(error).__name__ in ("UnpicklingError", "EOFError") or "central directory" in said:
+        return "it is cut off or no torch file"
+    return _COLOURS.sub("", said or type(error).__name__).splitlines()[0]
 
 
 def _load(path: UPath) -> Any:

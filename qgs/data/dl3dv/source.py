@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import ClassVar, overload
+from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch import Tensor
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.dl3dv.layout import Place, find_scenes, scene_folder
 from qgs.data.encoded import EncodedFrame, EncodedScene
+from qgs.data.lazy_scenes import LazyScenes
 from qgs.data.paths import opened_path
 from qgs.data.photo_scene import Development, PhotoScene, pixel_cache
 from qgs.data.photos import held_out_frames, present_frames
@@ -37,6 +38,7 @@ class Dl3dvConfig(SceneSource.Config):
         "test_scenes",
         "max_scenes",
     }
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
     images: str | None = None
@@ -46,7 +48,7 @@ class Dl3dvConfig(SceneSource.Config):
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-class Dl3dvScenes(Sequence[Scene]):
+class Dl3dvScenes(LazyScenes):
     """The scenes of a split, each read when it is asked for."""
 
     def __init__(self, places: Mapping[str, Place], config: Dl3dvConfig) -> None:
@@ -55,14 +57,9 @@ class Dl3dvScenes(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._places)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        return Dl3dvScene(*self._places[index], self._config)
+    def scene(self, place: int) -> Dl3dvScene:
+        """See `LazyScenes`."""
+        return Dl3dvScene(*self._places[place], self._config)
 
 
 class Dl3dvScene(EncodedScene):

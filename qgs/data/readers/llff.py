@@ -41,7 +41,7 @@ def read(folder: UPath, images: str | None) -> Listing:
     if len(paths) != len(rows):
         raise ValueError(
             f"{file} has {len(rows)} poses, but {photos} has {len(paths)} images: they belong "
-            "together in the order of the names{_skipped(paths)}, so give all images and no others"
+            f"together in the order of the names{_skipped(paths)}, so give all images and no others"
         )
     return Listing(file, [_frame(path, row) for path, row in zip(paths, rows, strict=True)])
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from importlib.util import find_spec
-from typing import ClassVar, overload
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.contracts.extras import MissingExtraError
+from qgs.data.lazy_scenes import LazyScenes
 from qgs.data.rooms.draws import Draws
 from qgs.data.rooms.layout import furnish
 from qgs.data.rooms.path import camera_path
@@ -36,6 +37,7 @@ class RoomsConfig(SceneSource.Config):
     """
 
     undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {"cache_mb"}
+    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
     scenes: int = Field(default=2000, ge=1)
     test_scenes: int = Field(default=32, ge=1)
@@ -158,7 +160,7 @@ class RoomScene(Scene):
             list(pool.map(lambda unit: cast(*unit), work))
 
 
-class RoomScenes(Sequence[Scene]):
+class RoomScenes(LazyScenes):
     """The rooms of a split, made when they are asked for."""
 
     def __init__(self, config: RoomsConfig, split: Split, count: int, cache: ImageCache) -> None:
@@ -168,16 +170,9 @@ class RoomScenes(Sequence[Scene]):
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(self._count)[index]]
-        if not -self._count <= index < self._count:
-            raise IndexError(f"room {index} of {self._count}")
-        return RoomScene(self._config, self._split, index % self._count, self._cache)
+    def scene(self, place: int) -> RoomScene:
+        """See `LazyScenes`."""
+        return RoomScene(self._config, self._split, place, self._cache)
 
 
 class RoomsSource(SceneSource):

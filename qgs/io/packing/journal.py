@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 from upath import UPath
 
@@ -42,7 +42,7 @@ def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
     """The journal in `folder`, a new one where nothing is there yet.
 
     Raises FileExistsError for a folder that holds something else, and ValueError for one with an
-    unfinished packing of other settings.
+    unfinished packing of other settings, or with a journal that is none.
     """
     settings = json.loads(json.dumps(settings))
     file = folder / JOURNAL
@@ -54,16 +54,34 @@ def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
                 "give a new folder"
             )
         return Journal(folder, settings)
-    content = json.loads(file.read_text(encoding="utf-8"))
+    content = _read(file)
     before = content["settings"]
     other = [key for key in {**before, **settings} if before.get(key) != settings.get(key)]
-    if content["version"] != _VERSION or other:
+    if content.get("version") != _VERSION or other:
         said = "; ".join(f"{key} was {before.get(key)}, is {settings.get(key)}" for key in other)
         raise ValueError(
             f"{folder} holds an unfinished packing with other settings ({said}): give those again "
             "to finish it, or give a new folder"
         )
     return Journal(folder, settings, content["files"])
+
+
+def _read(file: UPath) -> Mapping[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(_foreign(file, f"is not valid JSON ({error})")) from error
+    whole = isinstance(content, dict) and isinstance(content.get("settings"), dict)
+    files = content.get("files") if whole else None
+    if not isinstance(files, dict) or not all(
+        isinstance(files.get(s), dict) for s in get_args(Split)
+    ):
+        raise ValueError(_foreign(file, "was not written by a packing"))
+    return content
+
+
+def _foreign(file: UPath, reason: str) -> str:
+    return f"{file} {reason}: move it away if you know it, or give a new folder"
 
 
 def _held(folder: UPath) -> list[str]:

@@ -15,8 +15,8 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     radius = "gs_anchor_radius_raw" in shapes
     ray_biased = DECODER + "0.gs_cross_attn.geo_scale" in shapes
     anchor_aware = DECODER + "0.anchor_head_self_attn.fc1.weight" in shapes
-    model = backbone(shapes)
-    model["queries"] |= {"type": "locus/anchored", "radius": radius}
+    model = backbone(shapes, "locus/anchored")
+    model["queries"]["radius"] = radius
     bandwidth = {"bandwidth": "radius" if radius else "fixed"}
     biased = {"type": "locus/ray_biased", **bandwidth}
     model["decoder"] |= {
@@ -73,6 +73,7 @@ LOCUSGS = WeightLayout(
         "Gaussian centres: scaled by the radius where there is one, else anchor + offset",
         "clamps, epsilons, sigma0, lower bound of the radius: the LocusGS release's",
         "supervised layers: the middle one and the last",
+        "losses: photometric, visibility, and anchor visibility with weight 0.1",
         "scale and frame of the world, renderer, training: the framework's defaults",
     ),
 )

@@ -34,20 +34,20 @@ def locusgs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     released = ReleasedOptions(options)
     released.only(UNSUPPORTED_BUT)
     model = backbone(released)
-    model["head"]["gaussians_per_query"] = released["num_gaussians_per_token"]
+    model["head"]["gaussians_per_query"] = released.count("num_gaussians_per_token")
     model["queries"] = _queries(released)
     model["decoder"] |= {
-        "cross_attention": _cross_attention(released, options.get("geo_sigma", 0.1)),
+        "cross_attention": _cross_attention(released),
         "self_attention": {"type": released.meaning("self_attn_variant", SELF_ATTENTION)},
         "refinement": _refinement(released),
     }
     model["centers"] = _centers(released)
-    model["supervision"] = {"layers": released["anchor_supervision_layers"]}
+    model["supervision"] = {"layers": sorted(set(released.counts("anchor_supervision_layers")))}
     return {"recipe": 1, "plugins": ["locus"], "model": model}
 
 
 def _radius(options: ReleasedOptions, read: bool) -> dict[str, Any]:
-    return {"radius_min": options["anchor_radius_min"]} if read else {}
+    return {"radius_min": options.number("anchor_radius_min")} if read else {}
 
 
 def _queries(options: ReleasedOptions) -> dict[str, Any]:
@@ -58,13 +58,14 @@ def _queries(options: ReleasedOptions) -> dict[str, Any]:
     }
     if not options.flag("use_anchor_radius"):
         return queries | {"radius": False}
-    return queries | _radius(options, True) | {"init_radius": options["anchor_radius_init"]}
+    return queries | _radius(options, True) | {"init_radius": options.number("anchor_radius_init")}
 
 
-def _cross_attention(options: ReleasedOptions, sigma: float) -> dict[str, Any]:
+def _cross_attention(options: ReleasedOptions) -> dict[str, Any]:
     chosen = options.meaning("cross_attn_variant", CROSS_ATTENTION)
     if chosen == "qgs/content":
         return {"type": chosen}
+    sigma = options.number("geo_sigma") if "geo_sigma" in options else 0.1
     by_radius = options.flag("anchor_radius_affects_bias")
     bandwidth = "radius" if by_radius else "fixed"
     return {"type": chosen, "bandwidth": bandwidth, "sigma0": sigma} | _radius(options, by_radius)

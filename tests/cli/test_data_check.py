@@ -1,0 +1,96 @@
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from textured_room import INTRINSICS, SIZE, walk
+from typer.testing import CliRunner
+
+from qgs.cli import app
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    path = tmp_path_factory.mktemp("set") / "room"
+    (path / "images").mkdir(parents=True)
+    fx, fy, cx, cy = INTRINSICS
+    frames = []
+    for number, shot in enumerate(walk(6)[:3]):
+        (path / "images" / f"{number}.jpg").write_bytes(shot.encoded())
+        pose = (shot.c2w @ FLIP).tolist()
+        frames.append({"file_path": f"images/{number}.jpg", "transform_matrix": pose})
+    top = {"w": SIZE[1], "h": SIZE[0], "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    (path / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def broken(room):
+    """A folder of folders: the sound room, and one with a missing image and markup in its name."""
+    path = room.parent / "many"
+    path.mkdir()
+    shutil.copytree(room, path / "sound")
+    shutil.copytree(room, path / "<b>bad")
+    (path / "<b>bad" / "images" / "1.jpg").unlink()
+    return path
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["data", "check", *map(str, arguments)])
+
+
+def test_a_sound_set_has_exit_code_0_and_a_table(room):
+    result = run(room)
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    assert re.fullmatch(
+        r"scene +format +frames +decodable +missing +bad poses +epipolar px", lines[0].strip()
+    )
+    assert re.fullmatch(r"room +nerfstudio +3 +3 +0 +0 +0\.\d\d", lines[1].strip())
+    assert lines[-1] == f"{room}: 1 scene, 0 errors, 0 warnings"
+
+
+def test_errors_have_exit_code_1_and_one_line_each(broken):
+    result = run(broken, "--geometry", 0)
+    assert result.exit_code == 1
+    assert (
+        "error: <b>bad, frame 1 (images/1.jpg): the image does not exist: add the file, or remove "
+        "the frame from transforms.json\n" in result.output
+    )
+    assert "note: no pose was judged by photos (--geometry 0)" in result.output
+    assert result.output.splitlines()[-1] == f"{broken}: 2 scenes, 1 error, 0 warnings"
+
+
+def test_a_path_that_is_no_data_set_is_a_mistake(tmp_path):
+    result = run(tmp_path / "nowhere")
+    assert isinstance(result.exception, FileNotFoundError)
+    (tmp_path / "empty").mkdir()
+    assert "holds nothing" in str(run(tmp_path / "empty").exception)
+
+
+def test_the_page_needs_no_other_file(broken, tmp_path):
+    page = tmp_path / "new" / "check.html"
+    result = run(broken, "--report", page, "--geometry", 1)
+    assert result.exit_code == 1
+    html = page.read_text()
+    assert [file.name for file in page.parent.iterdir()] == ["check.html"]
+    assert not re.search(r'(src|href)="(?!data:)', html)
+    assert "&lt;b&gt;bad" in html
+    assert "<b>bad" not in html
+    assert "the image does not exist" in html
+    assert html.count('alt="cameras of') == 2
+    assert html.count('alt="worst pair of') == 1
+
+
+def test_quick_reads_headers_only(room, tmp_path):
+    path = tmp_path / "room"
+    shutil.copytree(room, path)
+    file = path / "images" / "2.jpg"
+    file.write_bytes(file.read_bytes()[:-400])
+    result = run(path, "--quick")
+    assert result.exit_code == 0, result.output
+    assert "quick: only headers of images were read" in result.output
+    assert run(path, "--geometry", 0).exit_code == 1

@@ -1,0 +1,188 @@
+"""Errors between two steps lose nothing: the run is saved, and says how to go on."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import resource
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+from qgs.composer import Recipe
+from qgs.data.sampling import Batch
+from qgs.data.stream import SampleStream
+from qgs.data.workers import WorkerError
+from qgs.engine import NonFiniteError, RunFolder, TrainingResult, periodic, train
+from qgs.engine.folder import RunFolder as Folder
+from qgs.engine.interrupt import StopRequest, signal
+from qgs.engine.progress import TrainingProgress
+from qgs.engine.state import read_state
+from qgs.engine.trainer import Trainer
+
+QUIET = Console(quiet=True)
+
+
+def run(recipe: Recipe, folder: Path, resume: bool = False) -> TrainingResult:
+    return train(recipe, folder, console=QUIET, device="cpu", resume=resume)
+
+
+def saved_step(folder: Path) -> int:
+    return read_state(Folder(folder).state).parts["counters"]["step"]
+
+
+def losses(folder: Path) -> list[float]:
+    return [record["loss"] for record in RunFolder(folder).history()]
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, from_sample: int) -> None:
+    """From this sample on, the data cannot be read."""
+    batch = SampleStream.batch
+
+    def broken(stream: SampleStream, numbers: Sequence[int]) -> Batch:
+        if max(numbers) >= from_sample:
+            raise OSError("the disk is gone")
+        return batch(stream, numbers)
+
+    monkeypatch.setattr(SampleStream, "batch", broken)
+
+
+def test_data_that_fails_leaves_a_run_that_goes_on(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("tokengs", "training.save_every=0", "training.batch_size=2", "training.ema=0.9")
+    through = run(recipe, tmp_path / "through")
+    with monkeypatch.context() as patch:
+        spoil(patch, from_sample=6)
+        with pytest.raises(OSError, match="the disk is gone") as caught:
+            run(recipe, tmp_path / "broken")
+    assert caught.value.__notes__ == ["The run is saved at step 3; continue with --resume"]
+    assert saved_step(tmp_path / "broken") == 3
+    again = run(recipe, tmp_path / "broken", resume=True)
+    assert (again.resumed_at, again.steps) == (3, 4)
+    assert losses(tmp_path / "broken") == losses(tmp_path / "through")
+    ours, theirs = again.model.state_dict(), through.model.state_dict()
+    assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
+
+
+def test_data_that_fails_after_the_last_step_fails_no_run(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoil(monkeypatch, from_sample=4)
+    assert run(tiny("tokengs", "training.batch_size=1"), tmp_path / "run").steps == 4
+
+
+def test_a_killed_worker_leaves_a_run_that_goes_on(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
+
+    class Killing(TrainingProgress):
+        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
+            for child in multiprocessing.active_children():
+                child.kill()
+            return False
+
+    trainer = Trainer(recipe, tmp_path / "run")
+    with closing(trainer), pytest.raises(WorkerError, match=r"lower training\.workers"):
+        trainer.run(Killing(QUIET), StopRequest())
+    assert saved_step(tmp_path / "run") == len(losses(tmp_path / "run")) >= 1
+
+
+def test_an_evaluation_that_fails_is_told_and_ends_nothing(
+    tiny: Callable[..., Recipe],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    steps: list[int] = []
+
+    def failing(model: Any, recipe: Any, step: int, **_: Any) -> None:
+        steps.append(saved_step(tmp_path / "run"))
+        raise ValueError("no scene could be judged")
+
+    monkeypatch.setattr(periodic, "evaluate", failing)
+    recipe = tiny("tokengs", "training.evaluate_every=2", "training.save_every=0")
+    result = run(recipe, tmp_path / "run")
+    assert result.steps == 4
+    assert steps == [2, 4], "saved before it is judged"
+    assert "the evaluation at step 2 failed: ValueError: no scene could be judged" in caplog.text
+
+
+def test_a_stop_is_heard_between_two_scenes(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe = tiny("tokengs", "training.evaluate_every=2", "evaluation.scenes=3")
+    trainer, stop = Trainer(recipe, tmp_path / "run"), StopRequest()
+    scenes: list[int] = []
+    between = trainer.evaluations._between_scenes
+
+    def asked(done: int, wanted: int) -> None:
+        scenes.append(done)
+        stop.signal = signal.SIGTERM
+        between(done, wanted)
+
+    trainer.evaluations._between_scenes = asked
+    with closing(trainer):
+        result = trainer.run(TrainingProgress(QUIET), stop)
+    assert scenes == [1]
+    assert (result.steps, result.stopped_by) == (2, "SIGTERM")
+    assert not (tmp_path / "run" / "evaluations.jsonl").exists()
+
+
+def test_a_full_disk_is_told_with_what_to_do(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
+    run(tiny("tokengs", "training.steps=3"), folder)
+    whole = Folder(folder).state.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"It takes \d+\.\d MB .* --resume"):
+            run(recipe, folder, resume=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert Folder(folder).state.read_bytes() == whole
+    assert run(recipe, folder, resume=True).steps == 4
+
+
+def test_bad_poses_are_told_as_data_with_the_remedy_first(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = SampleStream.batch
+
+    def without_pose(stream: SampleStream, numbers: Sequence[int]) -> Batch:
+        made = batch(stream, numbers)
+        if numbers[0] < 4:
+            return made
+        cameras = replace(made.inputs.cameras, c2w=made.inputs.cameras.c2w * float("nan"))
+        return replace(made, inputs=replace(made.inputs, cameras=cameras))
+
+    monkeypatch.setattr(SampleStream, "batch", without_pose)
+    with pytest.raises(NonFiniteError) as caught:
+        run(tiny("tokengs", "training.batch_size=2"), tmp_path / "run")
+    message = str(caught.value)
+    assert message.startswith("step 3 is not finite. To go on without it, ")
+    assert "--resume --set training.on_nonfinite=skip" in message.splitlines()[0]
+    assert "step 2" not in message
+    assert "learning rate" not in message
+    assert "inputs.cameras.c2w" in message
+
+
+@pytest.mark.parametrize("damage", ['{"step": 2, "lo', "\0\0\0", "[1]", "\x85\u2028"])
+def test_a_damaged_line_stops_no_run(
+    tiny: Callable[..., Recipe], tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    folder = tmp_path / "run"
+    run(tiny("tokengs", "training.steps=3", "training.evaluate_every=3"), folder)
+    for name in ("history.jsonl", "evaluations.jsonl"):
+        lines = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join([damage, *lines]) + "\n")
+    run(tiny("tokengs", "training.evaluate_every=4"), folder, resume=True)
+    for name, steps in (("history.jsonl", [1, 2, 3, 4]), ("evaluations.jsonl", [3, 4])):
+        assert f"{folder / name}, line 1 is damaged" in caplog.text
+        lines = (folder / name).read_text().splitlines()
+        assert [json.loads(line)["step"] for line in lines] == steps

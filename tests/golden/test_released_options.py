@@ -1,0 +1,80 @@
+"""What each option of a release says in a recipe, at values that are no defaults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from golden.dumped import metadata
+from qgs_locus.released import locusgs_recipe
+
+from qgs.components.released import tokengs_recipe
+from qgs.composer import resolve
+from qgs.composer.show import flat
+
+BACKBONE = [
+    ({"enc_embed_dim": 48, "token_dim": 48}, {"width": 48}),
+    ({"enc_num_heads": 8}, {"heads": 8}),
+    ({"patch_size": 4}, {"encoder.patch_size": 4}),
+    ({"enc_depth": 5}, {"encoder.depth": 5}),
+    ({"mlp_ratio": 2.5}, {"encoder.mlp_ratio": 2.5}),
+    ({"gaussian_scale_cap": 0.3}, {"head.scale_cap": 0.3}),
+    ({"num_gs_tokens": 31}, {"queries.count": 31}),
+    ({"gs_token_std": 0.4}, {"queries.std": 0.4}),
+]
+TOKENGS = [
+    *BACKBONE,
+    ({"dec_depth": 3}, {"decoder.depth": 3, "supervision.layers": [3]}),
+    ({"dec_patch_size": 3}, {"head.gaussians_per_query": 9}),
+    ({"opacity_bias": 3.5}, {"head.opacity_bias": -3.5}),
+    ({"gaussian_z_offset": 2.5}, {"centers.z_offset": 2.5}),
+]
+LOCUSGS = [
+    *BACKBONE,
+    ({"dec_depth": 3}, {"decoder.depth": 3}),
+    ({"num_gaussians_per_token": 7}, {"head.gaussians_per_query": 7}),
+    ({"anchor_supervision_layers": [2]}, {"supervision.layers": [2]}),
+    ({"gaussian_z_offset": 2.5}, {"queries.center_init.mean": [0.0, 0.0, 2.5]}),
+    ({"anchor_radius_init": 0.3}, {"queries.init_radius": 0.3}),
+    (
+        {"anchor_radius_min": 0.02},
+        {
+            "queries.radius_min": 0.02, "centers.radius_min": 0.02,
+            "decoder.cross_attention.radius_min": 0.02, "decoder.refinement.radius_min": 0.02,
+        },
+    ),
+    ({"anchor_radius_refinement": False}, {"decoder.refinement.radius": False}),
+    (
+        {"anchor_radius_affects_bias": False, "geo_sigma": 0.7},
+        {"decoder.cross_attention.bandwidth": "fixed", "decoder.cross_attention.sigma0": 0.7},
+    ),
+    (
+        {"anchor_radius_affects_bias": False},
+        {"decoder.cross_attention.bandwidth": "fixed", "decoder.cross_attention.sigma0": 0.1},
+    ),
+    ({"geo_sigma": 0.7}, {"decoder.cross_attention.sigma0": 0.7}),
+    ({"cross_attn_variant": "content_only"}, {"decoder.cross_attention.type": "qgs/content"}),
+    ({"self_attn_variant": "content_only"}, {"decoder.self_attention.type": "qgs/content"}),
+    ({"gaussian_center_variant": "anchor_offset"}, {"centers.type": "locus/anchor_offset"}),
+    ({"gaussian_center_variant": "free_center"}, {"centers.type": "qgs/free"}),
+]  # fmt: skip
+CASES = [("tokengs", *case) for case in TOKENGS] + [("locusgs", *case) for case in LOCUSGS]
+
+
+@pytest.mark.parametrize(("kind", "options", "says"), CASES, ids=str)
+def test_an_option_says(kind: str, options: dict[str, Any], says: dict[str, Any]) -> None:
+    read = {"tokengs": tokengs_recipe, "locusgs": locusgs_recipe}[kind]
+    unchanged = metadata(kind)["options"]
+    recipe = flat(resolve(read(unchanged | options)).tree["model"])
+    assert {path: recipe[path] for path in says} == says
+    before = flat(resolve(read(unchanged)).tree["model"])
+    assert "geo_sigma" in options or any(before.get(path) != says[path] for path in says)
+
+
+def test_no_radius_state() -> None:
+    options = {
+        "use_anchor_radius": False, "anchor_radius_affects_bias": False,
+        "anchor_radius_refinement": False, "gaussian_center_variant": "anchor_offset",
+    }  # fmt: skip
+    tree = resolve(locusgs_recipe(metadata("locusgs")["options"] | options)).tree
+    assert tree["model"]["queries"]["radius"] is False

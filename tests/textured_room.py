@@ -1,0 +1,78 @@
+"""Photos of the inside of a textured box, with exact cameras, for matching features."""
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+SIZE = (120, 180)
+INTRINSICS = (145.0, 147.0, 89.0, 61.0)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """image: (H, W, 3) uint8. c2w: (4, 4) OpenCV camera-to-world."""
+
+    image: np.ndarray
+    c2w: np.ndarray
+
+    def encoded(self, kind: str = "JPEG") -> bytes:
+        file = io.BytesIO()
+        Image.fromarray(self.image).save(file, kind, quality=92)
+        return file.getvalue()
+
+
+def walk(count: int, seed: int = 0) -> list[Shot]:
+    """Photos along a rising arc that turns and rolls, so that no convention is ambiguous."""
+    walls = np.random.default_rng(seed).random((6, 40, 40))
+    return [_shot(walls, pose) for pose in _poses(count)]
+
+
+def _poses(count: int) -> list[np.ndarray]:
+    poses = []
+    for place in np.linspace(0, 1, count):
+        yaw, pitch, roll = 0.5 * place - 0.2, 0.15 - 0.3 * place, 0.25 * place
+        pose = np.eye(4)
+        pose[:3, :3] = _turn(1, yaw) @ _turn(0, pitch) @ _turn(2, roll)
+        pose[:3, 3] = 0.9 * place - 0.4, 0.3 * np.sin(4 * place), 0.5 * place - 0.6
+        poses.append(pose)
+    return poses
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    turn = np.eye(3)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    turn[first, first] = turn[second, second] = np.cos(angle)
+    turn[second, first] = np.sin(angle)
+    turn[first, second] = -turn[second, first]
+    return turn
+
+
+def _shot(walls: np.ndarray, pose: np.ndarray) -> Shot:
+    """Every pixel's ray meets the box's walls, at 1.2, 1 and 1.5 from the origin, from inside."""
+    fx, fy, cx, cy = INTRINSICS
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1) @ pose[:3, :3].T
+    half = np.array([1.2, 1.0, 1.5])
+    reach = (np.sign(rays) * half - pose[:3, 3]) / rays
+    axis = reach.argmin(-1)
+    hit = (pose[:3, 3] + rays * reach.min(-1)[..., None]) / half
+    side = np.take_along_axis(np.sign(rays), axis[..., None], -1)[..., 0] > 0
+    across = np.stack(
+        [np.choose(axis, np.moveaxis(hit[..., [(k + n) % 3 for k in range(3)]], -1, 0))
+         for n in (1, 2)]
+    )  # fmt: skip
+    grey = _sampled(walls, 2 * axis + side, (across + 1) / 2 * (walls.shape[1] - 1.001))
+    tint = np.array([1.0, 0.9, 0.8]) + 0.05 * axis[..., None]
+    return Shot((np.clip(grey[..., None] * tint, 0, 1) * 255).astype(np.uint8), pose)
+
+
+def _sampled(walls: np.ndarray, wall: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Bilinear between the values of a wall's grid."""
+    low = np.floor(place).astype(int).clip(0, walls.shape[1] - 2)
+    u, v = place - low
+    i, j = low
+    top = walls[wall, i, j] * (1 - v) + walls[wall, i, j + 1] * v
+    bottom = walls[wall, i + 1, j] * (1 - v) + walls[wall, i + 1, j + 1] * v
+    return top * (1 - u) + bottom * u
