@@ -32,7 +32,7 @@ def test_slots_and_their_defaults() -> None:
 
 
 def test_commands() -> None:
-    shown = re.findall(r"^\| `qgs (\w+)", section("On the command line"), re.MULTILINE)
+    shown = re.findall(r"^\| `qgs ([\w-]+)", section("On the command line"), re.MULTILINE)
     groups = [group.name or "" for group in app.registered_groups]
     commands = [command.name or "" for command in app.registered_commands]
     assert set(shown) == {*commands, *groups}

@@ -7,7 +7,18 @@ import sys
 
 import typer
 
-from qgs.cli import bench, data, demo, evaluate, inspect, reconstruct, train, weights
+from qgs.cli import (
+    bench,
+    check_plugin,
+    data,
+    demo,
+    evaluate,
+    inspect,
+    new_plugin,
+    reconstruct,
+    train,
+    weights,
+)
 
 app = typer.Typer(
     name="qgs",
@@ -17,7 +28,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _group in (inspect, train, evaluate, reconstruct, weights, data, bench, demo):
+_RECIPES = (inspect, train, evaluate, reconstruct, weights, data, bench, demo)
+_PLUGINS = (new_plugin, check_plugin)
+for _group in (*_RECIPES, *_PLUGINS):
     _group.register(app)
 
 

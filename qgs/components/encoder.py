@@ -60,7 +60,7 @@ class MultiViewViT(Encoder):
     class Config(ComponentConfig):
         """patch_size: P in pixels. depth: blocks. layer_scale: its initial value.
 
-        norm_eps: of every LayerNorm.
+        mlp_ratio: hidden width of the MLPs over D. norm_eps: of every LayerNorm.
         """
 
         patch_size: int = Field(default=8, ge=1)

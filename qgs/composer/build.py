@@ -7,23 +7,49 @@ from typing import Any
 
 import torch
 
+from qgs.composer.builtin import BUILTIN
 from qgs.composer.decode import Chosen
+from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.nodes import Path
-from qgs.contracts import Component, ModelComponent, ModelDims, Refinement
+from qgs.composer.promises import hold_to_promise
+from qgs.composer.registry import component_failure
+from qgs.contracts import Component, ModelComponent, ModelDims, Refinement, SceneSource
+from qgs.contracts.extras import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
 
 
 def build(chosen: Chosen, dims: ModelDims) -> Any:
-    """The component itself; one with parameters is given the sizes of the model."""
-    if issubclass(chosen.component, ModelComponent):
-        return chosen.component(chosen.config, dims)
-    return build_plain(chosen)
+    """The component itself, built with the sizes of the model and held to what it provides."""
+    if not issubclass(chosen.component, ModelComponent):
+        return build_plain(chosen)
+    built = _constructed(chosen, chosen.config, dims)
+    hold_to_promise(built, chosen)
+    return built
 
 
 def build_plain(chosen: Chosen) -> Any:
     """A component that knows nothing of the model's sizes."""
-    plain: Any = chosen.component
-    built = plain(chosen.config)
+    return _constructed(chosen, chosen.config)
+
+
+def _constructed(chosen: Chosen, *arguments: Any) -> Any:
+    """An instance; what a plugin's constructor raises is reported with its distribution.
+
+    Missing packages, and data that cannot be opened, are the user's to mend: told as they are.
+    """
+    make: Any = chosen.component
+    try:
+        built = make(*arguments)
+    except MissingExtraError:
+        raise
+    except Exception as error:
+        ours = chosen.installed.plugin.name == BUILTIN.name
+        if ours or (issubclass(make, SceneSource) and isinstance(error, ValueError | OSError)):
+            raise
+        failure = component_failure(chosen.type, "__init__", error, chosen.installed)
+        origin, path = chosen.place.origin, chosen.written_at
+        problem = RecipeProblem(origin.file, origin.line, path, failure.reason, failure.fix)
+        raise RecipeError([problem]) from error
     assert isinstance(built, Component)
     return built
 

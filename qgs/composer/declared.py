@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable
 from typing import TypeVar
 
 from qgs.composer.decode import Chosen
-from qgs.composer.registry import Registry, component_failure
+from qgs.composer.promises import refuse_unkeepable
+from qgs.composer.registry import component_failure
 from qgs.contracts import Component, ComponentConfig, Fields, Problem, RecipeContext, Supervision
 
 T = TypeVar("T")
 
 
-def check_declarations(chosen: Chosen, context: RecipeContext, registry: Registry) -> list[Problem]:
+def check_declarations(chosen: Chosen, context: RecipeContext) -> list[Problem]:
     """The `problems` of a component whose declarations can all be read.
 
     Raises PluginError, which names the distribution, for one whose code fails.
@@ -22,11 +23,12 @@ def check_declarations(chosen: Chosen, context: RecipeContext, registry: Registr
         try:
             return question()
         except Exception as error:
-            raise component_failure(chosen.type, name, error, registry) from error
+            raise component_failure(chosen.type, name, error, chosen.installed) from error
 
     component, config = chosen.component, chosen.config
     ask("requires", lambda: dict(component.requires(config)))
-    ask("provides", lambda: dict(component.provides(config)))
+    provided = ask("provides", lambda: dict(component.provides(config)))
+    refuse_unkeepable(chosen, provided)
     if issubclass(component, Supervision):
         ask("weights", lambda: dict(component(config).weights()))
     return ask("problems", lambda: _listed(component.problems(config, context)))

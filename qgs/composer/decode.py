@@ -24,7 +24,12 @@ from qgs.composer.nodes import (
     to_plain,
 )
 from qgs.composer.places import Place
-from qgs.composer.registry import Registry, available_plugins, component_failure
+from qgs.composer.registry import (
+    InstalledPlugin,
+    Registry,
+    available_plugins,
+    component_failure,
+)
 from qgs.composer.slots import SLOTS, type_at
 from qgs.composer.suggest import did_you_mean, nearest
 from qgs.contracts import Component, ComponentConfig
@@ -34,12 +39,13 @@ ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 
 @dataclass(frozen=True)
 class Chosen:
-    """The component that stands at a place: its `type`, class and options."""
+    """The component that stands at a place: its `type`, class, options, and where it came from."""
 
     place: Place
     type: str
     component: type[Component]
     config: ComponentConfig
+    installed: InstalledPlugin
 
     @property
     def written_at(self) -> str:
@@ -83,13 +89,14 @@ def _decode_place(place: Place, registry: Registry, problems: Problems) -> Chose
     component = _find(name, place, registry, origin, problems)
     if component is None:
         return None
+    installed = registry.plugins[name.partition("/")[0]]
     try:
         config = decode_config(component.Config, node.without("type"), place.source, problems)
     except Exception as error:
-        failure = component_failure(name, "Config", error, registry)
+        failure = component_failure(name, "Config", error, installed)
         problems.add(origin, ".".join(place.source), failure.reason, failure.fix)
         return None
-    return None if config is None else Chosen(place, name, component, config)
+    return None if config is None else Chosen(place, name, component, config, installed)
 
 
 def _find(

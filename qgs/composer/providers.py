@@ -24,12 +24,12 @@ def fix_unmet(missing: Fields, chosen: Chosen, before: Sequence[Chosen], registr
     fixes = dict.fromkeys(
         f"set `{earlier.written_at}.{option}: {value}` on `{earlier.type}`"
         for earlier in before
-        for option, value, config in _variants(earlier.config)
+        for option, value, config in variants(earlier.config)
         if missing.keys() <= offers(earlier.component, config).keys()
     )
     if not fixes:
         fixes = dict.fromkeys(_installed_providers(missing, chosen.place.slot.name, registry))
-    for option, value, config in _variants(chosen.config):
+    for option, value, config in variants(chosen.config):
         needed = needs(chosen.component, config)
         if needed is not None and not missing.keys() & needed.keys():
             names = " and no ".join(missing)
@@ -73,11 +73,11 @@ def _default_configs(component: type[Component]) -> Iterator[tuple[str, Componen
     if config is None:
         return
     yield "", config
-    for option, value, variant in _variants(config):
+    for option, value, variant in variants(config):
         yield f" with `{option}: {value}`", variant
 
 
-def _variants(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
+def variants(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
     """`config` with one choice made otherwise: option, new value in YAML, new config."""
     for option, field in type(config).model_fields.items():
         choices: tuple[object, ...] = ()

@@ -27,6 +27,7 @@ from qgs.contracts import (
     EvaluationConfig,
     Loss,
     ModelDims,
+    Plugin,
     RecipeContext,
     SceneSource,
     SceneSourceConfig,
@@ -80,11 +81,17 @@ class Recipe:
         return build_plain(self.parts["data",])
 
 
-def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+def resolve(
+    recipe: str | FilePath | Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    plugins: Sequence[Plugin] = (),
+) -> Recipe:
     """Read, merge and check a recipe.
 
     recipe: path of a YAML file, or a mapping of the same form, whose `extends` is relative to the
         working directory. overrides: `a.b=value`, laid over it in order.
+    plugins: what the recipe may name besides the plugins that are installed, such as one under
+        test.
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
@@ -93,7 +100,7 @@ def resolve(recipe: str | FilePath | Mapping[str, Any], overrides: Sequence[str]
     problems.raise_if_stopped()
     tree = _with_default_losses(tree)
     settings = decode_settings(tree, problems)
-    registry = load_plugins(tree, problems)
+    registry = load_plugins(tree, problems, plugins)
     places = expand(tree, settings.decoder.depth, problems)
     places = apply_swaps(tree.child_map("swap"), places, problems)
     parts = decode_places(places, registry, problems)
@@ -123,19 +130,17 @@ def _check_components(
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
     context = RecipeContext(dims, size)
     parts = {
-        path: chosen if chosen and _check_options(chosen, context, registry, problems) else None
+        path: chosen if chosen and _check_options(chosen, context, problems) else None
         for path, chosen in parts.items()
     }
     decoded = decoded_layers(parts["model", "supervision"], depth)
     check_flow(list(execution_order(parts, depth, decoded)), registry, problems)
 
 
-def _check_options(
-    chosen: Chosen, context: RecipeContext, registry: Registry, problems: Problems
-) -> bool:
+def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
     """Report what is wrong with a component's options; whether the component could be asked."""
     try:
-        found = check_declarations(chosen, context, registry)
+        found = check_declarations(chosen, context)
     except PluginError as error:
         problems.add(chosen.place.origin, chosen.written_at, error.reason, error.fix)
         return False

@@ -37,6 +37,11 @@ class InstalledPlugin:
     distribution: str
     version: str
 
+    @property
+    def released_as(self) -> str:
+        """Name and version of the distribution, as messages give them."""
+        return f"{self.distribution} {self.version}"
+
 
 @dataclass(frozen=True)
 class Registry:
@@ -64,21 +69,31 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
     return None if any(field.is_required() for field in fields) else component.Config()
 
 
-def component_failure(kind: str, what: str, error: Exception, registry: Registry) -> PluginError:
-    """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
-    plugin = kind.partition("/")[0]
-    installed = registry.plugins[plugin]
-    distribution = f"{installed.distribution} {installed.version}"
+def component_fault(installed: InstalledPlugin, fault: str) -> PluginError:
+    """A component of `installed` breaks its contract; `fault` says which one, and how."""
     return PluginError(
-        f"the plugin `{plugin}` of {distribution} fails: `{what}` of `{kind}` raises "
-        f"{type(error).__name__}: {error}",
-        f"update {distribution}, or choose another component",
+        f"the plugin `{installed.plugin.name}` of {installed.released_as} fails: {fault}",
+        f"update {installed.released_as}, or choose another component",
+    )
+
+
+def component_failure(
+    kind: str, what: str, error: Exception, installed: InstalledPlugin
+) -> PluginError:
+    """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
+    return component_fault(
+        installed, f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
     )
 
 
 def builtin() -> InstalledPlugin:
     """The plugin `qgs`."""
     return InstalledPlugin(BUILTIN, "qgs", qgs.__version__)
+
+
+def not_installed(plugin: Plugin) -> InstalledPlugin:
+    """A plugin that came with no distribution."""
+    return InstalledPlugin(plugin, "no distribution", "0")
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:
@@ -116,7 +131,10 @@ def load_registry(names: Iterable[str]) -> Registry:
 def load_sound_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
     plugins, broken = {"qgs": builtin()}, []
-    for name in sorted(available_plugins()):
+    available = available_plugins()
+    for entry in available.pop(BUILTIN.name, []):
+        broken.append(f"{_distribution(entry)} offers a plugin `qgs`, the framework's own name")
+    for name in sorted(available):
         try:
             plugins[name] = load_plugin(name)
         except PluginError as error:
@@ -134,7 +152,7 @@ def _load(entry: EntryPoint) -> InstalledPlugin:
     update = f"update {distribution}, or take the plugin out of the recipe"
     try:
         plugin = entry.load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise PluginError(
             f"the plugin `{entry.name}` of {distribution} cannot be imported from "
             f"`{entry.value}`: {type(error).__name__}: {error}",

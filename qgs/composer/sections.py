@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,10 +11,10 @@ from pydantic import Field
 from qgs.composer.decode import ConfigT, decode_config
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Origin, Path, ScalarNode, is_null, kind_of
-from qgs.composer.registry import PluginError, Registry, builtin, load_plugin
+from qgs.composer.registry import PluginError, Registry, builtin, load_plugin, not_installed
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS
 from qgs.composer.suggest import did_you_mean
-from qgs.contracts import ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
+from qgs.contracts import ComponentConfig, EvaluationConfig, Plugin, TrainingConfig, ViewsConfig
 
 
 class ModelSettings(ComponentConfig):
@@ -172,8 +173,12 @@ def _check_heads(node: MapNode, model: ModelSettings, problems: Problems) -> Non
         )
 
 
-def load_plugins(tree: MapNode, problems: Problems) -> Registry:
-    """The components of the recipe's `plugins`; a problem for each that cannot be used."""
+def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
+    """The components of the recipe's `plugins`; a problem for each that cannot be used.
+
+    given: plugins that need not be installed.
+    """
+    at_hand = {plugin.name: not_installed(plugin) for plugin in given}
     plugins, unusable = {"qgs": builtin()}, set()
     seen: dict[str, Origin] = {}
     written = tree.items.get("plugins")
@@ -192,7 +197,7 @@ def load_plugins(tree: MapNode, problems: Problems) -> Registry:
             continue
         seen[item.value] = item.origin
         try:
-            plugins[item.value] = load_plugin(item.value)
+            plugins[item.value] = at_hand.get(item.value) or load_plugin(item.value)
         except PluginError as error:
             unusable.add(item.value)
             problems.add(item.origin, path, error.reason, error.fix)

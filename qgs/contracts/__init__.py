@@ -12,6 +12,7 @@ from qgs.contracts.component import (
     OptionError,
     Problem,
     RecipeContext,
+    component_of,
     without_effect,
 )
 from qgs.contracts.cross_attention import CrossAttention
@@ -67,5 +68,6 @@ __all__ = [
     "Unused",
     "ViewsConfig",
     "WeightLayout",
+    "component_of",
     "without_effect",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import torch
 from pydantic import BaseModel, ConfigDict
@@ -22,6 +22,9 @@ class OptionError(ValueError):
 
 class ComponentConfig(BaseModel):
     """Options of a component: frozen, strict about types, unknown keys refused."""
+
+    __component__: ClassVar[type[Component] | None] = None
+    """The class whose options these are; None for settings that belong to none."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -114,6 +117,17 @@ class Component(ABC):
     class Config(ComponentConfig):
         """No options."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Give every class a Config of its own, which knows the class (see `component_of`)."""
+        super().__init_subclass__(**options)
+        inherited = cls.Config
+        if not (isinstance(inherited, type) and issubclass(inherited, ComponentConfig)):
+            return  # no sound component: whoever loads it says so
+        if inherited.__qualname__ != f"{cls.__qualname__}.Config":
+            where = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.Config"}
+            cls.Config = type("Config", (inherited,), {**where, "__doc__": inherited.__doc__})
+        cls.Config.__component__ = cls
+
     @classmethod
     def requires(cls, config: ComponentConfig) -> Fields:
         """Fields that must exist before this component runs, as a function of its options."""
@@ -128,6 +142,17 @@ class Component(ABC):
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
         """What is wrong with `config` beside the rest of the recipe; empty when it fits."""
         return ()
+
+
+def component_of(config: ComponentConfig) -> type[Component]:
+    """The class whose options `config` holds; raises TypeError for options of no component."""
+    component = type(config).__component__ if isinstance(config, ComponentConfig) else None
+    if component is None:
+        raise TypeError(
+            f"{type(config).__name__} holds options of no component; "
+            "give the Config of a component class, such as MyAttention.Config()"
+        )
+    return component
 
 
 class ModelComponent(Component, torch.nn.Module):

@@ -19,9 +19,13 @@ class CrossAttention(ModelComponent):
     to the decoder layer. Neither argument is changed. Raises KeyError for a field the state lacks,
     which the composer rules out through `requires`, and RuntimeError (torch's) for a memory of
     another width or number of heads.
+
+    ordered_views: whether the order of the views has a meaning. Without one, permuting the views of
+    the memory leaves the update as it is.
     """
 
     slot: ClassVar[str] = "cross_attention"
+    ordered_views: ClassVar[bool] = False
 
     @abstractmethod
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:

@@ -20,9 +20,13 @@ class Encoder(ModelComponent):
     """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
 
     Runs once per forward pass. Raises ValueError for images it cannot divide into patches.
+
+    ordered_views: whether the order of the views has a meaning. Without one, permuting the views
+    permutes the tokens.
     """
 
     slot: ClassVar[str] = "encoder"
+    ordered_views: ClassVar[bool] = False
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:

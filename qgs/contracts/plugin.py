@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
-from qgs.contracts.component import Component
+from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.layout import WeightLayout
 
 CONTRACT_VERSION = 1
@@ -23,9 +23,13 @@ class Plugin:
     contract_version: the CONTRACT_VERSION that the components were written for.
     components: final component classes; their `name` is unique within their slot.
     layouts: published state dicts of models that these components make.
+    examples: options that `qgs check-plugin` tries besides the defaults of every component.
+    exemptions: checks of `qgs.testing` that a component is known to fail, each with the reason.
     """
 
     name: str
     contract_version: int
     components: Sequence[type[Component]]
     layouts: Sequence[WeightLayout] = ()
+    examples: Sequence[ComponentConfig] = ()
+    exemptions: Mapping[type[Component], Mapping[str, str]] = field(default_factory=dict)

@@ -50,9 +50,12 @@ class Renderer(Component, torch.nn.Module):
     Differentiable in every Gaussian parameter and in the cameras' c2w and intrinsics. Zero
     Gaussians, and Gaussians behind the camera, off screen or huge, give finite images and finite
     gradients.
+
+    devices: types of the devices that it renders on.
     """
 
     slot: ClassVar[str] = "renderer"
+    devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
 
     class Config(RendererConfig):
         """The common settings."""

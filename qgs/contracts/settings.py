@@ -20,8 +20,8 @@ class ViewsConfig(ComponentConfig):
     scene is named in a warning. The other inputs lie between, targets are drawn from the same span.
     frame: the camera that becomes the identity. scale: "constant" multiplies translations by
     `scale_factor`; "distance" divides them by the largest distance from the first input camera to
-    another one, then multiplies by `scale_factor`. mirror: probability of mirroring a training
-    sample in x.
+    another one, then multiplies by `scale_factor`. scale_factor: see `scale`. mirror: probability
+    of mirroring a training sample in x.
     """
 
     inputs: int = Field(default=4, ge=1)
@@ -51,16 +51,15 @@ class TrainingConfig(ComponentConfig):
     comes first and the schedule follows the larger of the two fractions. batch_size: scenes per
     step and process. accumulate: batches per optimiser step. learning_rate: peak of the one-cycle
     cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
-    final_divisor: first rate over last rate (torch's OneCycleLR). clip: gradient norm. precision:
-    autocast dtype. save_every: steps between checkpoints, 0 for
-    none but at the end and before evaluations.
-    collapse_window: steps of background-only output after which training stops. workers: processes
-    that decode data, 0 for a thread of this one. render_views: target views rendered at a time, 0
-    for all; bounds memory and changes no gradient. ema: decay of an exponential moving average of
-    the weights, saved and evaluated beside them. on_nonfinite: after a NaN or infinite loss or
-    gradient, whose batch and weights are saved, training stops or skips the step. evaluate_every:
-    steps between evaluations with pictures, 0 for none. trackers: where metrics go besides the
-    run's own history.
+    final_divisor: first rate over last rate (torch's OneCycleLR). betas, weight_decay: of AdamW.
+    clip: gradient norm. precision: autocast dtype. save_every: steps between checkpoints, 0 for
+    none but at the end and before evaluations. collapse_window: steps of background-only output
+    after which training stops. workers: processes that decode data, 0 for a thread of this one.
+    render_views: target views rendered at a time, 0 for all; bounds memory and changes no gradient.
+    ema: decay of an exponential moving average of the weights, saved and evaluated beside them.
+    on_nonfinite: after a NaN or infinite loss or gradient, whose batch and weights are saved,
+    training stops or skips the step. evaluate_every: steps between evaluations with pictures, 0 for
+    none. trackers: where metrics go besides the run's own history.
     """
 
     steps: int = Field(default=150_000, ge=1)
@@ -86,18 +85,19 @@ class TrainingConfig(ComponentConfig):
 
 
 class EvaluationConfig(ComponentConfig):
-    """What `qgs eval` runs: at most `scenes` test scenes, `samples` view samples from each.
+    """What `qgs eval` runs.
 
-    index: a JSON file {scene: null | {"context": [frames], "target": [frames]}} that names scenes
-    and frames instead (pixelSplat's format); then scenes, samples and seed mean nothing. Frames
-    are positions in the scene's frames, the path is relative to the working directory. protocol: a
-    name for these settings in tables, by default the index's file name; what decides the numbers,
-    the index's content included, is hashed beside it. metrics: besides PSNR and SSIM.
-    ssim_covariance: population as in Wang et al. 2004, or sample, scikit-image's default, by which
-    pixelSplat's evaluation and those derived from it score.
-    lpips_weights: file of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth), None
-    for torch's cache. tuning_steps, tuning_rate: token tuning on the input views before each scene
-    is judged, with the recipe's photometric loss (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
+    scenes: test scenes, at most. samples: view samples from each. seed: of their views. index: a
+    JSON file {scene: null | {"context": [frames], "target": [frames]}} that names scenes and frames
+    instead (pixelSplat's format); then scenes, samples and seed mean nothing. Frames are positions
+    in the scene's frames, the path is relative to the working directory. protocol: a name for these
+    settings in tables, by default the index's file name; what decides the numbers, the index's
+    content included, is hashed beside it. metrics: besides PSNR and SSIM. ssim_covariance:
+    population as in Wang et al. 2004, or sample, scikit-image's default, by which pixelSplat's
+    evaluation and those derived from it score. lpips_weights: file of VGG-16 weights (safetensors,
+    or torchvision's vgg16-397923af.pth), None for torch's cache. tuning_steps, tuning_rate: token
+    tuning on the input views before each scene is judged, with the recipe's photometric loss
+    (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
     """
 
     scenes: int = Field(default=32, ge=1)

@@ -33,7 +33,7 @@ def full_precision(function: F) -> F:
         device = tensors[0].device.type if tensors else "cpu"
         # Leaving the outermost autocast of a thread empties a cache that all threads share, so
         # a thread that loads data must not enter one while another trains.
-        inside = torch.is_autocast_enabled(device)
+        inside = device != "meta" and torch.is_autocast_enabled(device)
         with torch.autocast(device_type=device, enabled=False) if inside else nullcontext():
             return function(*map(raised, args), **{k: raised(v) for k, v in kwargs.items()})
 

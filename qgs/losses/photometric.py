@@ -21,7 +21,7 @@ class Photometric(Loss):
     renderings = "each"
 
     class Config(ComponentConfig):
-        """Weights as published.
+        """mse_weight, ssim_weight: of the two terms, as published.
 
         padding: of the SSIM window, see `qgs.losses.ssim.mean_ssim`.
         """

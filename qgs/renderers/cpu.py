@@ -33,6 +33,7 @@ class CpuRenderer(Renderer):
     """
 
     name = "cpu"
+    devices = ("cpu",)
 
     def __init__(self, config: RendererConfig) -> None:
         super().__init__(config)

@@ -26,6 +26,7 @@ class GsplatRenderer(Renderer):
     """
 
     name = "gsplat"
+    devices = ("cuda",)
 
     def __init__(self, config: RendererConfig) -> None:
         super().__init__(config)

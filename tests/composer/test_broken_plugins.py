@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-from qgs.composer import RecipeError, resolve
+from qgs.composer import PluginError, RecipeError, compose, resolve
+from qgs.composer.registry import load_sound_plugins
+from qgs.types import Cameras, Views
 
 
 def test_a_component_that_refines_a_field_is_no_provider_of_it(write, install):
@@ -188,3 +191,139 @@ def test_two_distributions_with_one_plugin_name(write, install):
     (problem,) = caught.value.problems
     assert "first-twin 1.2, second-twin 1.2" in problem.reason
     assert "uninstall" in problem.fix
+
+
+def test_a_plugin_that_ends_the_process_at_import_is_reported(write, install):
+    install("qgs-quits", "quits", "raise SystemExit(3)")
+    with pytest.raises(RecipeError, match=r"qgs-quits 1\.2 cannot be imported"):
+        resolve(write("recipe: 1\nplugins: [quits]\n"))
+
+
+def test_a_distribution_that_takes_the_frameworks_name_is_reported(write, install):
+    install("impostor", "qgs", "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 1, ())")
+    registry, broken = load_sound_plugins()
+    (message,) = [message for message in broken if "impostor 1.2" in message]
+    assert "`qgs`, the framework's own name" in message
+    assert "qgs/latent" in registry.components("queries")
+    resolve(write("recipe: 1\n"))
+
+
+FAULTY = """
+from qgs.contracts import CrossAttention, FieldSpec, Loss, Plugin, Queries, Refinement
+from qgs.contracts import SceneSource
+from qgs.types import QueryState
+import torch
+
+PLACE = {"place": FieldSpec((3,))}
+
+class Exploding(Queries):
+    name = "exploding"
+    count = 3
+    def __init__(self, config, dims):
+        raise ValueError("no luck")
+    def forward(self, batch_size):
+        raise NotImplementedError
+
+class ExplodingLoss(Loss):
+    name = "exploding"
+    def __init__(self, config):
+        raise RuntimeError("no luck")
+    def forward(self, prediction, rendering, target):
+        raise NotImplementedError
+
+class Closed(SceneSource):
+    name = "closed"
+    def __init__(self, config):
+        raise FileNotFoundError("photos/ is not there")
+    def scenes(self, split):
+        raise NotImplementedError
+
+class Silent(Queries):
+    name = "silent"
+    count = 3
+    @classmethod
+    def provides(cls, config):
+        return PLACE
+    def forward(self, batch_size):
+        return QueryState(torch.zeros(batch_size, 3, self.dims.width))
+
+class Shapeless(Refinement):
+    name = "shapeless"
+    @classmethod
+    def provides(cls, config):
+        return PLACE
+    def forward(self, state):
+        return state.replace(fields={"place": state.features[..., :2]})
+
+class Boasting(CrossAttention):
+    name = "boasting"
+    @classmethod
+    def provides(cls, config):
+        return PLACE
+    def forward(self, state, memory):
+        return state.features
+
+plugin = Plugin("faulty", 1, (Exploding, ExplodingLoss, Closed, Silent, Shapeless, Boasting))
+"""
+
+TINY = """
+recipe: 1
+plugins: [faulty]
+model: {width: 16, heads: 2, encoder: {depth: 1}, queries: {count: 3},
+        decoder: {depth: 1}, supervision: {layers: [1]}, head: {gaussians_per_query: 2}}
+"""
+
+
+@pytest.fixture
+def faulty(install) -> None:
+    install("qgs-faulty", "faulty", FAULTY, version="0.3")
+
+
+def test_what_a_constructor_raises_is_reported_with_its_distribution(write, faulty):
+    queries = "model: {queries: {type: faulty/exploding}}\n"
+    recipe = resolve(write("recipe: 1\nplugins: [faulty]\n" + queries))
+    with pytest.raises(RecipeError) as caught:
+        recipe.build_model("meta")
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", 3, "model.queries")
+    assert "qgs-faulty 0.3" in problem.reason
+    assert "`__init__` of `faulty/exploding` raises ValueError: no luck" in problem.reason
+
+
+def test_what_a_loss_raises_when_built_is_reported_with_its_distribution(write, faulty):
+    recipe = resolve(write("recipe: 1\nplugins: [faulty]\nlosses: {x: {type: faulty/exploding}}\n"))
+    with pytest.raises(RecipeError, match=r"losses\.x\n.*qgs-faulty 0\.3"):
+        recipe.build_losses()
+
+
+def test_data_that_cannot_be_opened_is_told_as_it_is(write, faulty):
+    recipe = resolve(write("recipe: 1\nplugins: [faulty]\ndata: {type: faulty/closed}\n"))
+    with pytest.raises(FileNotFoundError, match="photos/ is not there"):
+        recipe.build_data()
+
+
+LIES = {
+    "model.queries={type: faulty/silent}": "but the state that it returns has no field at all",
+    "model.decoder.refinement={type: faulty/shapeless}": r"it returns one of trailing shape \(2,\)",
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_component_that_lies_about_what_it_provides_is_reported(lie, write, faulty):
+    model = compose(write(TINY), [lie])
+    cameras = Cameras(torch.eye(4).expand(1, 1, 4, 4), torch.full((1, 1, 4), 8.0), (16, 16))
+    with pytest.raises(PluginError, match=LIES[lie]) as caught:
+        model(Views(torch.rand(1, 1, 3, 16, 16), cameras))
+    assert "qgs-faulty 0.3" in caught.value.reason
+    assert "says that it provides place (3 float32)" in caught.value.reason
+    model = compose(write(TINY))
+    assert model(Views(torch.rand(1, 1, 3, 16, 16), cameras)).gaussians.means.isfinite().all()
+
+
+def test_a_component_that_could_never_provide_what_it_says_is_refused(write, faulty):
+    decoder = "model: {decoder: {cross_attention: {type: faulty/boasting}}}\n"
+    with pytest.raises(RecipeError) as caught:
+        resolve(write("recipe: 1\nplugins: [faulty]\n" + decoder))
+    (problem,) = caught.value.problems
+    assert "qgs-faulty 0.3" in problem.reason
+    assert "`cross_attention` has no way to write" in problem.reason

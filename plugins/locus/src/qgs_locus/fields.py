@@ -23,7 +23,7 @@ class RadiusOptions(ComponentConfig):
     """How a support radius r is read from the raw radius rho; all components must agree.
 
     radius_bound: "floor" is r = max(softplus(rho), radius_min) (release), "offset" is
-    r = softplus(rho) + radius_min (paper).
+    r = softplus(rho) + radius_min (paper). radius_min: world units.
     """
 
     radius_bound: Literal["floor", "offset"] = "floor"

@@ -74,10 +74,10 @@ class _ClampedProduct(torch.autograd.Function):
         for start in range(0, count, rows):
             product[:, start : start + rows] = left[:, start : start + rows] @ right
         # Number bounds are twice as fast as tensor ones, but reading them would stall a GPU.
-        if lower.is_cuda:
-            product.clamp_(lower, torch.zeros_like(lower))
-        else:
+        if lower.device.type == "cpu":
             product.clamp_(lower.item(), 0.0)
+        else:
+            product.clamp_(lower, torch.zeros_like(lower))
         ctx.save_for_backward(left, right, lower, product)
         return product
 

@@ -1,0 +1,124 @@
+"""`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from importlib.resources import files
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
+
+TEMPLATE_SUFFIX = ".jinja"
+NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
+LONGEST_NAME = 40
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("new-plugin")(new_plugin)
+
+
+def new_plugin(
+    name: Annotated[str, typer.Argument(help="Name of the plugin, as in `type: NAME/component`.")],
+    out: Annotated[
+        Path | None, typer.Option(help="New folder, never overwritten; default: ./qgs-NAME.")
+    ] = None,
+) -> None:
+    """Write a plugin to start from: one component, its contract tests, a recipe that uses it."""
+    check_name(name)
+    distribution = distribution_of(name)
+    folder = out or Path(distribution)
+    write_plugin(name, folder)
+    typer.echo(f"wrote {folder}; next:")
+    typer.echo(f"  cd {folder}")
+    typer.echo("  pip install -e '.[test]'")
+    typer.echo("  python -m pytest")
+    typer.echo("  qgs compose recipe.yaml")
+
+
+def distribution_of(name: str) -> str:
+    """What pip calls the distribution of the plugin `name`."""
+    return f"qgs-{name.replace('_', '-')}"
+
+
+def package_of(name: str) -> str:
+    """The package that is imported for the plugin `name`."""
+    return f"qgs_{name.replace('-', '_')}"
+
+
+def check_name(name: str) -> None:
+    """Raise ValueError for a name that no plugin can have, or that an installed one has."""
+    if not NAME.fullmatch(name):
+        near = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")
+        meant = f"; did you mean `{near}`?" if NAME.fullmatch(near) else ""
+        raise ValueError(
+            f"`{name}` is no name of a plugin: lower-case letters and digits, beginning with a "
+            f"letter, words joined by single hyphens or underscores{meant}"
+        )
+    if len(name) > LONGEST_NAME:
+        raise ValueError(
+            f"`{name}` has {len(name)} characters; a plugin's name has {LONGEST_NAME} at most"
+        )
+    if name == "qgs" or name.startswith(("qgs-", "qgs_")):
+        raise ValueError(
+            f"`{name}` begins like the framework's own name; the distribution is called "
+            "qgs-NAME anyway, so leave `qgs` out"
+        )
+    taken = [entry for entry in entry_points(group="qgs.plugins") if entry.name == name]
+    if taken:
+        owner = taken[0].dist.name if taken[0].dist else "an unknown distribution"
+        raise ValueError(
+            f"the name `{name}` is taken by {owner}, which is installed; of two plugins with one "
+            "name qgs uses neither, so choose another"
+        )
+
+
+def write_plugin(name: str, folder: Path) -> None:
+    """Write the distribution of the plugin `name` into the new `folder`, whole or not at all.
+
+    Raises FileExistsError if there is something at `folder`, whatever it is.
+    """
+    from qgs.io.atomic import new_folder
+
+    with new_folder(folder) as fresh:
+        for path, text in rendered(name):
+            target = fresh / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+
+
+def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
+    """Every file of the distribution of the plugin `name`: path inside it, content."""
+    from jinja2 import Environment, StrictUndefined
+
+    import qgs
+    from qgs.contracts import CONTRACT_VERSION
+
+    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
+    major, minor = qgs.__version__.split(".")[:2]
+    values = {
+        "name": name,
+        "distribution": distribution_of(name),
+        "package": package_of(name),
+        "contract_version": CONTRACT_VERSION,
+        "oldest_qgs": f"{major}.{minor}",
+        "next_qgs": f"{major}.{int(minor) + 1}",
+    }
+    for path, template in _templates(files("qgs.cli") / "plugin_template", PurePosixPath()):
+        parts = [values["package"] if part == "package" else part for part in path.parts]
+        yield PurePosixPath(*parts), environment.from_string(template).render(values)
+
+
+def _templates(folder: Traversable, path: PurePosixPath) -> Iterator[tuple[PurePosixPath, str]]:
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if entry.is_dir():
+            yield from _templates(entry, path / entry.name)
+        elif entry.name.endswith(TEMPLATE_SUFFIX):
+            name = entry.name.removesuffix(TEMPLATE_SUFFIX)
+            yield path / name, entry.read_text(encoding="utf-8")

@@ -1,0 +1,84 @@
+"""Options: what a user writes is what the component gets."""
+
+from __future__ import annotations
+
+from pydantic import ValidationError
+
+from qgs.composer.decode import decode_config
+from qgs.composer.errors import Problems, RecipeError
+from qgs.composer.loader import load_mapping
+from qgs.composer.nodes import ScalarNode
+from qgs.composer.yaml12 import dump
+from qgs.contracts import ComponentConfig, Problem
+from qgs.testing.case import Case
+from qgs.testing.faults import expect
+from qgs.testing.registry import ALL_SLOTS, check
+
+
+@check(ALL_SLOTS)
+def check_config_round_trip(case: Case) -> None:
+    """Options written as YAML and read again are the same options."""
+    text = dump(case.config.model_dump(mode="json"))
+    again, faults = _decoded(case, text)
+    expect(again is not None, f"`{text.strip()}` is refused: {faults}")
+    expect(again == case.config, f"{case.config!r} is read again as {again!r}")
+
+
+@check(ALL_SLOTS)
+def check_misspelt_option_is_refused(case: Case) -> None:
+    """An option that does not exist is refused, and the nearest one that does is suggested."""
+    names = list(type(case.config).model_fields)
+    wrong = f"{names[0]}_x" if names else "no_such_option"
+    options = {**case.config.model_dump(mode="json"), wrong: 1}
+    config, faults = _decoded(case, dump(options))
+    expect(config is None, f"the option `{wrong}` is accepted")
+    expect(not names or f"did you mean `{names[0]}`" in faults, f"the message is: {faults}")
+
+
+@check(ALL_SLOTS)
+def check_config_is_frozen(case: Case) -> None:
+    """Options cannot be changed once they are set."""
+    for name in type(case.config).model_fields:
+        before = getattr(case.config, name)
+        try:
+            setattr(case.config, name, before)
+        except (ValidationError, AttributeError, TypeError):
+            continue
+        expect(False, f"`{name}` can be assigned to; derive Config from ComponentConfig")
+
+
+@check(ALL_SLOTS)
+def check_problems_are_told(case: Case) -> None:
+    """`problems` gives qgs.contracts.Problem objects that name an option, a reason and a fix."""
+    found = case.problems(case.size)
+    for problem in found:
+        expect(isinstance(problem, Problem), f"`problems` gives {problem!r}")
+        option = problem.option.partition(".")[0]
+        known = not option or option in type(case.config).model_fields
+        expect(known, f"a problem is about the option `{option}`, which does not exist")
+        expect(bool(problem.reason and problem.fix), f"{problem} lacks a reason or a fix")
+    expect(not found, f"the options of this case are refused: {[p.reason for p in found]}")
+
+
+@check(ALL_SLOTS)
+def check_declarations_depend_on_options_alone(case: Case) -> None:
+    """`requires` and `provides` give the same FieldSpecs each time, for equal options."""
+    twin = case.config.model_copy(deep=True)
+    for name in ("requires", "provides"):
+        first, second = (dict(getattr(case.component, name)(c)) for c in (case.config, twin))
+        expect(first == second, f"`{name}` gives {first}, then {second}")
+        for field, spec in first.items():
+            kind = type(spec).__name__
+            expect(kind == "FieldSpec", f"`{name}` gives a {kind} for {field}")
+
+
+def _decoded(case: Case, text: str) -> tuple[ComponentConfig | None, str]:
+    problems = Problems()
+    node = load_mapping(text, "case", problems)
+    assert not isinstance(node, ScalarNode)
+    config = decode_config(case.component.Config, node, (), problems)
+    try:
+        problems.raise_any()
+    except RecipeError as error:
+        return config, str(error)
+    return config, ""

@@ -1,0 +1,101 @@
+"""Inputs and parameters stay as they are, and outputs are new."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from qgs.testing.case import Case
+from qgs.testing.faults import expect
+from qgs.testing.registry import MODULES, check
+from qgs.testing.subjects import inputs_of
+from qgs.testing.trees import cloned, described, difference, leaves, scalar, tracked
+from qgs.types import QueryState
+
+
+@check(MODULES)
+def check_inputs_are_not_changed(case: Case) -> None:
+    """Neither the forward nor the backward pass changes an input, in numbers or in names."""
+    module = case.lively()
+    inputs = tracked(inputs_of(case))
+    before = cloned(inputs)
+    outputs = module(*inputs.values())
+    found = difference(before, cloned(inputs))
+    expect(not found, f"after the forward pass the inputs differ: {found}")
+    total = scalar(outputs)
+    if total.requires_grad:
+        total.backward()
+    found = difference(before, cloned(inputs))
+    expect(not found, f"after the backward pass the inputs differ: {found}")
+
+
+@check(MODULES - {"queries"})
+def check_outputs_share_no_memory(case: Case) -> None:
+    """What a component computes lies in memory of its own: not in its inputs' or parameters'."""
+    module, inputs = case.lively(), inputs_of(case)
+    outputs = leaves(module(*inputs.values()))
+    taken = {x.untyped_storage().data_ptr(): n for n, x in leaves(inputs).items() if x.numel()}
+    taken |= {p.untyped_storage().data_ptr(): n for n, p in module.named_parameters()}
+    provided = {f"fields.{name}" for name in case.component.provides(case.config)}
+    for name, tensor in outputs.items():
+        if case.slot == "refinement" and name not in provided:
+            continue  # passed on as it is
+        owner = taken.get(tensor.untyped_storage().data_ptr()) if tensor.numel() else None
+        expect(owner is None, f"`{name}` lies in the memory of `{owner}`")
+
+
+@check(MODULES)
+def check_forward_keeps_no_state(case: Case) -> None:
+    """A forward pass changes no parameter, no buffer, and no attribute that later passes see."""
+    module = case.lively()
+    before, kept = cloned(dict(module.state_dict())), _attributes(module)
+    module(*inputs_of(case).values())
+    found = difference(before, dict(module.state_dict()))
+    expect(not found, f"after a forward pass the state dict differs: {found}")
+    changed = [name for name, value in _attributes(module).items() if kept.get(name) != value]
+    expect(not changed, f"a forward pass changes {', '.join(changed)}")
+
+
+@check({"refinement", "queries"})
+def check_writes_equal_provides(case: Case) -> None:
+    """The fields that are written are those in `provides`, in the shape and dtype given there."""
+    module, inputs = case.lively(), inputs_of(case)
+    before: dict[str, Tensor] = {}
+    if case.slot == "refinement":
+        state = inputs["state"]
+        unrelated = {"unrelated.field": torch.randn(*state.features.shape[:2], 3)}
+        inputs = {"state": state.replace(fields=unrelated)}
+        before = dict(inputs["state"].fields)
+    output = module(*inputs.values())
+    expect(isinstance(output, QueryState), f"it gives a {type(output).__name__}")
+    provided = case.component.provides(case.config)
+    written = {n for n, x in output.fields.items() if n not in before or not _same(x, before[n])}
+    expect(written <= set(provided), f"it writes {_names(written - set(provided))} besides")
+    expect(set(provided) <= written, f"it does not write {_names(set(provided) - written)}")
+    lost = set(before) - set(output.fields)
+    expect(not lost, f"it loses {_names(lost)}")
+    if case.slot == "refinement":
+        passed = _same(output.features, inputs["state"].features)
+        expect(passed, "it changes the features, which a refinement passes on")
+    for name, spec in provided.items():
+        kept = output[name].dtype == spec.dtype
+        expect(kept, f"`{name}` is {described(output[name])}, declared as {spec}")
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    return one is other or (one.data_ptr() == other.data_ptr() and one.shape == other.shape)
+
+
+def _names(names: set[str]) -> str:
+    return ", ".join(sorted(names))
+
+
+def _attributes(module: torch.nn.Module) -> dict[str, str]:
+    """Plain values that the parts of a module hold, as text."""
+    return {
+        f"{name}.{key}" if name else key: repr(value)
+        for name, part in module.named_modules()
+        for key, value in vars(part).items()
+        if isinstance(value, str | int | float | bool | tuple | list | dict | Tensor | None)
+        and not key.startswith("_")
+    }

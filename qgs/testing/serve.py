@@ -1,0 +1,89 @@
+"""What the other process of `qgs.testing.other_process` does: one request a line, one answer."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import os
+import sys
+from types import ModuleType
+from typing import Any
+
+from qgs.testing.audit import root_of, watched
+
+_events: dict[str, list[str]] = {}
+"""What importing did, by root of the package."""
+
+_modules: dict[str, ModuleType] = {}
+
+
+def serve(threads: int) -> None:
+    """Answer every request of the standard input."""
+    import torch
+
+    torch.set_num_threads(threads)
+    out = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what components print must not pass for an answer
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer = {"import": _import, "run": _run}[request["task"]](request)
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=out, flush=True)
+
+
+def _import(request: dict[str, Any]) -> dict[str, Any]:
+    _module(request)
+    return {"events": _events[root_of(request["file"])]}
+
+
+def _run(request: dict[str, Any]) -> dict[str, Any]:
+    """Load weights into a new instance, run it on saved inputs, save the outputs."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    from qgs.contracts import ModelDims
+    from qgs.testing.case import Case
+    from qgs.testing.subjects import inputs_of
+    from qgs.testing.trees import leaves, mapped
+
+    component: Any = _module(request)
+    for name in request["class"].split("."):
+        component = getattr(component, name)
+    config = component.Config.model_validate_json(request["config"])
+    size = request["image_size"]
+    case = Case(config, ModelDims(*request["dims"]), tuple(size) if size else None)
+    module = case.build(seed=99).eval()
+    module.load_state_dict(load_file(request["weights"]))
+    given = load_file(request["inputs"])
+    inputs = mapped(inputs_of(case), lambda name, _: given[name])
+    with torch.no_grad():
+        outputs = module(*inputs.values())
+    save_file({n: x.contiguous().clone() for n, x in leaves(outputs).items()}, request["outputs"])
+    return {}
+
+
+def _module(request: dict[str, Any]) -> ModuleType:
+    name = request["module"]
+    if name in _modules:
+        return _modules[name]
+    with watched(request["file"]) as events:
+        try:
+            _modules[name] = importlib.import_module(name)
+        except ImportError:
+            _modules[name] = _from_file(name, request["file"])
+    _events.setdefault(root_of(request["file"]), []).extend(events)
+    return _modules[name]
+
+
+def _from_file(name: str, file: str) -> ModuleType:
+    """A module that is no part of an importable package, such as a test."""
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{name} cannot be imported from {file}")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,151 @@
+"""`qgs new-plugin`: what it writes, and what it refuses."""
+
+from __future__ import annotations
+
+import ast
+import math
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from qgs.cli import app
+from qgs.cli.new_plugin import check_name, rendered
+from qgs.contracts import ModelDims
+from qgs.io.atomic import new_folder
+from qgs.types import ImageMemory, QueryState
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["new-plugin", "far-sighted"])
+    assert result.exit_code == 0, result.output
+    folder = tmp_path / "qgs-far-sighted"
+    written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert written == {
+        "README.md",
+        "pyproject.toml",
+        "recipe.yaml",
+        "src/qgs_far_sighted/__init__.py",
+        "src/qgs_far_sighted/abstaining.py",
+        "tests/test_components.py",
+    }
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    assert project["name"] == "qgs-far-sighted"
+    assert project["entry-points"]["qgs.plugins"] == {"far-sighted": "qgs_far_sighted:plugin"}
+    assert [path.name for path in tmp_path.iterdir()] == ["qgs-far-sighted"], "nothing is left over"
+
+
+def test_component_and_test_are_short() -> None:
+    files = {str(path): text for path, text in rendered("short")}
+    component = files["src/qgs_short/abstaining.py"]
+    assert len(component.splitlines()) < 50
+    assert len(files["tests/test_components.py"].splitlines()) < 10
+    for path, text in files.items():
+        assert "{{" not in text
+        if path.endswith(".py"):
+            ast.parse(text)
+            assert max(map(len, text.splitlines())) <= 100
+
+
+def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
+    CliRunner().invoke(app, ["new-plugin", "tidy"])
+    for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
+        ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
+        done = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("name", ["a", "wide", "far-sighted", "far_sighted", "view2d"])
+def test_names_that_are_taken_as_they_are(name: str) -> None:
+    check_name(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Far Sighted", "did you mean `far-sighted`"),
+        ("../escape", "did you mean `escape`"),
+        ("2fast", "did you mean `fast`"),
+        ("a--b", "did you mean `a-b`"),
+        ("", "is no name of a plugin"),
+        ("é", "is no name of a plugin"),
+        ("a" * 41, "has 41 characters"),
+        ("qgs", "leave `qgs` out"),
+        ("qgs-more", "leave `qgs` out"),
+        ("locus", "taken by qgs-locus"),
+    ],
+)
+def test_names_that_are_refused(name: str, message: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["new-plugin", "--", name])
+    assert message in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["folder", "empty folder", "file", "dangling link"])
+def test_nothing_is_overwritten(kind: str, tmp_path: Path) -> None:
+    place = tmp_path / "mine"
+    if kind == "file":
+        place.write_text("mine")
+    elif kind == "dangling link":
+        place.symlink_to("nowhere")
+    else:
+        place.mkdir()
+        if kind == "folder":
+            (place / "README.md").write_text("mine")
+    before = sorted(map(str, tmp_path.rglob("*")))
+    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "mine"])
+    assert isinstance(result.exception, FileExistsError)
+    assert "never overwritten" in str(result.exception)
+    assert sorted(map(str, tmp_path.rglob("*"))) == before
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    def fail_halfway() -> None:
+        with new_folder(tmp_path / "a" / "new") as fresh:
+            (fresh / "half").write_text("")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_halfway()
+    assert list((tmp_path / "a").iterdir()) == []
+
+
+def test_a_folder_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError), new_folder(tmp_path / "new"):
+        (tmp_path / "new").mkdir()
+    assert list(tmp_path.iterdir()) == [tmp_path / "new"]
+
+
+def test_a_new_folder_has_the_usual_permissions(tmp_path: Path) -> None:
+    (tmp_path / "usual").mkdir()
+    with new_folder(tmp_path / "new"):
+        pass
+    modes = {os.stat(tmp_path / name).st_mode for name in ("usual", "new")}
+    assert len(modes) == 1
+
+
+@pytest.mark.parametrize("sink", [-0.5, 1.5])
+def test_its_component_computes_its_formula(sink: float) -> None:
+    (source,) = [text for path, text in rendered("mine") if path.name == "abstaining.py"]
+    names: dict = {}
+    exec(source, names)
+    attention = names["AbstainingAttention"]
+    torch.manual_seed(0)
+    module = attention(attention.Config(sink_init=sink), ModelDims(16, 2, 1))
+    state = QueryState(torch.randn(2, 3, 16))
+    keys, values = torch.randn(2, 2, 2, 6, 8)
+    memory = ImageMemory(keys, values, torch.randn(2, 6, 16), torch.randn(2, 6, 6), (1, 2, 3))
+    logits = module.core.project(state.features) @ keys.transpose(-1, -2) / 8**0.5
+    read = logits.exp() @ values / (math.exp(sink) + logits.exp().sum(-1, keepdim=True))
+    expected = module.core.out_proj(read.transpose(1, 2).flatten(2))
+    torch.testing.assert_close(module(state, memory), expected)

@@ -1,0 +1,71 @@
+"""A fresh virtual environment with qgs and qgs-locus from their wheels.
+
+Installing torch again for every test would take minutes. All packages of the present environment
+but qgs and its plugins are lent through a folder of links, so that qgs can only come from its
+wheel.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import venv
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+KEPT_BACK = re.compile(r"_*(editable_+)?_*qgs.*|.*\.pth|pip|pip-.*|__pycache__")
+
+
+@dataclass(frozen=True)
+class FreshEnvironment:
+    """A virtual environment at `folder`."""
+
+    folder: Path
+
+    def run(self, command: str, cwd: Path, timeout: float = 600) -> str:
+        """Standard output of a bash script in the activated environment; it must end well."""
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", command],
+            cwd=cwd,
+            env=self.variables(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=timeout,
+        )
+        assert done.returncode == 0, f"{command}\n{done.stdout}"
+        return done.stdout
+
+    def variables(self) -> dict[str, str]:
+        """Environment variables as `source bin/activate` leaves them."""
+        kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        path = f"{self.folder / 'bin'}{os.pathsep}{kept['PATH']}"
+        return {**kept, "PATH": path, "VIRTUAL_ENV": str(self.folder), "COLUMNS": "200"}
+
+
+def make_fresh_environment(folder: Path) -> FreshEnvironment:
+    """Build the wheels of qgs and qgs-locus and install them into a new environment."""
+    wheels = folder / "wheels"
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
+    subprocess.run([*build, str(ROOT), str(ROOT / "plugins/locus")], check=True)
+    venv.create(folder / "venv", with_pip=True)
+    environment = FreshEnvironment(folder / "venv")
+    environment.run("pip uninstall -q -y setuptools", folder)  # torch wants a newer one: the lent
+    _lend_packages(folder)
+    environment.run(f"pip install -q --no-index {wheels}/*.whl", folder)
+    return environment
+
+
+def _lend_packages(folder: Path) -> None:
+    lent = folder / "lent"
+    lent.mkdir()
+    for site in {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}:
+        for entry in Path(site).iterdir():
+            if not KEPT_BACK.fullmatch(entry.name) and not (lent / entry.name).exists():
+                (lent / entry.name).symlink_to(entry)
+    (own,) = (folder / "venv").glob("lib/python*/site-packages")
+    (own / "lent.pth").write_text(f"{lent}\n")

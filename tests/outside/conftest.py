@@ -1,0 +1,12 @@
+"""One fresh environment for all tests that need one: making it takes most of the time."""
+
+from __future__ import annotations
+
+import pytest
+from fresh_environment import FreshEnvironment, make_fresh_environment
+
+
+@pytest.fixture(scope="session")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> FreshEnvironment:
+    """qgs and qgs-locus from their wheels, nothing from the source tree."""
+    return make_fresh_environment(tmp_path_factory.mktemp("fresh"))

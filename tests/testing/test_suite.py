@@ -1,0 +1,105 @@
+"""The suite as its users meet it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from contract_mutants.modules import AddsNoise, Counts
+from typer.testing import CliRunner
+
+from qgs.cli import app
+from qgs.components import MlpFeedForward
+from qgs.composer.registry import load_plugin
+from qgs.contracts import CONTRACT_VERSION, ViewsConfig
+from qgs.testing import CHECKS, Case, cases_of, checks_for, parametrize_with_checks, run_check
+
+SNAPSHOT = Path(__file__).parent / "state_dicts.json"
+
+
+def _bound(decorated) -> dict:
+    return {parameter.id: parameter.values[0] for parameter in decorated.args[1]}
+
+
+def test_a_failure_says_what_was_seen_and_what_the_contract_says() -> None:
+    name = "feed_forward/adds_noise-eval_repeats_bitwise"
+    check = _bound(parametrize_with_checks([Case(AddsNoise.Config())]).mark)[name]
+    with pytest.raises(pytest.fail.Exception) as failure:
+        check()
+    lines = str(failure.value).splitlines()
+    assert lines[0] == "feed_forward/adds_noise: eval_repeats_bitwise"
+    assert lines[1].startswith("  seen: the second time output: values differ by up to")
+    assert lines[2].startswith("  contract: In evaluation mode the same inputs give")
+
+
+def test_expected_failures_are_strict() -> None:
+    reasons = {"forward_keeps_no_state": "it counts", "config_is_frozen": "it might fail"}
+    checks = _bound(
+        parametrize_with_checks([Case(Counts.Config())], expected_failures=reasons).mark
+    )
+    with pytest.raises(pytest.xfail.Exception, match="it counts"):
+        checks["feed_forward/counts-forward_keeps_no_state"]()
+    with pytest.raises(pytest.fail.Exception, match="passes, although it is expected to fail"):
+        checks["feed_forward/counts-config_is_frozen"]()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("config_is_frosen", "did you mean `config_is_frozen`"),
+        ("supervision_weights", "applies to none of the cases, but to supervision"),
+    ],
+)
+def test_expected_failures_that_cannot_be_are_refused(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parametrize_with_checks([Case(Counts.Config())], expected_failures={name: "why not"})
+
+
+def test_tests_of_another_contract_version_are_refused() -> None:
+    with pytest.raises(ValueError, match="contract version 99"):
+        parametrize_with_checks([Case(Counts.Config())], contract_version=CONTRACT_VERSION + 98)
+
+
+def test_a_case_is_made_of_the_options_of_a_component() -> None:
+    assert Case(MlpFeedForward.Config()).component is MlpFeedForward
+    assert Case(Counts.Config()).component is Counts
+    with pytest.raises(TypeError, match="ViewsConfig holds options of no component"):
+        Case(ViewsConfig())
+
+
+def test_tiers_share_out_the_checks() -> None:
+    case = Case(MlpFeedForward.Config())
+    core, extended = (checks_for(case, [tier]) for tier in ("core", "extended"))
+    assert core
+    assert [check.name for check in extended] == ["compiles"]
+    assert len(core) + len(extended) == len(checks_for(case))
+
+
+@pytest.mark.parametrize("plugin", ["qgs", "locus"])
+def test_names_in_state_dicts_stay(plugin: str) -> None:
+    pinned = json.loads(SNAPSHOT.read_text())
+    for case in cases_of(load_plugin(plugin)):
+        if case.has_parameters:
+            known = Case(case.config, case.dims, state_dict=pinned[case.label])
+            outcome = run_check(CHECKS["state_dict_keys"], known)
+            assert outcome.ok, outcome.message
+
+
+def test_a_pinned_name_that_moved_is_told() -> None:
+    case = Case(MlpFeedForward.Config(), state_dict={"norm.weight": (32,)})
+    outcome = run_check(CHECKS["state_dict_keys"], case)
+    assert "saved weights would not load" in outcome.message
+
+
+def test_check_plugin_reports_an_unknown_plugin() -> None:
+    result = CliRunner().invoke(app, ["check-plugin", "lucos"])
+    assert "no installed distribution offers a plugin `lucos`" in str(result.exception)
+
+
+@pytest.mark.slow
+def test_check_plugin_passes_locus() -> None:
+    result = CliRunner().invoke(app, ["check-plugin", "locus"])
+    assert result.exit_code == 0, result.output
+    assert "7 components" in result.output
+    assert "0 failed" in result.output

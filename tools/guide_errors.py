@@ -1,0 +1,90 @@
+"""The messages on the guide's page of errors, produced by what stands above each of them.
+
+A block of text on that page is what its recipe, or its Python code, raises. A Python block with a
+distribution as its title is the module of a plugin that is installed meanwhile.
+
+`python tools/guide_errors.py` brings the page up to date; a test tells when it is not.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import chdir, contextmanager, redirect_stderr
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import qgs
+from qgs.io.atomic import write_text
+
+PAGE = Path(__file__).parents[1] / "docs/errors.md"
+BLOCK = re.compile(
+    r'^```(yaml|python|text)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE
+)
+
+
+def updated(page: str) -> str:
+    """`page` with every block of text replaced by the message that belongs there."""
+    with TemporaryDirectory() as folder, chdir(folder), _restored_path():
+        message = ""
+
+        def replaced(block: re.Match[str]) -> str:
+            nonlocal message
+            kind, title, text = block.groups()
+            if kind == "text":
+                return f"```text\n{message}\n```"
+            if kind == "python" and title:
+                _install(title, text, Path(folder))
+            else:
+                message = _message(kind, title or "recipe.yaml", text)
+            return block.group(0)
+
+        return BLOCK.sub(replaced, page)
+
+
+def _message(kind: str, name: str, text: str) -> str:
+    """What a recipe raises when it is composed, or Python code when it is run."""
+    try:
+        if kind == "yaml":
+            Path(name).write_text(text, encoding="utf-8")
+            qgs.compose(name, device="meta")
+        else:
+            exec(compile(text, name, "exec"), {})  # the guide's own code
+    except ValueError as error:
+        return str(error)
+    raise RuntimeError(f"this raises nothing, so the page is wrong:\n{text}")
+
+
+def _install(distribution: str, source: str, folder: Path) -> None:
+    """Make a module importable as the plugin of `distribution`, a name and a version."""
+    name, version = distribution.split()
+    module = name.replace("-", "_")
+    site = folder / module
+    info = site / f"{module}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (site / f"{module}.py").write_text(source, encoding="utf-8")
+    metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+    (info / "METADATA").write_text(metadata, encoding="utf-8")
+    entry = f"[qgs.plugins]\n{name.removeprefix('qgs-')} = {module}:plugin\n"
+    (info / "entry_points.txt").write_text(entry, encoding="utf-8")
+    sys.path.insert(0, str(site))
+
+
+@contextmanager
+def _restored_path() -> Iterator[None]:
+    """`sys.path` and the imported modules as they were, and nothing on standard error."""
+    path, modules = list(sys.path), set(sys.modules)
+    try:
+        with redirect_stderr(StringIO()):
+            yield
+    finally:
+        for name in set(sys.modules) - modules:
+            if name.startswith("qgs_"):
+                del sys.modules[name]
+        sys.path[:] = path
+
+
+if __name__ == "__main__":
+    write_text(PAGE, updated(PAGE.read_text(encoding="utf-8")))
