@@ -111,7 +111,8 @@ def _signals_of_children_left_alone() -> Iterator[None]:
 def _next(batches: Iterator[Batch | _Failure]) -> Batch | _Failure:
     try:
         return next(batches)
-    except RuntimeError as error:  # all that torch tells of a worker's sudden end
+    # What torch tells of a worker's sudden end, and what a connection to it says when it breaks.
+    except (RuntimeError, OSError, EOFError) as error:
         raise WorkerError(
             f"a process that decodes data ended suddenly ({error}): often the system was out of "
             "memory; lower training.workers, or views and image sizes"

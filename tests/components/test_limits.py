@@ -95,9 +95,9 @@ LOSS_LIMITS: list[tuple[str, str, float, float, dict[str, Any]]] = [
 
 BEGINNINGS = {
     "std", "init_std", "position_std", "layer_scale", "init_radius", "gamma_init", "weight",
-    "mse_weight", "ssim_weight",
+    "mse_weight", "ssim_weight", "ratio", "mlp_ratio",
 }  # fmt: skip
-"""Numbers that say how training starts or what it weighs, and limit nothing."""
+"""Numbers that say how training starts, what it weighs or how wide a layer is; they limit nothing."""
 
 
 @pytest.fixture(autouse=True)
