@@ -97,7 +97,7 @@ BEGINNINGS = {
     "std", "init_std", "position_std", "layer_scale", "init_radius", "gamma_init", "weight",
     "mse_weight", "ssim_weight", "ratio", "mlp_ratio",
 }  # fmt: skip
-"""Numbers that say how training starts, what it weighs or how wide a layer is; they limit nothing."""
+"""Numbers that say how training starts, what it weighs or how wide a layer is."""
 
 
 @pytest.fixture(autouse=True)
