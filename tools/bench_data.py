@@ -47,7 +47,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=256)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    with _chunks(options.path) as path:
+    with chunks_at(options.path) as path:
         config = ChunksConfig(path=path, image_size=(options.size, options.size))
         source = ChunksSource(config)
         report_speed(source.scenes("train"))
@@ -55,7 +55,8 @@ def main() -> int:
 
 
 @contextmanager
-def _chunks(path: str | None) -> Iterator[str]:
+def chunks_at(path: str | None) -> Iterator[str]:
+    """`path` itself, or for None a temporary folder of synthetic chunks."""
     if path is not None:
         yield path
         return

@@ -13,16 +13,13 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from itertools import islice
 from multiprocessing import active_children
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import torch
-from bench_data import write_synthetic
-from upath import UPath
+from bench_data import chunks_at
 
 from qgs.composer import Recipe, resolve
 from qgs.data.loader import training_batches
@@ -42,22 +39,12 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--samples", type=int, default=10_000)
     options = parser.parse_args()
-    with _chunks(options.path) as path:
+    with chunks_at(options.path) as path:
         data = {"type": "qgs/chunks", "path": path, "image_size": [256, 256]}
         recipe = resolve({**resolve(TINY).tree, "data": data})
         ratio = measured_ratio(recipe, options.workers)
         growth = measured_growth(recipe, options.workers, options.samples)
     return int(ratio < RATIO or growth > GROWTH)
-
-
-@contextmanager
-def _chunks(path: str | None) -> Iterator[str]:
-    if path is not None:
-        yield path
-        return
-    with TemporaryDirectory() as folder:
-        write_synthetic(UPath(folder))
-        yield folder
 
 
 def measured_ratio(recipe: Recipe, workers: int) -> float:

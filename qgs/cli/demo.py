@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from qgs.cli.options import Device
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -34,9 +36,7 @@ def demo(
     folder: Annotated[
         Path | None, typer.Option("--recipe-folder", help="Folder of the tiny recipes.")
     ] = None,
-    device: Annotated[
-        str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
-    ] = "auto",
+    device: Device = "auto",
 ) -> None:
     """Train the tiny TokenGS and LocusGS on the same rooms, compare them, write report.html."""
     files = recipes or default_recipes(folder)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qgs.cli.options import parse_size
+from qgs.cli.options import Device, parse_size
 from qgs.cli.scene_choice import chosen_scene
 
 if TYPE_CHECKING:
@@ -58,9 +58,7 @@ def reconstruct(
     scene_name: Annotated[
         str | None, typer.Option("--scene", help="Name of the scene, where there are several.")
     ] = None,
-    device: Annotated[
-        str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
-    ] = "auto",
+    device: Device = "auto",
 ) -> None:
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
 
