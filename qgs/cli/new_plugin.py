@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from importlib.metadata import entry_points
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, distribution, entry_points
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated
@@ -32,8 +33,7 @@ def new_plugin(
 ) -> None:
     """Write a plugin to start from: one component, its contract tests, a recipe that uses it."""
     check_name(name)
-    distribution = distribution_of(name)
-    folder = out or Path(distribution)
+    folder = out or Path(distribution_of(name))
     write_plugin(name, folder)
     typer.echo(f"wrote {folder}; next:")
     typer.echo(f"  cd {folder}")
@@ -55,7 +55,7 @@ def package_of(name: str) -> str:
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
     if not NAME.fullmatch(name):
-        near = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-0123456789")
+        near = re.sub(r"[^a-z0-9]+", "-", name.lower()).lstrip("-0123456789").rstrip("-")
         meant = f"; did you mean `{near}`?" if NAME.fullmatch(near) else ""
         raise ValueError(
             f"`{name}` is no name of a plugin: lower-case letters and digits, beginning with a "
@@ -70,12 +70,40 @@ def check_name(name: str) -> None:
             f"`{name}` begins like the framework's own name; the distribution is called "
             "qgs-NAME anyway, so leave `qgs` out"
         )
+    read = _read_in_a_recipe(name)
+    if read != name:
+        raise ValueError(
+            f"`{name}` in a recipe's `plugins: [{name}]` would be read as {read!r} and not as a "
+            f"name; choose another, such as `{name}-things`"
+        )
+    _refuse_taken(name)
+
+
+def _read_in_a_recipe(name: str) -> object:
+    """What a YAML 1.2 reader takes `name` for when it stands without quotes."""
+    import yaml
+
+    from qgs.composer.yaml12 import Yaml12Loader, scalar_value
+
+    node = yaml.compose(f"[{name}]", Loader=Yaml12Loader).value[0]
+    return scalar_value(node.tag, node.value)
+
+
+def _refuse_taken(name: str) -> None:
+    """Raise ValueError if an installed plugin has this name or this distribution's name."""
     taken = [entry for entry in entry_points(group="qgs.plugins") if entry.name == name]
     if taken:
         owner = taken[0].dist.name if taken[0].dist else "an unknown distribution"
         raise ValueError(
             f"the name `{name}` is taken by {owner}, which is installed; of two plugins with one "
             "name qgs uses neither, so choose another"
+        )
+    with suppress(PackageNotFoundError):
+        installed = distribution(distribution_of(name))
+        raise ValueError(
+            f"a plugin `{name}` would be the distribution {distribution_of(name)}, and "
+            f"{installed.name} {installed.version} is installed, which it would replace; choose "
+            "another name"
         )
 
 

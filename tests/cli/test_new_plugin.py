@@ -16,6 +16,9 @@ from typer.testing import CliRunner
 
 from qgs.cli import app
 from qgs.cli.new_plugin import check_name, rendered
+from qgs.composer.errors import Problems
+from qgs.composer.loader import load_mapping
+from qgs.composer.nodes import ListNode, ScalarNode
 from qgs.contracts import ModelDims
 from qgs.io.atomic import new_folder
 from qgs.types import ImageMemory, QueryState
@@ -70,6 +73,26 @@ def test_names_that_are_taken_as_they_are(name: str) -> None:
     check_name(name)
 
 
+@pytest.mark.parametrize("name", ["no", "on", "yes", "off", "n", "inf", "nan", "e3", "none"])
+def test_words_that_other_readers_of_yaml_take_for_values(name: str) -> None:
+    check_name(name)
+    (text,) = [text for path, text in rendered(name) if path.name == "recipe.yaml"]
+    plugins = load_mapping(text, "recipe.yaml", Problems()).items["plugins"]
+    assert isinstance(plugins, ListNode)
+    assert plugins.items == (ScalarNode(plugins.origin, name),)
+
+
+def test_a_distribution_that_is_installed_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "site/qgs_far_sighted-2.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: qgs-far-sighted\nVersion: 2.0\n")
+    monkeypatch.syspath_prepend(info.parent)
+    with pytest.raises(ValueError, match=r"qgs-far-sighted 2\.0 is installed, which it would"):
+        check_name("far_sighted")
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -83,6 +106,10 @@ def test_names_that_are_taken_as_they_are(name: str) -> None:
         ("qgs", "leave `qgs` out"),
         ("qgs-more", "leave `qgs` out"),
         ("locus", "taken by qgs-locus"),
+        ("null", "would be read as None"),
+        ("true", "would be read as True"),
+        ("false", "choose another, such as `false-things`"),
+        ("1e3", "did you mean `e3`"),
     ],
 )
 def test_names_that_are_refused(name: str, message: str, tmp_path: Path) -> None:
