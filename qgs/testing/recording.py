@@ -1,14 +1,18 @@
-"""Tensors that note when their numbers are read."""
+"""Tensors that note when their numbers are read, and fields that note when they are asked for."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from qgs.testing.trees import leaves, mapped
+from qgs.testing.trees import mapped
+from qgs.types import LayerPrediction, QueryState
 
 METADATA = {
     getattr(Tensor, name).__get__
@@ -24,6 +28,22 @@ METADATA = {
     )
 } | {Tensor.size, Tensor.dim, Tensor.numel, Tensor.__len__, Tensor.is_floating_point}
 """What can be asked of a tensor without reading a number of it."""
+
+PASSING_ON = {QueryState.__post_init__.__code__, QueryState.replace.__code__}
+"""Code that goes through all fields for the component, which sees none of them."""
+
+
+@dataclass
+class Reads:
+    """What a component has looked at.
+
+    numbers: dotted names of the tensors it computed with. asked: fields of a state that it asked
+    for by name, found or not. all_asked: whether it went through the fields, names or values.
+    """
+
+    numbers: set[str] = field(default_factory=set)
+    asked: set[str] = field(default_factory=set)
+    all_asked: bool = False
 
 
 class RecordedTensor(Tensor):
@@ -48,16 +68,84 @@ class RecordedTensor(Tensor):
         return func(*tree_map(plain, args), **tree_map(plain, kwargs or {}))
 
 
-def recorded(tree: Any) -> tuple[Any, set[str]]:
-    """A copy of `tree` and the names of the tensors in it that were read so far."""
-    read: set[str] = set()
+class RecordedFields(Mapping[str, Tensor]):
+    """Fields of a state that note who asks, and have whatever is asked for.
+
+    absent: makes the tensor of a field that is not there.
+    """
+
+    def __init__(
+        self, held: Mapping[str, Tensor], absent: Callable[[str], Tensor], reads: Reads
+    ) -> None:
+        self._held = dict(held)
+        self._absent = absent
+        self._reads = reads
+
+    def changed(self, fields: Mapping[str, Tensor]) -> RecordedFields:
+        """With other fields besides or instead."""
+        return RecordedFields({**self._held, **fields}, self._absent, self._reads)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The field, held or made up; `get` and `in` come here too."""
+        if sys._getframe(1).f_code not in PASSING_ON:
+            self._reads.asked.add(name)
+        return self._held[name] if name in self._held else self._absent(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._every(sys._getframe(1).f_code))
+
+    def __len__(self) -> int:
+        return len(self._every(sys._getframe(1).f_code))
+
+    def keys(self) -> Any:
+        """All names."""
+        return self._every(sys._getframe(1).f_code).keys()
+
+    def values(self) -> Any:
+        """All tensors."""
+        return self._every(sys._getframe(1).f_code).values()
+
+    def items(self) -> Any:
+        """All of both."""
+        return self._every(sys._getframe(1).f_code).items()
+
+    def _every(self, asker: Any) -> dict[str, Tensor]:
+        self._reads.all_asked |= asker not in PASSING_ON
+        return self._held
+
+
+class RecordedState(QueryState):
+    """A state whose copies note who asks for their fields, as it does itself."""
+
+    fields: RecordedFields  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def replace(
+        self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
+    ) -> QueryState:
+        """As of any state."""
+        kept = self.features if features is None else features
+        return RecordedState(kept, self.fields.changed(fields or {}))
+
+
+def recorded(inputs: dict[str, Any], absent: Callable[[str], Tensor]) -> tuple[Any, Reads]:
+    """A copy of the inputs of a component, and what was looked at in it so far.
+
+    absent: makes a field that a component asks for and that `inputs` lack.
+    """
+    reads = Reads()
 
     def wrap(name: str, tensor: Tensor) -> Tensor:
         note = tensor.detach().clone().as_subclass(RecordedTensor)
-        note.read_as, note.readers = name, read
+        note.read_as, note.readers = name, reads.numbers
         return note
 
-    copy = mapped(tree, wrap)
-    leaves(copy)
-    read.clear()
-    return copy, read
+    def watched(value: Any) -> Any:
+        if isinstance(value, QueryState):
+            return RecordedState(value.features, RecordedFields(value.fields, absent, reads))
+        if isinstance(value, LayerPrediction):
+            return replace(value, state=watched(value.state))
+        return value
+
+    copy = {name: watched(value) for name, value in mapped(inputs, wrap).items()}
+    reads.numbers.clear()
+    return copy, reads

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from contract_mutants import import_io, modules, options, pictures
+from contract_mutants import import_io, modules, options, pictures, reads
 
 from qgs.contracts import Component
 from qgs.testing import CHECKS, Case, run_check
@@ -88,6 +88,12 @@ MUTANTS = [
     Mutant("loss_is_a_mean_over_scenes", pictures.SumsOverScenes, "against the mean over scenes"),
     Mutant("renderings_as_declared", pictures.TakesTheWorstView, "against the mean over views"),
     Mutant("compiles", modules.GrowsATuple, "more graphs are compiled"),
+    Mutant("reads_within_requires", reads.ReadsAnothersFieldIfThere, "reads anchor.center"),
+    Mutant("reads_within_requires", reads.LooksForAField, "reads anchor.center"),
+    Mutant("reads_within_requires", reads.ReadsInTry, "reads anchor.center"),
+    Mutant("reads_within_requires", reads.ReadsWhatItCopies, "reads anchor.raw_radius"),
+    Mutant("reads_within_requires", reads.SearchesTheFields, "goes through all fields"),
+    Mutant("reads_within_requires", reads.PeeksAtTheRendering, "although `renderings` is none"),
 ]
 
 SLOW = {"compiles"}
