@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 from torch import Tensor
@@ -62,3 +63,13 @@ class PeeksAtTheRendering(Loss):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
+
+
+class PassesFieldsOn(ContentSelfAttention):
+    """Sound: it makes states by hand, with fields that it does not look at."""
+
+    name: ClassVar[str] = "passes_fields_on"
+
+    def forward(self, state: QueryState) -> Tensor:
+        doubled = replace(state, features=2 * state.features)
+        return super().forward(QueryState(doubled.features, doubled.fields).replace())

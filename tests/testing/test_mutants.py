@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from contract_mutants import import_io, modules, options, pictures, reads
+from contract_mutants import halves, import_io, modules, options, pictures, reads
 
 from qgs.contracts import Component
 from qgs.testing import CHECKS, Case, run_check
@@ -94,6 +94,17 @@ MUTANTS = [
     Mutant("reads_within_requires", reads.ReadsWhatItCopies, "reads anchor.raw_radius"),
     Mutant("reads_within_requires", reads.SearchesTheFields, "goes through all fields"),
     Mutant("reads_within_requires", reads.PeeksAtTheRendering, "although `renderings` is none"),
+    Mutant("geometry_is_float32_under_autocast", halves.MatmulThenFloat, "output: values differ"),
+    Mutant("geometry_is_float32_under_autocast", halves.TurnsInHalf, "place.center: values differ"),
+    Mutant(
+        "geometry_is_float32_under_autocast",
+        halves.PlacesQueriesInHalf,
+        "place.center",
+        {"count": 6},
+    ),
+    Mutant("geometry_is_float32_under_autocast", halves.DecodesInHalf, "opacities: values differ"),
+    Mutant("geometry_is_float32_under_autocast", halves.BiasesInHalf, "explain.geometry"),
+    Mutant("geometry_is_float32_under_autocast", halves.MeasuresInHalf, "volume: values differ"),
 ]
 
 SLOW = {"compiles"}

@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
-import torch
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from qgs.contracts import CrossAttention, SelfAttention
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
+from qgs.testing.learned import LearnedLayers, ReplayedLayers
 from qgs.testing.registry import MODULES, PARAMETRIC, check
 from qgs.testing.subjects import Inputs, inputs_of
 from qgs.testing.trees import (
     cast,
     described,
+    distance,
     floating,
+    leaves,
     mapped,
     not_finite,
     tracked,
 )
+
+EXPLAINED = "explain.geometry"
+"""What geometry adds to attention logits; -inf where it keeps a query from looking."""
 
 GEOMETRY = {
     "encoder": ("patch_rays",),
     "queries": ("fields.",),
     "refinement": ("fields.",),
     "head": ("scales", "quats", "opacities"),
+    "cross_attention": (EXPLAINED,),
+    "self_attention": (EXPLAINED,),
     "centers": ("output",),
     "renderer": ("rgb", "alpha", "depth"),
     "losses": ("",),
@@ -38,22 +50,37 @@ HALVED = (
 )
 """Inputs that arrive in bfloat16 under autocast."""
 
+RTOL, ATOL = 1e-5, 1e-6
+"""How far geometry under autocast may be from float32: bfloat16 rounds by 4e-3."""
+
 CLOSE = 0.1
 """How far bfloat16 may take an output from its float32 value, in units of its spread."""
 
 
 @check(MODULES)
 def check_geometry_is_float32_under_autocast(case: Case) -> None:
-    """Under bfloat16 autocast what is computed is finite, and geometry stays float32."""
+    """Under bfloat16 autocast what is computed is finite, and geometry is computed in float32.
+
+    Learned layers run in bfloat16. What is made of their outputs and of the geometry that goes in
+    (means, world-frame fields, what a head decodes, what geometry adds to attention logits, images,
+    losses) has the values that float32 gives it for the same outputs of the layers.
+    """
     module, inputs = case.lively(), _halved(inputs_of(case))
-    with torch.autocast(case.device, dtype=torch.bfloat16):
-        outputs = module(*inputs.values())
-    broken = not_finite(outputs)
+    if case.slot == "queries":
+        module.requires_grad_(False)  # its parameters are no layers: they are the geometry
+    with torch.autocast(case.device, dtype=torch.bfloat16), LearnedLayers() as layers:
+        outputs = _with_explanation(module, inputs)
+    broken = [name for name in not_finite(outputs) if name != EXPLAINED]
     expect(not broken, f"under autocast {', '.join(broken)} is not finite")
-    for name, tensor in floating(outputs).items():
-        if name.startswith(GEOMETRY.get(case.slot, ())):
-            kept = tensor.dtype == torch.float32
-            expect(kept, f"under autocast `{name}` is {described(tensor)}, not float32")
+    seen = {n: x for n, x in floating(outputs).items() if n.startswith(GEOMETRY.get(case.slot, ()))}
+    for name, tensor in seen.items():
+        kept = tensor.dtype == torch.float32
+        expect(kept, f"under autocast `{name}` is {described(tensor)}, not float32")
+    with ReplayedLayers(layers.outputs):
+        exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
+    for name in seen.keys() - _without_frame(case):
+        found = distance({name: exact[name]}, {name: seen[name]}, RTOL, ATOL)
+        expect(not found, f"under autocast, against float32, {found}")
 
 
 @check(MODULES)
@@ -96,4 +123,26 @@ def check_moves_to_a_device(case: Case) -> None:
 
 
 def _halved(inputs: Inputs) -> Inputs:
-    return mapped(inputs, lambda name, x: x.to(torch.bfloat16) if name in HALVED else x)
+    """Features in bfloat16, which ask for gradients; geometry asks for none."""
+
+    def visit(name: str, x: Tensor) -> Tensor:
+        return x.to(torch.bfloat16).requires_grad_() if name in HALVED else x
+
+    return mapped(inputs, visit)
+
+
+def _with_explanation(module: Any, inputs: Inputs) -> dict[str, Any]:
+    """The outputs, and what geometry adds to the logits of an attention that tells it."""
+    outputs = leaves(module(*inputs.values()))
+    if isinstance(module, CrossAttention | SelfAttention):
+        queries = torch.arange(inputs["state"].features.shape[1])
+        weights = module.explain(*inputs.values(), queries)
+        if weights is not None and weights.geometry is not None:
+            outputs[EXPLAINED] = weights.geometry
+    return outputs
+
+
+def _without_frame(case: Case) -> set[str]:
+    """Provided fields that stand in no frame."""
+    provided = case.component.provides(case.config).items()
+    return {f"fields.{name}" for name, spec in provided if spec.frame == "none"}
