@@ -1,5 +1,5 @@
 # Sourced by tools/demo and tools/test: `use_environment EXTRAS` makes sure that a virtual
-# environment holds qgs, its EXTRAS and plugins/locus, and puts it first on PATH.
+# environment holds qgs, its EXTRAS and the plugins, and puts it first on PATH.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
@@ -52,7 +52,7 @@ fingerprint() {
     {
         echo "$root"
         "$1/bin/python" --version
-        cat "$root"/{pyproject.toml,constraints.txt,plugins/locus/pyproject.toml}
+        cat "$root"/{pyproject.toml,constraints.txt,plugins/{locus,ellipsoid}/pyproject.toml}
     } | sha256sum | cut -d' ' -f1
 }
 
@@ -61,11 +61,12 @@ install() {
     "$environment/bin/python" -m pip --version >/dev/null 2>&1 ||
         die "the virtual environment $environment has no pip." \
             "Add it with: $environment/bin/python -m ensurepip"
-    echo "qgs: installing qgs[$extras] and plugins/locus into $environment" >&2
+    echo "qgs: installing qgs[$extras] and the plugins into $environment" >&2
     # Modules are compiled when first imported: most of them never are.
     "$environment/bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
         --constraint "$root/constraints.txt" \
-        --editable "$root[$extras]" --editable "$root/plugins/locus" ||
+        --editable "$root[$extras]" --editable "$root/plugins/locus" \
+        --editable "$root/plugins/ellipsoid" ||
         die "the installation failed (see above); run the command again to retry."
     echo "qgs: installed in $((SECONDS - started)) s" >&2
 }

@@ -1,0 +1,75 @@
+"""`ellipsoid/anchored`: every query carries a 3D anchor, a centre and an ellipsoid around it."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from qgs_locus.anchors import FrustumCenters, NormalCenters
+from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, raw_radius_of
+from torch import Tensor, nn
+
+from qgs.contracts import Fields, ModelDims, Queries
+from qgs.types import QueryState, SpatialSupport
+from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
+
+Radius = Annotated[float, Field(gt=0)]
+
+
+class EllipsoidQueries(Queries):
+    """N learned vectors, centres mu, rotations and raw radii, shared by all scenes."""
+
+    name: ClassVar[str] = "anchored"
+
+    class Config(RadiusOptions):
+        """count: N. std: of the features. center_init: where anchors start, see `locus/anchored`.
+
+        init_radii: semi-axes that every anchor starts with, along the axes of the world.
+        """
+
+        count: int = Field(default=4096, ge=1)
+        std: float = Field(default=0.01, ge=0)
+        init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
+        center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
+            NormalCenters()
+        )
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
+        self.center = nn.Parameter(config.center_init.sample(config.count))
+        raw = torch.tensor([raw_radius_of(radius) for radius in config.init_radii])
+        self.rotation = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(config.count, 1))
+        self.raw_radii = nn.Parameter(raw.repeat(config.count, 1))
+
+    @classmethod
+    def provides(cls, config: Config) -> Fields:
+        """Centre, rotation and raw radii."""
+        return {**CENTER_FIELD, **shape_fields(config)}
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.features.shape[0]
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        """No weight decay on rotations: their length means nothing."""
+        return name != "rotation" and super().decays(name, parameter)
+
+    def forward(self, batch_size: int) -> QueryState:
+        """Features (B, N, D); fields centre (B, N, 3), rotation (B, N, 4), raw radii (B, N, 3)."""
+
+        def shared(x: Tensor) -> Tensor:
+            return x.expand(batch_size, -1, -1)
+
+        rotation = F.normalize(self.rotation, dim=-1)
+        shape = {ROTATION: shared(rotation), RAW_RADII: shared(self.raw_radii)}
+        return QueryState(shared(self.features), {CENTER: shared(self.center), **shape})
+
+    def support(self, state: QueryState) -> SpatialSupport:
+        """The ellipsoids."""
+        return SpatialSupport(state[CENTER], anchor_axes(state, self.config))

@@ -1,0 +1,52 @@
+"""`ellipsoid/ray_biased`: queries look first at the rays that pass through their ellipsoid."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
+from torch import Tensor
+
+from qgs.contracts import Fields
+from qgs.types import ImageMemory, QueryState
+from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation, shape_fields
+from qgs_ellipsoid.ray_bias import ellipsoid_bias, ray_features
+
+
+class EllipsoidCrossAttention(RayBiasedCrossAttention):
+    """`locus/ray_biased` whose bias measures a ray's distance in the metric of the anchor.
+
+    Floors, clamp and gamma are LocusGS's; the floor of (sigma0 r)^2 holds along each axis.
+    """
+
+    name: ClassVar[str] = "ray_biased"
+
+    class Config(RayBiasedCrossAttention.Config):
+        """As `locus/ray_biased`. bandwidth: "fixed" measures all anchors by sigma0, as LocusGS."""
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """Those of `locus/ray_biased`, with a shape for its radius."""
+        required = dict(super().requires(config))
+        if required.pop(RAW_RADIUS, None):
+            required.update(shape_fields(config))
+        return required
+
+    def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
+        """gamma b (B, N, M), float32, computed from the state that enters the layer."""
+        config = self.config
+        if config.bandwidth == "fixed":
+            return super().bias(state, memory)
+        features = memory.once(
+            f"ellipsoid.ray_features.{config.direction_eps:g}",
+            lambda: ray_features(memory.patch_rays, config.direction_eps),
+        )
+        radii = support_radius(state[RAW_RADII], config)
+        sigma_sq = (config.sigma0 * radii).square().clamp_min(config.sigma_sq_min)
+        rotation = anchor_rotation(state[ROTATION])
+        return ellipsoid_bias(
+            state[CENTER], rotation, sigma_sq, features, config.bias_min, self.gamma
+        )

@@ -1,0 +1,179 @@
+"""The attention bias between ellipsoidal anchors and image rays: b = -1/2 min (x-mu)' A (x-mu).
+
+The minimum is over the points x of a ray; A = R diag(1 / sigma^2) R' is the anchor's own metric
+with bandwidths sigma_i = sigma0 r_i. For a Plücker ray (m, d) and e = m - mu x d it is
+e' adj(A) e / d' A d: the squared moment of the ray over its squared direction, both in coordinates
+where the ellipsoid is a unit ball (Wa x Wb = cof(W) (a x b), with A = W' W).
+
+The numerator is a quadratic form in (m, d). Its mixed part adj(A) [mu]x has no trace, so that 20
+features of a ray are enough, and none of them could be spared; the denominator takes the 6 products
+of d. LocusGS's isotropic bias takes 10. Both products run in float64, block by block, as its does.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.geometry.rays import normalised_rays
+
+NUMERATOR = 20
+"""Features of the numerator; those of the denominator follow."""
+
+BLOCK = {"cpu": 2**19, "cuda": 2**24}
+"""Pairs that are computed at a time: what stays in a cache, or in memory."""
+
+
+def _raised(x: Tensor) -> Tensor:
+    """float64, where the device has it."""
+    return x if x.device.type == "mps" else x.double()
+
+
+def _products(v: Tensor) -> list[Tensor]:
+    """xx, yy, zz, xy, xz, yz of vectors (..., 3)."""
+    x, y, z = v.unbind(-1)
+    return [x * x, y * y, z * z, x * y, x * z, y * z]
+
+
+def _quadratic(form: Tensor) -> list[Tensor]:
+    """What symmetric matrices (..., 3, 3) weigh `_products` with."""
+    pairs = ((0, 1), (0, 2), (1, 2))
+    return [form[..., i, i] for i in range(3)] + [2 * form[..., i, j] for i, j in pairs]
+
+
+def _crossed(v: Tensor) -> Tensor:
+    """[v]x (..., 3, 3), the matrix that makes v x d of d."""
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+
+
+OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+
+
+@full_precision
+def ray_features(patch_rays: Tensor, direction_eps: float = 1e-6) -> Tensor:
+    """26 features of each ray, float64: (B, M, 6) -> (B, 26, M).
+
+    The 20 of the numerator are the products of m, m_i d_j without their trace, and the products of
+    d; the 6 of the denominator the products of d again, or of an axis for a ray of no direction.
+    direction_eps: floor of |d| before the ray is normalised.
+    """
+    moments, directions = map(_raised, normalised_rays(patch_rays, direction_eps))
+    mixed = moments[..., :, None] * directions[..., None, :]
+    trace_free = [mixed[..., i, i] - mixed[..., 2, 2] for i in (0, 1)]
+    trace_free += [mixed[..., i, j] for i, j in OFF_DIAGONAL]
+    upward = directions.new_tensor([0.0, 0.0, 1.0])
+    directed = torch.where(directions.square().sum(-1, keepdim=True) > 0.25, directions, upward)
+    numerator = [*_products(moments), *trace_free, *_products(directions)]
+    return torch.stack([*numerator, *_products(directed)], -2)
+
+
+@full_precision
+def anchor_features(center: Tensor, rotation: Tensor, sigma_sq: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights of the ray features, float64: numerator (B, N, 20), denominator (B, N, 6).
+
+    center (B, N, 3); rotation (B, N, 3, 3), anchor to world; sigma_sq (B, N, 3), along its axes.
+    """
+    center, rotation, sigma_sq = map(_raised, (center, rotation, sigma_sq))
+    metric = (rotation / sigma_sq[..., None, :]) @ rotation.mT
+    inverse = (rotation * sigma_sq[..., None, :]) @ rotation.mT
+    adjugate = inverse / sigma_sq.prod(-1)[..., None, None]
+    crossed = _crossed(center)
+    mixed = adjugate @ crossed
+    around = crossed.mT @ mixed
+    trace_free = [mixed[..., i, j] for i, j in ((0, 0), (1, 1), *OFF_DIAGONAL)]
+    numerator = [*_quadratic(adjugate), *(-2 * x for x in trace_free), *_quadratic(around)]
+    return torch.stack(numerator, -1), torch.stack(_quadratic(metric), -1)
+
+
+@full_precision
+def ellipsoid_bias(
+    center: Tensor,
+    rotation: Tensor,
+    sigma_sq: Tensor,
+    features: Tensor,
+    bias_min: float,
+    gamma: Tensor,
+) -> Tensor:
+    """gamma * clamp(b, bias_min, 0), (B, N, M), in the dtype of `center`.
+
+    center (B, N, 3); rotation (B, N, 3, 3), anchor to world; sigma_sq (B, N, 3); features
+    (B, 26, M) of `ray_features`, which all layers share; gamma 0-d, positive.
+    """
+    numerator, denominator = anchor_features(center, rotation, sigma_sq)
+    scaled = numerator * (-0.5 * gamma)
+    lower = bias_min * gamma
+    return cast(Tensor, _ClampedRatio.apply(scaled, denominator, features, lower, center.dtype))
+
+
+class _ClampedRatio(torch.autograd.Function):
+    """min(max((a @ f) / (c @ g), lower), 0), which keeps its result alone for the backward pass."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, above: Tensor, below: Tensor, features: Tensor, lower: Tensor, dtype: torch.dtype
+    ) -> Tensor:
+        ratio = above.new_empty(*above.shape[:2], features.shape[-1], dtype=dtype)
+        of_above, of_below = features[:, :NUMERATOR], features[:, NUMERATOR:]
+        for rows in _blocks(ratio):
+            ratio[:, rows] = (above[:, rows] @ of_above).div_(below[:, rows] @ of_below)
+        # Number bounds are twice as fast as tensor ones, but reading them would stall a GPU.
+        if lower.device.type == "cpu":
+            ratio.clamp_(lower.item(), 0.0)
+        else:
+            ratio.clamp_(lower, torch.zeros_like(lower))
+        ctx.save_for_backward(above, below, features, lower, ratio)
+        return ratio
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *factors, lower, ratio = ctx.saved_tensors
+        (gradient,) = gradients
+        at_lower = ratio <= lower
+        inside = gradient.masked_fill(at_lower | (ratio >= 0), 0)
+        above, below, features = (x.to(gradient) for x in factors)
+        parts = [torch.zeros_like(x) for x in (above, below, features)]
+        for rows in _blocks(ratio):
+            fall = inside[:, rows] / (below[:, rows] @ features[:, NUMERATOR:])
+            rise = -fall * ratio[:, rows]
+            parts[0][:, rows] = fall @ features[:, :NUMERATOR].mT
+            parts[1][:, rows] = rise @ features[:, NUMERATOR:].mT
+            if ctx.needs_input_grad[2]:
+                parts[2][:, :NUMERATOR] += above[:, rows].mT @ fall
+                parts[2][:, NUMERATOR:] += below[:, rows].mT @ rise
+        to_factors = (part.to(x) for part, x in zip(parts, factors, strict=True))
+        return (*to_factors, gradient.masked_fill(~at_lower, 0).sum(), None)
+
+
+def _blocks(pairs: Tensor) -> list[slice]:
+    """Slices of the anchors of (B, N, M), BLOCK pairs at a time."""
+    batch, count, tokens = pairs.shape
+    rows = max(BLOCK.get(pairs.device.type, BLOCK["cuda"]) // max(batch * tokens, 1), 1)
+    return [slice(start, start + rows) for start in range(0, count, rows)]
+
+
+@full_precision
+def ellipsoid_bias_direct(
+    center: Tensor,
+    rotation: Tensor,
+    sigma_sq: Tensor,
+    patch_rays: Tensor,
+    bias_min: float,
+    gamma: Tensor,
+    direction_eps: float = 1e-6,
+) -> Tensor:
+    """`ellipsoid_bias` by its definition: rays are brought to where the ellipsoid is a unit ball.
+
+    Through (B, N, M, 3) points and directions; patch_rays (B, M, 6), not normalised.
+    """
+    moments, directions = normalised_rays(patch_rays, direction_eps)
+    nearest = torch.linalg.cross(directions, moments, dim=-1)
+    whitening = (rotation / sigma_sq.sqrt()[..., None, :]).mT
+    points = torch.einsum("bnij,bnmj->bnmi", whitening, nearest[:, None] - center[:, :, None])
+    along = torch.einsum("bnij,bmj->bnmi", whitening, directions)
+    moment_sq = torch.linalg.cross(points, along, dim=-1).square().sum(-1)
+    return gamma * (-0.5 * moment_sq / along.square().sum(-1)).clamp(bias_min, 0)

@@ -1,0 +1,29 @@
+"""Rotations as quaternions, w x y z."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+
+
+@full_precision
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Hamilton product (..., 4): the rotation `right`, then the rotation `left`."""
+    w, v = left[..., :1], left[..., 1:]
+    w2, v2 = right[..., :1], right[..., 1:]
+    real = w * w2 - (v * v2).sum(-1, keepdim=True)
+    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
+
+
+@full_precision
+def turned(quats: Tensor, turn: Tensor) -> Tensor:
+    """Unit quaternions (..., 4) of `quats` turned about world axes by `turn` (..., 3).
+
+    turn / 2 is the Gibbs vector of the rotation: it turns about `turn` by 2 atan(|turn| / 2), which
+    is |turn| radians while that is small and never half a turn (Cayley transform).
+    """
+    small = torch.cat([torch.ones_like(turn[..., :1]), turn / 2], -1)
+    return F.normalize(quat_product(F.normalize(small, dim=-1), quats), dim=-1)
