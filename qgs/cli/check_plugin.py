@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from itertools import groupby
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,8 +11,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from qgs.testing import Outcome
-
-Tiers = Literal["core", "extended"]
 
 
 def register(app: typer.Typer) -> None:
@@ -33,57 +32,55 @@ def check_plugin(
     from qgs.composer.registry import load_plugin
     from qgs.testing import check_plugin as outcomes_of
     from qgs.testing.plugins import without_case
+    from qgs.testing.registry import TIERS
 
     torch.set_num_threads(1)
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     installed = load_plugin(name)
-    tiers: tuple[Tiers, ...] = ("core",) if core else ("core", "extended")
     console.print(
         f"plugin {name} of {installed.released_as}, contract version "
-        f"{installed.plugin.contract_version}",
-        markup=False,
+        f"{installed.plugin.contract_version}"
     )
-    outcomes = []
-    for outcome in outcomes_of(name, tiers):
-        if outcomes and outcomes[-1].case is not outcome.case:
-            _summarise(console, [o for o in outcomes if o.case is outcomes[-1].case])
-        outcomes.append(outcome)
-    if outcomes:
-        _summarise(console, [o for o in outcomes if o.case is outcomes[-1].case])
-    unchecked = [f"{component.slot}/{component.name}" for component in without_case(installed)]
-    for label in unchecked:
-        console.print(
-            f"not checked: {label} has options without a default; list a Config of it in "
-            "`examples` of the Plugin",
-            markup=False,
-        )
-    faults = sum(not outcome.ok for outcome in outcomes)
-    checked = len({outcome.case.component for outcome in outcomes})
-    console.print(f"{checked} components, {len(outcomes)} checks, {faults} failed", markup=False)
-    if faults or unchecked:
+    outcomes: list[Outcome] = []
+    made = outcomes_of(name, ("core",) if core else TIERS)
+    for _, group in groupby(made, key=lambda outcome: id(outcome.case)):
+        of_case = list(group)
+        _summarise(console, of_case)
+        outcomes += of_case
+    unchecked = without_case(installed)
+    for component, why in unchecked.items():
+        label = f"{component.slot}/{component.name}"
+        fix = "list a Config of it in `examples` of the Plugin"
+        console.print(f"not checked: {label}: {why}; {fix}")
+    console.print(_total(outcomes))
+    if unchecked or not all(outcome.ok for outcome in outcomes):
         raise SystemExit(1)
 
 
 def _summarise(console: Console, outcomes: list[Outcome]) -> None:
     """One line for a case, and what is to be known of each check that did not simply pass."""
-    case = outcomes[0].case
-    passed = sum(outcome.verdict == "passed" for outcome in outcomes)
     good = all(outcome.ok for outcome in outcomes)
-    console.print(
-        f"{'ok    ' if good else 'FAILED'} {case.label}: {passed} of {len(outcomes)} pass",
-        markup=False,
-        soft_wrap=True,
-    )
-    skipped: dict[str, list[str]] = {}
+    passed = sum(outcome.verdict == "passed" for outcome in outcomes)
+    label = outcomes[0].case.label
+    console.print(f"{'ok    ' if good else 'FAILED'} {label}: {passed} of {len(outcomes)} pass")
     for outcome in outcomes:
-        if outcome.verdict == "skipped":
-            skipped.setdefault(outcome.message, []).append(outcome.check.name)
-        elif outcome.verdict == "expected failure":
-            line = f"  expected to fail: {outcome.check.name}: {outcome.message}"
-            console.print(line, markup=False, soft_wrap=True)
+        if outcome.verdict == "expected failure":
+            console.print(f"  expected to fail: {outcome.check.name}: {outcome.message}")
         elif not outcome.ok:
-            text = "\n".join(f"  {line}" for line in outcome.message.splitlines())
-            console.print(text, markup=False, soft_wrap=True)
-    for reason, names in skipped.items():
-        line = f"  skipped: {', '.join(names)}: {reason}"
-        console.print(line, markup=False, soft_wrap=True)
+            console.print("\n".join(f"  {line}" for line in outcome.message.splitlines()))
+    skipped = [outcome for outcome in outcomes if outcome.verdict == "skipped"]
+    for reason in dict.fromkeys(outcome.message for outcome in skipped):
+        alike = [outcome for outcome in skipped if outcome.message == reason]
+        names = ", ".join(outcome.check.name for outcome in alike)
+        console.print(f"  skipped: {f'{len(alike)} checks' if alike[0].cause else names}: {reason}")
+
+
+def _total(outcomes: list[Outcome]) -> str:
+    counts = {
+        "failed": sum(not outcome.ok for outcome in outcomes),
+        "expected to fail": sum(outcome.verdict == "expected failure" for outcome in outcomes),
+        "skipped": sum(outcome.verdict == "skipped" for outcome in outcomes),
+    }
+    components = len({outcome.case.component for outcome in outcomes})
+    told = ", ".join(f"{count} {what}" for what, count in counts.items())
+    return f"{components} components, {len(outcomes)} checks, {told}"

@@ -22,7 +22,13 @@ from qgs.contracts.feed_forward import FeedForward
 from qgs.contracts.head import Head
 from qgs.contracts.layout import LayoutError, Rename, Unused, WeightLayout
 from qgs.contracts.loss import Loss
-from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
+from qgs.contracts.plugin import (
+    CONTRACT_VERSION,
+    ENTRY_POINT_GROUP,
+    Expected,
+    ExpectedError,
+    Plugin,
+)
 from qgs.contracts.queries import Queries
 from qgs.contracts.refinement import Refinement
 from qgs.contracts.renderer import Renderer, RendererConfig
@@ -41,6 +47,8 @@ __all__ = [
     "CrossAttention",
     "Encoder",
     "EvaluationConfig",
+    "Expected",
+    "ExpectedError",
     "FeedForward",
     "FieldSpec",
     "Fields",

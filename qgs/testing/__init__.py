@@ -15,18 +15,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from qgs.contracts import ExpectedError
     from qgs.testing.case import Case
     from qgs.testing.decorator import parametrize_with_checks
     from qgs.testing.faults import CannotCheck, ContractError
     from qgs.testing.plugins import cases_of, check_plugin
     from qgs.testing.registry import CHECKS, checks_for
-    from qgs.testing.running import Outcome, run_check
+    from qgs.testing.running import CaseRun, Outcome, run_check
 
 __all__ = [
     "CHECKS",
     "CannotCheck",
     "Case",
+    "CaseRun",
     "ContractError",
+    "ExpectedError",
     "Outcome",
     "cases_of",
     "check_plugin",
@@ -36,16 +39,18 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Case": "case",
-    "parametrize_with_checks": "decorator",
-    "CannotCheck": "faults",
-    "ContractError": "faults",
-    "cases_of": "plugins",
-    "check_plugin": "plugins",
-    "CHECKS": "registry",
-    "checks_for": "registry",
-    "Outcome": "running",
-    "run_check": "running",
+    "Case": "qgs.testing.case",
+    "parametrize_with_checks": "qgs.testing.decorator",
+    "ExpectedError": "qgs.contracts",
+    "CannotCheck": "qgs.testing.faults",
+    "ContractError": "qgs.testing.faults",
+    "cases_of": "qgs.testing.plugins",
+    "check_plugin": "qgs.testing.plugins",
+    "CHECKS": "qgs.testing.registry",
+    "checks_for": "qgs.testing.registry",
+    "CaseRun": "qgs.testing.running",
+    "Outcome": "qgs.testing.running",
+    "run_check": "qgs.testing.running",
 }
 """Fetched on first use: another process imports `qgs.testing.serve` before any component."""
 
@@ -53,6 +58,6 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if _HOMES[name] != "faults":
+    if _HOMES[name] != "qgs.testing.faults":
         import_module("qgs.testing.checks")
-    return getattr(import_module(f"qgs.testing.{_HOMES[name]}"), name)
+    return getattr(import_module(_HOMES[name]), name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from qgs.composer.slots import SLOTS
 from qgs.contracts import (
     Component,
     ComponentConfig,
@@ -20,6 +22,7 @@ from qgs.contracts import (
     component_of,
 )
 from qgs.testing.faults import CannotCheck
+from qgs.testing.wording import case_of, described
 
 SMALL = ModelDims(width=32, heads=2, depth=2)
 
@@ -40,7 +43,7 @@ class Case:
         of normally distributed numbers, such as `{"my.quat": lambda x: F.normalize(x, dim=-1)}`.
     state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
         pins nothing.
-    Raises TypeError for a config that belongs to no component.
+    Raises TypeError for what is no options, and for options of no component that a recipe can name.
     """
 
     config: ComponentConfig
@@ -50,7 +53,16 @@ class Case:
     state_dict: Mapping[str, tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
-        component_of(self.config)
+        if inspect.isclass(self.config) or isinstance(self.config, Component):
+            raise TypeError(f"{described(self.config)} is no options; write {case_of(self.config)}")
+        component = component_of(self.config)
+        slot = SLOTS.get(getattr(component, "slot", ""))
+        named = isinstance(getattr(component, "name", None), str)
+        if slot is None or not issubclass(component, slot.contract) or not named:
+            raise TypeError(
+                f"{component.__qualname__} is no component that a recipe can name; give it a "
+                "`name` and derive it from the contract of a slot, such as qgs.contracts.Encoder"
+            )
 
     @property
     def component(self) -> type[Component]:

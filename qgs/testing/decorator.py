@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import inspect
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from qgs.contracts import CONTRACT_VERSION
+from qgs.contracts import CONTRACT_VERSION, ComponentConfig
 from qgs.testing.case import Case
-from qgs.testing.registry import Check, Tier, checks_for
-from qgs.testing.running import refuse_unknown, run_check
+from qgs.testing.expected import ExpectedFailures, expected_of
+from qgs.testing.registry import TIERS, Check, Tier, checks_for, tiers_given
+from qgs.testing.running import CaseRun
+from qgs.testing.wording import case_of, described
 
 
 @dataclass(frozen=True)
@@ -17,14 +20,13 @@ class BoundCheck:
     """A check of a case, made by calling it inside a pytest test."""
 
     check: Check
-    case: Case
-    expected: str | None = None
+    run: CaseRun
 
     def __call__(self) -> None:
         """Pass, or end the running pytest test as failed, skipped or expected to fail."""
         import pytest
 
-        outcome = run_check(self.check, self.case, self.expected)
+        outcome = self.run.make(self.check)
         if outcome.verdict == "skipped":
             pytest.skip(outcome.message)
         if outcome.verdict == "expected failure":
@@ -36,8 +38,8 @@ class BoundCheck:
 def parametrize_with_checks(
     cases: Iterable[Case],
     *,
-    expected_failures: Mapping[str, str] | None = None,
-    tiers: Iterable[Tier] = ("core", "extended"),
+    expected_failures: ExpectedFailures | None = None,
+    tiers: Iterable[Tier] = TIERS,
     contract_version: int = CONTRACT_VERSION,
 ) -> Callable[[Callable[..., Any]], Any]:
     """Parametrise a pytest test with every check that applies to each case.
@@ -46,26 +48,45 @@ def parametrize_with_checks(
         def test_contract(check):
             check()
 
-    expected_failures: check -> why the cases fail it. Strict: one that passes is a failure.
+    expected_failures: check -> why the cases fail it, or a function that gives that for a case.
+        Strict: a check that passes is a failure. A reason stands for a check that sees the contract
+        broken; for one that ends with an error, write `ExpectedError(ItsClass, reason)`.
     tiers: "core", "extended". contract_version: what the components were written for.
-    Raises ValueError for no cases, for expected failures that no check can be, and for another
+    Raises TypeError for what is no list of cases, or no expected failures; ValueError for no cases,
+    for no tiers or unknown ones, for expected failures that no check can be, and for another
     contract version than the installed one.
     """
     import pytest
 
-    chosen, wanted = list(cases), tuple(tiers)
-    expected = dict(expected_failures or {})
-    if not chosen:
-        raise ValueError("there are no cases to check; give Case(MyComponent.Config())")
+    chosen, wanted = cases_given(cases), tiers_given(tiers)
     if contract_version != CONTRACT_VERSION:
         raise ValueError(
             f"these tests are of contract version {contract_version}, this qgs has version "
             f"{CONTRACT_VERSION}; install the qgs they were written for, or bring them up to date"
         )
-    refuse_unknown(expected, chosen)
+    runs = [
+        CaseRun(case, expected)
+        for case, expected in zip(chosen, expected_of(expected_failures, chosen), strict=True)
+    ]
     parameters = [
-        pytest.param(BoundCheck(c, case, expected.get(c.name)), id=f"{case.label}-{c.name}")
-        for case in chosen
-        for c in checks_for(case, wanted)
+        pytest.param(BoundCheck(check, run), id=f"{run.case.label}-{check.name}")
+        for run in runs
+        for check in checks_for(run.case, wanted)
     ]
     return pytest.mark.parametrize("check", parameters)
+
+
+def cases_given(given: Iterable[Case]) -> list[Case]:
+    """At least one case; raises TypeError for what is none, ValueError where there are none."""
+    if isinstance(given, Case):
+        raise TypeError(f"the cases are no list but the one case {given.label}; give [Case(...)]")
+    single = inspect.isclass(given) or isinstance(given, str | ComponentConfig)
+    if single or not isinstance(given, Iterable):
+        raise TypeError(f"the cases are no list but {described(given)}; give [{case_of(given)}]")
+    cases = list(given)
+    for case in cases:
+        if not isinstance(case, Case):
+            raise TypeError(f"{described(case)} is no case; give {case_of(case)}")
+    if not cases:
+        raise ValueError("there are no cases to check; give [Case(MyComponent.Config())]")
+    return cases

@@ -2,45 +2,141 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import inspect
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
-from qgs.composer.registry import InstalledPlugin, default_config, load_plugin
-from qgs.contracts import Component, ComponentConfig, ModelDims, component_of
+from qgs.composer.registry import (
+    InstalledPlugin,
+    PluginError,
+    default_config,
+    load_plugin,
+)
+from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
 from qgs.testing.case import Case
-from qgs.testing.registry import Tier, checks_for
-from qgs.testing.running import Outcome, run_check
+from qgs.testing.expected import fault_of
+from qgs.testing.places import raised
+from qgs.testing.registry import TIERS, Tier, checks_for, tiers_given
+from qgs.testing.running import CaseRun, Outcome
+from qgs.testing.wording import described, options_of
 
 DEPTHS = (2, 12)
 """Decoder depths that are tried, in turn, until the component's `problems` accepts one."""
 
 
 def cases_of(installed: InstalledPlugin) -> list[Case]:
-    """The plugin's examples, and every component with its default options."""
-    configs = [default_config(component) for component in installed.plugin.components]
+    """The plugin's examples, and every component with its default options.
+
+    Raises PluginError for `examples` that are no options of its components.
+    """
+    plugin = installed.plugin
+    for example in plugin.examples:
+        fault = _example_fault(example, plugin.components)
+        if fault:
+            raise _unsound(installed, "examples", fault)
+    configs = [default_config(component) for component in plugin.components]
     configs = [config for config in configs if config is not None]
-    configs += [e for e in installed.plugin.examples if e not in configs]
+    configs += [e for e in plugin.examples if e not in configs]
     return [_fitting(config) for config in configs]
+
+
+def without_case(installed: InstalledPlugin) -> dict[type[Component], str]:
+    """Components that have no example and cannot be made with default options, and why not."""
+    checked = {case.component for case in cases_of(installed)}
+    return {c: _lacking(c) for c in installed.plugin.components if c not in checked}
+
+
+def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping[str, Expected]]:
+    """The known failures of each of the `cases`: those of its class, and of its options.
+
+    Raises PluginError for exemptions that no check of the cases can have.
+    """
+    exemptions = installed.plugin.exemptions
+    for owner, exempted in exemptions.items():
+        fault = _exemption_fault(owner, exempted, cases)
+        if fault:
+            raise _unsound(installed, "exemptions", fault)
+    return [
+        {
+            name: expected
+            for owner, exempted in exemptions.items()
+            if _concerns(owner, case)
+            for name, expected in exempted.items()
+        }
+        for case in cases
+    ]
+
+
+def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[Outcome]:
+    """Every check of every case of the plugin `name`, case by case.
+
+    Raises PluginError for a plugin that is unusable or has unsound examples or exemptions, and
+    ValueError as `tiers_given` does.
+    """
+    wanted = tiers_given(tiers)
+    installed = load_plugin(name)
+    cases = cases_of(installed)
+    runs = map(CaseRun, cases, exemptions_of(installed, cases))
+    return (run.make(check) for run in runs for check in checks_for(run.case, wanted))
 
 
 def _fitting(config: ComponentConfig) -> Case:
     """A case as small as the options allow."""
     cases = [Case(config, ModelDims(width=32, heads=2, depth=depth)) for depth in DEPTHS]
-    return next((case for case in cases if not case.problems(case.size)), cases[0])
+    return next((case for case in cases if _accepts(case)), cases[0])
 
 
-def without_case(installed: InstalledPlugin) -> list[type[Component]]:
-    """Components that have options without a default, and no example."""
-    checked = {case.component for case in cases_of(installed)}
-    return [c for c in installed.plugin.components if c not in checked]
+def _accepts(case: Case) -> bool:
+    """Whether `problems` has none; where it raises, the checks of the case tell it."""
+    try:
+        return not case.problems(case.size)
+    except Exception:
+        return False
 
 
-def check_plugin(name: str, tiers: Iterable[Tier] = ("core", "extended")) -> Iterator[Outcome]:
-    """Every check of every case of the plugin `name`; raises PluginError for an unusable one."""
-    installed = load_plugin(name)
-    for config in installed.plugin.examples:
-        component_of(config)
-    wanted = tuple(tiers)
-    for case in cases_of(installed):
-        known = installed.plugin.exemptions.get(case.component, {})
-        for check in checks_for(case, wanted):
-            yield run_check(check, case, known.get(check.name))
+def _lacking(component: type[Component]) -> str:
+    fields = component.Config.model_fields.items()
+    required = [f"`{name}`" for name, field in fields if field.is_required()]
+    if required:
+        return f"there is no default for {', '.join(required)}"
+    try:
+        component.Config()
+    except Exception as error:
+        return f"its default options are refused: {raised(error, component)}"
+    raise AssertionError("a component with default options has a case")
+
+
+def _example_fault(example: Any, components: Sequence[type[Component]]) -> str:
+    if not isinstance(example, ComponentConfig):
+        return f"{described(example)} is no options; list {options_of(example)}"
+    component = type(example).__component__
+    if component is None or component not in components:
+        return f"{described(example)} is of no component of the plugin"
+    return ""
+
+
+def _exemption_fault(owner: Any, exempted: Any, cases: list[Case]) -> str:
+    concerned = [case for case in cases if _concerns(owner, case)]
+    if not concerned:
+        what = described(owner)
+        if inspect.isclass(owner) and issubclass(owner, Component):
+            return f"{what} is no component of the plugin that is checked"
+        return f"{what} is neither a component of the plugin nor the options of one of its cases"
+    if not isinstance(exempted, Mapping):
+        return f"those of {described(owner)} are no mapping of checks to reasons"
+    for name, expected in exempted.items():
+        fault = fault_of(name, expected, concerned)
+        if fault:
+            return f"those of {described(owner)}: {fault}"
+    return ""
+
+
+def _concerns(owner: Any, case: Case) -> bool:
+    return owner is case.component or (isinstance(owner, ComponentConfig) and owner == case.config)
+
+
+def _unsound(installed: InstalledPlugin, what: str, fault: str) -> PluginError:
+    return PluginError(
+        f"the `{what}` of the plugin `{installed.plugin.name}` of {installed.released_as}: {fault}",
+        f"mend the `{what}` of its Plugin",
+    )

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from inspect import cleandoc
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 from qgs.composer.slots import SLOTS
+from qgs.composer.suggest import did_you_mean
 from qgs.testing.case import Case
 
 Tier: TypeAlias = Literal["core", "extended"]
-"""core: what every component needs to work at all; extended: slower, or rarer trouble."""
+"""core: what every component needs to work at all; extended: what takes seconds for each case."""
+TIERS: tuple[Tier, ...] = get_args(Tier)
 
 ALL_SLOTS = frozenset(SLOTS)
 MODULES = ALL_SLOTS - {"supervision", "data"}
@@ -54,7 +56,21 @@ def check(
     return register
 
 
-def checks_for(case: Case, tiers: Iterable[Tier] = ("core", "extended")) -> list[Check]:
-    """The checks that apply to the slot of `case`."""
-    wanted = set(tiers)
+def checks_for(case: Case, tiers: Iterable[Tier] = TIERS) -> list[Check]:
+    """The checks that apply to the slot of `case`; raises ValueError as `tiers_given` does."""
+    wanted = tiers_given(tiers)
     return [c for c in CHECKS.values() if case.slot in c.slots and c.tier in wanted]
+
+
+def tiers_given(given: Iterable[Tier]) -> tuple[Tier, ...]:
+    """At least one tier; raises ValueError for anything else."""
+    if isinstance(given, str):
+        tier = given if given in TIERS else TIERS[0]
+        raise ValueError(f'tiers is the text "{given}" and no list; write tiers=["{tier}"]')
+    tiers = tuple(given)
+    if not tiers:
+        raise ValueError('with no tiers nothing is checked; leave them out, or tiers=["core"]')
+    for tier in tiers:
+        if tier not in TIERS:
+            raise ValueError(f"there is no tier `{tier}`; {did_you_mean(tier, TIERS, 'tiers')}")
+    return tiers

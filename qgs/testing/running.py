@@ -1,30 +1,37 @@
-"""Making one check of one case, and telling how it went."""
+"""Making checks of one case, and telling how they went."""
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
-from qgs.composer.suggest import did_you_mean
+from qgs.contracts import Expected, ExpectedError
 from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
+from qgs.testing.expected import BASICS, is_expected, reason_of
 from qgs.testing.faults import CannotCheck, ContractError
-from qgs.testing.registry import CHECKS, Check
+from qgs.testing.places import raised
+from qgs.testing.registry import Check
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a check of a case went. message: why it did not simply pass."""
+    """How a check of a case went.
+
+    message: why it did not simply pass. cause: the check that tells why this one could not be
+    made, "" for every outcome of its own. crashed: whether it failed with an error, and not by
+    seeing the contract broken.
+    """
 
     case: Case
     check: Check
     verdict: Verdict
     message: str = ""
+    cause: str = ""
+    crashed: bool = False
 
     @property
     def ok(self) -> bool:
@@ -32,42 +39,63 @@ class Outcome:
         return self.verdict not in ("failed", "unexpected pass")
 
 
-def run_check(check: Check, case: Case, expected: str | None = None) -> Outcome:
+class CaseRun:
+    """Checks of one case, made one after the other, in which one cause is told once.
+
+    After `builds` or `runs` failed, a check that ends with an error is skipped and refers to it:
+    a component that cannot be built or called ends all of them. One that sees the contract broken
+    fails, and one that can be made passes.
+    """
+
+    def __init__(self, case: Case, expected: Mapping[str, Expected] | None = None) -> None:
+        self.case = case
+        self.expected = expected or {}
+        self.cause = ""
+
+    def make(self, check: Check) -> Outcome:
+        """Make the next check."""
+        outcome = run_check(check, self.case, self.expected.get(check.name))
+        if outcome.verdict != "failed":
+            return outcome
+        if self.cause and outcome.crashed and check.name != self.cause:
+            why = f"ends with an error as `{self.cause}` does: see that check"
+            return replace(outcome, verdict="skipped", message=why, cause=self.cause)
+        if check.name in BASICS:
+            self.cause = check.name
+        return outcome
+
+
+def run_check(check: Check, case: Case, expected: Expected | None = None) -> Outcome:
     """Make `check` of `case`. expected: why it is known to fail; then a pass is a fault."""
     try:
         check.function(case)
     except (CannotCheck, MissingExtraError) as error:
         return Outcome(case, check, "skipped", str(error))
     except Exception as error:
-        if expected is not None:
-            return Outcome(case, check, "expected failure", expected)
-        return Outcome(case, check, "failed", _told(check, case, error))
+        return _failed(check, case, error, expected)
     if expected is None:
         return Outcome(case, check, "passed")
-    why = f"{case.label}: {check.name} passes, although it is expected to fail: {expected}"
-    return Outcome(case, check, "unexpected pass", f"{why}\n  fix: drop the expected failure")
+    why = f"{case.label}: {check.name} passes, although it is expected to fail: "
+    fix = "drop the expected failure, or restrict it to the options with which it fails"
+    return Outcome(case, check, "unexpected pass", f"{why}{reason_of(expected)}\n  fix: {fix}")
 
 
-def refuse_unknown(names: Mapping[str, str], cases: list[Case]) -> None:
-    """Raise ValueError for an expected failure that no check of `cases` can be."""
-    for name, reason in names.items():
-        if name not in CHECKS:
-            raise ValueError(f"there is no check `{name}`; {did_you_mean(name, CHECKS, 'checks')}")
-        if not any(case.slot in CHECKS[name].slots for case in cases):
-            slots = ", ".join(sorted(CHECKS[name].slots))
-            raise ValueError(f"the check `{name}` applies to none of the cases, but to {slots}")
-        if not reason.strip():
-            raise ValueError(f"the expected failure of `{name}` needs a reason")
+def _failed(check: Check, case: Case, error: Exception, expected: Expected | None) -> Outcome:
+    crashed = not isinstance(error, ContractError)
+    seen = error.seen if isinstance(error, ContractError) else raised(error, case.component)
+    if expected is not None and is_expected(error, expected):
+        told = f"{reason_of(expected)} (seen: {seen})"
+        return Outcome(case, check, "expected failure", told, crashed=crashed)
+    told = f"{case.label}: {check.name}\n  seen: {seen}\n  contract: {check.contract}"
+    if expected is not None:
+        told += f"\n  expected: {_otherwise(error, expected)}"
+    return Outcome(case, check, "failed", told, crashed=crashed)
 
 
-def _told(check: Check, case: Case, error: Exception) -> str:
-    seen = error.seen if isinstance(error, ContractError) else _raised(error)
-    return f"{case.label}: {check.name}\n  seen: {seen}\n  contract: {check.contract}"
-
-
-def _raised(error: Exception) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    own = Path(__file__).parent
-    places = [frame for frame in frames if own not in Path(frame.filename).parents]
-    place = places[0] if places else frames[-1]
-    return f"{type(error).__name__}: {error} (raised under {place.filename}:{place.lineno})"
+def _otherwise(error: Exception, expected: Expected) -> str:
+    """What was expected instead of `error`, and what to write if `error` is meant."""
+    if isinstance(expected, ExpectedError):
+        kinds = expected.error if isinstance(expected.error, tuple) else (expected.error,)
+        return f"{' or '.join(kind.__name__ for kind in kinds)}: {expected.reason}"
+    fix = f"ExpectedError({type(error).__name__}, ...) if the error is meant"
+    return f"a broken contract: {expected}\n  fix: mend the error, or write {fix}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from contract_mutants import halves, import_io, modules, options, pictures, reads
+from contract_mutants import broken, halves, import_io, modules, options, pictures, reads
 
 from qgs.contracts import Component
 from qgs.testing import CHECKS, Case, run_check
@@ -34,6 +34,10 @@ class Mutant:
 
 
 MUTANTS = [
+    Mutant("builds", broken.CannotBeBuilt, "RuntimeError: no kernel for width 32"),
+    Mutant("runs", broken.CannotBeCalled, "mat1 and mat2 shapes cannot be multiplied"),
+    Mutant("runs", broken.ForgetsToReturn, "it gives a NoneType, not a Tensor"),
+    Mutant("runs", broken.GivesNumbers, "error is no tensor"),
     Mutant("config_round_trip", options.LossyConfig, "is read again as", {"z_offset": 0.3}),
     Mutant("misspelt_option_is_refused", options.LaxConfig, "`z_offset_x` is accepted"),
     Mutant("config_is_frozen", options.ThawedConfig, "`z_offset` can be assigned to"),

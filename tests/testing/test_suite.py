@@ -7,12 +7,10 @@ from pathlib import Path
 
 import pytest
 from contract_mutants.modules import AddsNoise, Counts
-from typer.testing import CliRunner
 
-from qgs.cli import app
 from qgs.components import MlpFeedForward
 from qgs.composer.registry import load_plugin
-from qgs.contracts import CONTRACT_VERSION, ViewsConfig
+from qgs.contracts import CONTRACT_VERSION
 from qgs.testing import CHECKS, Case, cases_of, checks_for, parametrize_with_checks, run_check
 
 SNAPSHOT = Path(__file__).parent / "state_dicts.json"
@@ -33,39 +31,9 @@ def test_a_failure_says_what_was_seen_and_what_the_contract_says() -> None:
     assert lines[2].startswith("  contract: In evaluation mode the same inputs give")
 
 
-def test_expected_failures_are_strict() -> None:
-    reasons = {"forward_keeps_no_state": "it counts", "config_is_frozen": "it might fail"}
-    checks = _bound(
-        parametrize_with_checks([Case(Counts.Config())], expected_failures=reasons).mark
-    )
-    with pytest.raises(pytest.xfail.Exception, match="it counts"):
-        checks["feed_forward/counts-forward_keeps_no_state"]()
-    with pytest.raises(pytest.fail.Exception, match="passes, although it is expected to fail"):
-        checks["feed_forward/counts-config_is_frozen"]()
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("config_is_frosen", "did you mean `config_is_frozen`"),
-        ("supervision_weights", "applies to none of the cases, but to supervision"),
-    ],
-)
-def test_expected_failures_that_cannot_be_are_refused(name: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        parametrize_with_checks([Case(Counts.Config())], expected_failures={name: "why not"})
-
-
 def test_tests_of_another_contract_version_are_refused() -> None:
     with pytest.raises(ValueError, match="contract version 99"):
         parametrize_with_checks([Case(Counts.Config())], contract_version=CONTRACT_VERSION + 98)
-
-
-def test_a_case_is_made_of_the_options_of_a_component() -> None:
-    assert Case(MlpFeedForward.Config()).component is MlpFeedForward
-    assert Case(Counts.Config()).component is Counts
-    with pytest.raises(TypeError, match="ViewsConfig holds options of no component"):
-        Case(ViewsConfig())
 
 
 def test_tiers_share_out_the_checks() -> None:
@@ -90,16 +58,3 @@ def test_a_pinned_name_that_moved_is_told() -> None:
     case = Case(MlpFeedForward.Config(), state_dict={"norm.weight": (32,)})
     outcome = run_check(CHECKS["state_dict_keys"], case)
     assert "saved weights would not load" in outcome.message
-
-
-def test_check_plugin_reports_an_unknown_plugin() -> None:
-    result = CliRunner().invoke(app, ["check-plugin", "lucos"])
-    assert "no installed distribution offers a plugin `lucos`" in str(result.exception)
-
-
-@pytest.mark.slow
-def test_check_plugin_passes_locus() -> None:
-    result = CliRunner().invoke(app, ["check-plugin", "locus"])
-    assert result.exit_code == 0, result.output
-    assert "7 components" in result.output
-    assert "0 failed" in result.output

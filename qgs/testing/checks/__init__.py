@@ -1,6 +1,7 @@
 """The checks, one file per family. Importing this package registers them all."""
 
 from qgs.testing.checks import (
+    basics,
     building,
     compiling,
     composing,
@@ -19,6 +20,7 @@ from qgs.testing.checks import (
 )
 
 __all__ = [
+    "basics",
     "building",
     "compiling",
     "composing",

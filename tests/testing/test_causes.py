@@ -1,0 +1,76 @@
+"""What a component does wrong is told once, at the place of its own code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from contract_mutants import broken
+from contract_mutants.broken import CannotBeBuilt, CannotBeCalled
+from pydantic import ConfigDict
+
+from qgs.testing import CHECKS, Case, CaseRun, checks_for, parametrize_with_checks, run_check
+
+BROKEN = Path(broken.__file__)
+
+
+def _line(text: str) -> int:
+    return 1 + [text in line for line in BROKEN.read_text().splitlines()].index(True)
+
+
+@pytest.mark.parametrize(
+    ("component", "check", "culprit"),
+    [
+        (CannotBeBuilt, "builds", "raise RuntimeError"),
+        (CannotBeCalled, "runs", "features @ torch.ones(3, 3)"),
+        (CannotBeCalled, "sizes_vary", "features @ torch.ones(3, 3)"),
+    ],
+)
+def test_an_error_is_told_with_its_place_in_the_component(component, check, culprit) -> None:
+    outcome = run_check(CHECKS[check], Case(component.Config()))
+    assert f"(raised under {BROKEN}:{_line(culprit)})" in outcome.message
+
+
+@pytest.mark.parametrize(
+    ("component", "cause"), [(CannotBeBuilt, "builds"), (CannotBeCalled, "runs")]
+)
+def test_one_cause_is_one_failure(component, cause) -> None:
+    run = CaseRun(Case(component.Config()))
+    outcomes = [run.make(check) for check in checks_for(run.case, ["core"])]
+    assert [o.check.name for o in outcomes if not o.ok] == [cause]
+    skipped = [o for o in outcomes if o.verdict == "skipped"]
+    assert len(skipped) > 20
+    assert {(o.cause, o.message) for o in skipped} == {
+        (cause, f"ends with an error as `{cause}` does: see that check")
+    }
+    assert {o.check.name for o in outcomes if o.verdict == "passed"} >= {
+        "config_round_trip",
+        "import_does_no_io",
+    }
+
+
+def test_what_is_seen_to_break_the_contract_is_told_besides() -> None:
+    class CountsAndRaises(CannotBeCalled):
+        name = "counts_and_raises"
+
+        class Config(CannotBeCalled.Config):
+            model_config = ConfigDict(frozen=False)
+
+    run = CaseRun(Case(CountsAndRaises.Config()))
+    outcomes = {check.name: run.make(check) for check in checks_for(run.case, ["core"])}
+    assert {name for name, outcome in outcomes.items() if not outcome.ok} == {
+        "runs",
+        "config_is_frozen",
+    }
+
+
+def test_a_check_alone_tells_its_own_error() -> None:
+    """As with `pytest -k`: nothing is skipped for a cause that was not told."""
+    mark = parametrize_with_checks([Case(CannotBeCalled.Config())]).mark
+    checks = {p.id.rpartition("-")[2]: p.values[0] for p in mark.args[1]}
+    with pytest.raises(pytest.fail.Exception, match="mat1 and mat2"):
+        checks["sizes_vary"]()
+    with pytest.raises(pytest.fail.Exception, match="mat1 and mat2"):
+        checks["runs"]()
+    with pytest.raises(pytest.skip.Exception, match="as `runs` does"):
+        checks["sizes_vary"]()

@@ -1,0 +1,150 @@
+"""The contract suite on a whole plugin: its report, its examples, its exemptions."""
+
+from __future__ import annotations
+
+import pytest
+from contract_mutants.broken import CannotBeCalled
+from contract_mutants.modules import Counts
+from typer.testing import CliRunner
+
+from qgs.cli import app
+from qgs.components import FreeCenters, GaussianHead, MlpFeedForward
+from qgs.composer.registry import InstalledPlugin, PluginError
+from qgs.contracts import CONTRACT_VERSION, ExpectedError, Plugin, ViewsConfig
+from qgs.data import ChunksSource
+from qgs.testing import cases_of, check_plugin
+from qgs.testing.plugins import exemptions_of
+
+UNBOUNDED = FreeCenters.Config(output_limit=None)
+LARGE = "large_numbers_stay_finite"
+
+
+class CannotDefault(MlpFeedForward):
+    name = "cannot_default"
+
+    class Config(MlpFeedForward.Config):
+        def model_post_init(self, context) -> None:
+            raise RuntimeError("no defaults today")
+
+
+class CannotJudge(MlpFeedForward):
+    name = "cannot_judge"
+
+    @classmethod
+    def problems(cls, config, context):
+        raise RuntimeError("no judgement today")
+
+
+def _installed(*components, **parts) -> InstalledPlugin:
+    return InstalledPlugin(Plugin("mine", CONTRACT_VERSION, components, **parts), "qgs-mine", "1.2")
+
+
+def _report(monkeypatch, installed: InstalledPlugin, *options: str):
+    for module in ("qgs.composer.registry", "qgs.testing.plugins"):
+        monkeypatch.setattr(f"{module}.load_plugin", lambda name: installed)
+    return CliRunner().invoke(app, ["check-plugin", "mine", *options])
+
+
+def test_an_unknown_plugin_is_told() -> None:
+    result = CliRunner().invoke(app, ["check-plugin", "lucos"])
+    assert "no installed distribution offers a plugin `lucos`" in str(result.exception)
+
+
+def test_the_report_tells_a_cause_once(monkeypatch) -> None:
+    result = _report(monkeypatch, _installed(MlpFeedForward, CannotBeCalled), "--core")
+    assert result.exit_code == 1
+    lines = result.output.splitlines()
+    assert lines[0] == f"plugin mine of qgs-mine 1.2, contract version {CONTRACT_VERSION}"
+    assert any(line.startswith("ok     feed_forward/mlp: ") for line in lines)
+    assert any(line.startswith("FAILED feed_forward/cannot_be_called: ") for line in lines)
+    assert result.output.count("mat1 and mat2") == 1
+    skips = [line for line in lines if line.startswith("  skipped: ")]
+    assert len(skips) == 1
+    assert "checks: ends with an error as `runs` does: see that check" in skips[0]
+    assert lines[-1].startswith("2 components, ")
+    assert ", 1 failed, 0 expected to fail, " in lines[-1]
+
+
+def test_the_report_names_what_is_exempt(monkeypatch) -> None:
+    exempt = {Counts: {"forward_keeps_no_state": "it is a counter"}}
+    result = _report(monkeypatch, _installed(Counts, exemptions=exempt), "--core")
+    assert result.exit_code == 0, result.output
+    assert "expected to fail: forward_keeps_no_state: it is a counter (seen: " in result.output
+    assert "0 failed, 1 expected to fail, 0 skipped" in result.output
+
+
+def test_exemptions_are_of_a_class_or_of_options() -> None:
+    exempt = {FreeCenters: {"config_is_frozen": "all"}, UNBOUNDED: {LARGE: "these"}}
+    installed = _installed(FreeCenters, examples=(UNBOUNDED,), exemptions=exempt)
+    cases = cases_of(installed)
+    assert [case.config for case in cases] == [FreeCenters.Config(), UNBOUNDED]
+    known = exemptions_of(installed, cases)
+    assert known == [{"config_is_frozen": "all"}, {"config_is_frozen": "all", LARGE: "these"}]
+
+
+@pytest.mark.parametrize(
+    ("exemptions", "message"),
+    [
+        ({FreeCenters: {"large_number_stay_finite": "why"}}, f"did you mean `{LARGE}`"),
+        ({FreeCenters: {"supervision_weights": "why"}}, "but to supervision"),
+        ({FreeCenters: {LARGE: ""}}, f"`{LARGE}` needs a reason"),
+        ({FreeCenters: {LARGE: ExpectedError(Exception, "why")}}, "name the class it is of"),
+        ({FreeCenters: {"runs": "why"}}, "`runs` cannot be expected to fail"),
+        ({FreeCenters: LARGE}, "those of the class FreeCenters are no mapping"),
+        ({GaussianHead: {LARGE: "why"}}, "the class GaussianHead is no component of the plugin"),
+        ({UNBOUNDED: {LARGE: "why"}}, "nor the options of one of its cases"),
+        ({"free": {LARGE: "why"}}, "'free' is neither a component of the plugin nor"),
+    ],
+)
+def test_unsound_exemptions_are_told_by_distribution(monkeypatch, exemptions, message) -> None:
+    installed = _installed(FreeCenters, exemptions=exemptions)
+    with pytest.raises(PluginError, match=message) as refusal:
+        exemptions_of(installed, cases_of(installed))
+    assert "the `exemptions` of the plugin `mine` of qgs-mine 1.2: " in str(refusal.value)
+    monkeypatch.setattr("qgs.testing.plugins.load_plugin", lambda name: installed)
+    with pytest.raises(PluginError, match=message):
+        check_plugin("mine")
+
+
+@pytest.mark.parametrize(
+    ("example", "message"),
+    [
+        (FreeCenters, r"the class FreeCenters is no options; list FreeCenters.Config\(\)"),
+        (FreeCenters.Config, r"Config is no options; list FreeCenters.Config\(\)"),
+        ({"z_offset": 1.0}, r"no options; list MyComponent.Config\(\)"),
+        (ViewsConfig(), "is of no component of the plugin"),
+        (GaussianHead.Config(), "is of no component of the plugin"),
+    ],
+)
+def test_unsound_examples_are_told_by_distribution(example, message) -> None:
+    with pytest.raises(PluginError, match=message) as refusal:
+        cases_of(_installed(FreeCenters, examples=(example,)))
+    assert "the `examples` of the plugin `mine` of qgs-mine 1.2: " in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("component", "why"),
+    [
+        (CannotDefault, "its default options are refused: RuntimeError: no defaults today"),
+        (ChunksSource, "there is no default for `path`"),
+    ],
+)
+def test_what_has_no_default_options_is_named(monkeypatch, component, why) -> None:
+    result = _report(monkeypatch, _installed(component), "--core")
+    assert result.exit_code == 1
+    assert f"not checked: {component.slot}/{component.name}: {why}" in result.output
+    assert "list a Config of it in `examples` of the Plugin" in result.output
+
+
+def test_problems_that_raise_are_found_by_the_checks(monkeypatch) -> None:
+    result = _report(monkeypatch, _installed(CannotJudge), "--core")
+    assert result.exit_code == 1
+    assert "no judgement today" in result.output
+
+
+@pytest.mark.slow
+def test_locus_passes() -> None:
+    result = CliRunner().invoke(app, ["check-plugin", "locus"])
+    assert result.exit_code == 0, result.output
+    assert "7 components" in result.output
+    assert " 0 failed" in result.output
