@@ -1,7 +1,8 @@
 """The messages on the guide's page of errors, produced by what stands above each of them.
 
 A block of text on that page is what its recipe, or its Python code, raises. A Python block with a
-distribution as its title is the module of a plugin that is installed meanwhile.
+distribution as its title is the module of a plugin that is installed meanwhile: "qgs-NAME VERSION",
+or "DISTRIBUTION VERSION as NAME".
 
 `python tools/guide_errors.py` brings the page up to date; a test tells when it is not.
 """
@@ -58,8 +59,9 @@ def _message(kind: str, name: str, text: str) -> str:
 
 
 def _install(distribution: str, source: str, folder: Path) -> None:
-    """Make a module importable as the plugin of `distribution`, a name and a version."""
-    name, version = distribution.split()
+    """Make a module importable as the plugin of `distribution`, a block's title."""
+    release, _, plugin = distribution.partition(" as ")
+    name, version = release.split()
     module = name.replace("-", "_")
     site = folder / module
     info = site / f"{module}-{version}.dist-info"
@@ -67,7 +69,7 @@ def _install(distribution: str, source: str, folder: Path) -> None:
     (site / f"{module}.py").write_text(source, encoding="utf-8")
     metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
     (info / "METADATA").write_text(metadata, encoding="utf-8")
-    entry = f"[qgs.plugins]\n{name.removeprefix('qgs-')} = {module}:plugin\n"
+    entry = f"[qgs.plugins]\n{plugin or name.removeprefix('qgs-')} = {module}:plugin\n"
     (info / "entry_points.txt").write_text(entry, encoding="utf-8")
     sys.path.insert(0, str(site))
 

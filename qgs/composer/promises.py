@@ -36,11 +36,13 @@ def refuse_unkeepable(chosen: Chosen, provided: Fields) -> None:
 
 
 def hold_to_promise(module: nn.Module, chosen: Chosen) -> None:
-    """Make `module` raise PluginError when it returns a state without the fields it provides."""
+    """Make `module` raise PluginError when it does not give the state that it must.
+
+    That has the fields that it provides, and those of the state that it was given.
+    """
     if issubclass(chosen.component, Queries | Refinement):
         provided = dict(chosen.component.provides(chosen.config))
-        if provided:
-            module.register_forward_hook(_Promise(chosen.type, chosen.installed, provided))
+        module.register_forward_hook(_Promise(chosen.type, chosen.installed, provided))
 
 
 def _writable(component: type[Component]) -> Collection[str] | None:
@@ -62,18 +64,31 @@ class _Promise:
     installed: InstalledPlugin
     provided: Fields
 
-    def __call__(self, module: nn.Module, arguments: Any, state: QueryState) -> None:
+    def __call__(self, module: nn.Module, arguments: Any, state: Any) -> None:
+        if not isinstance(state, QueryState):
+            raise self._broken(f"returns {type(state).__name__}, not a QueryState")
+        found = ", ".join(state.fields) or "no field at all"
         for name, spec in self.provided.items():
+            says = f"says that it provides {name} ({spec}), but"
             if name not in state.fields:
-                found = ", ".join(state.fields) or "no field at all"
-                raise self._broken(name, spec, f"the state that it returns has {found}")
+                raise self._broken(f"{says} the state that it returns has {found}")
             shape = tuple(state.fields[name].shape[2:])
-            if len(shape) != len(spec.shape) or any(
-                isinstance(size, int) and size != given
-                for size, given in zip(spec.shape, shape, strict=True)
-            ):
-                raise self._broken(name, spec, f"it returns one of trailing shape {shape}")
+            if not _fits(shape, spec):
+                raise self._broken(f"{says} it returns one of trailing shape {shape}")
+        for given in arguments:
+            lost = [n for n in getattr(given, "fields", ()) if n not in state.fields]
+            if lost:
+                raise self._broken(
+                    f"loses {', '.join(lost)}: the state that it returns has {found}; "
+                    "`state.replace(...)` keeps what it does not change"
+                )
 
-    def _broken(self, name: str, spec: FieldSpec, what: str) -> Exception:
-        fault = f"`{self.type}` says that it provides {name} ({spec}), but {what}"
-        return component_fault(self.installed, fault)
+    def _broken(self, what: str) -> Exception:
+        return component_fault(self.installed, f"`{self.type}` {what}")
+
+
+def _fits(shape: tuple[int, ...], spec: FieldSpec) -> bool:
+    return len(shape) == len(spec.shape) and all(
+        not isinstance(size, int) or size == given
+        for size, given in zip(spec.shape, shape, strict=True)
+    )

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 
 import qgs
 from qgs.composer.builtin import BUILTIN
-from qgs.composer.slots import SLOTS
-from qgs.contracts import (
-    CONTRACT_VERSION,
-    ENTRY_POINT_GROUP,
-    Component,
-    ComponentConfig,
-    Plugin,
-    WeightLayout,
-)
+from qgs.composer.soundness import fault_of
+from qgs.contracts import ENTRY_POINT_GROUP, Component, ComponentConfig, Plugin
 
 
 class PluginError(ValueError):
@@ -39,8 +31,8 @@ class InstalledPlugin:
 
     @property
     def released_as(self) -> str:
-        """Name and version of the distribution, as messages give them."""
-        return f"{self.distribution} {self.version}"
+        """Name and version of the distribution, as messages give them; "" for none."""
+        return f"{self.distribution} {self.version}" if self.distribution else ""
 
 
 @dataclass(frozen=True)
@@ -64,16 +56,20 @@ class Registry:
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """The options that `component` has by default; None if it has options without a default."""
-    fields = component.Config.model_fields.values()
-    return None if any(field.is_required() for field in fields) else component.Config()
+    """The options that `component` has by default; None if they do not make a Config."""
+    try:
+        return component.Config()
+    except Exception:  # an option must be given, or the code of a stranger's validator fails
+        return None
 
 
 def component_fault(installed: InstalledPlugin, fault: str) -> PluginError:
     """A component of `installed` breaks its contract; `fault` says which one, and how."""
+    release = installed.released_as
+    origin = f" of {release}" if release else ""
     return PluginError(
-        f"the plugin `{installed.plugin.name}` of {installed.released_as} fails: {fault}",
-        f"update {installed.released_as}, or choose another component",
+        f"the plugin `{installed.plugin.name}`{origin} fails: {fault}",
+        f"{f'update {release}' if release else 'mend it'}, or choose another component",
     )
 
 
@@ -93,7 +89,7 @@ def builtin() -> InstalledPlugin:
 
 def not_installed(plugin: Plugin) -> InstalledPlugin:
     """A plugin that came with no distribution."""
-    return InstalledPlugin(plugin, "no distribution", "0")
+    return InstalledPlugin(plugin, "", "0")
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:
@@ -117,7 +113,7 @@ def load_plugin(name: str) -> InstalledPlugin:
     if len(entries) > 1:
         raise PluginError(
             f"several distributions offer a plugin `{name}`: "
-            f"{', '.join(sorted(map(_distribution, entries)))}",
+            f"{', '.join(sorted(map(_release, entries)))}",
             "uninstall all of them but one",
         )
     return _load(entries[0])
@@ -133,7 +129,10 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
     plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()
     for entry in available.pop(BUILTIN.name, []):
-        broken.append(f"{_distribution(entry)} offers a plugin `qgs`, the framework's own name")
+        broken.append(
+            f"{_release(entry)} offers a plugin `qgs`, the framework's own name; "
+            f"uninstall {_release(entry)}"
+        )
     for name in sorted(available):
         try:
             plugins[name] = load_plugin(name)
@@ -148,68 +147,36 @@ def plugin_versions(names: Iterable[str]) -> dict[str, str]:
 
 
 def _load(entry: EntryPoint) -> InstalledPlugin:
-    distribution = _distribution(entry)
-    update = f"update {distribution}, or take the plugin out of the recipe"
+    distribution = _release(entry)
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:
         raise PluginError(
             f"the plugin `{entry.name}` of {distribution} cannot be imported from "
             f"`{entry.value}`: {type(error).__name__}: {error}",
-            update,
+            _import_fix(entry, error),
         ) from error
-    if not isinstance(plugin, Plugin):
-        raise PluginError(
-            f"`{entry.value}` of {distribution} is no qgs.Plugin but {type(plugin).__name__}",
-            update,
-        )
-    fault = _fault(plugin, entry)
+    fault = fault_of(plugin, entry.name)
     if fault:
-        raise PluginError(f"the plugin `{entry.name}` of {distribution} {fault}", update)
+        reason = f"the plugin `{entry.name}` of {distribution} {fault.reason}"
+        raise PluginError(reason, fault.fix or _update(entry))
     assert entry.dist is not None
     return InstalledPlugin(plugin, entry.dist.name, entry.dist.version)
 
 
-def _fault(plugin: Plugin, entry: EntryPoint) -> str:
-    if plugin.contract_version != CONTRACT_VERSION:
-        return (
-            f"was written for contract version {plugin.contract_version}; "
-            f"this qgs has version {CONTRACT_VERSION}"
-        )
-    if plugin.name != entry.name:
-        return f"calls itself `{plugin.name}`; the two names must be one"
-    taken: set[tuple[str, str]] = set()
-    for component in plugin.components:
-        fault = _component_fault(component)
-        if fault:
-            return fault
-        if (component.slot, component.name) in taken:
-            return f"registers `{component.name}` twice in the slot `{component.slot}`"
-        taken.add((component.slot, component.name))
-    for layout in plugin.layouts:
-        if not isinstance(layout, WeightLayout):
-            return f"lists {layout!r}, which is no WeightLayout"
-    return ""
+def _import_fix(entry: EntryPoint, error: BaseException) -> str:
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    package = (missing or "").partition(".")[0]
+    if package and package not in ("qgs", entry.value.partition(".")[0].partition(":")[0]):
+        return f"install `{package}`, which {_release(entry)} needs, or do without the plugin"
+    return _update(entry)
 
 
-def _component_fault(component: type[Component]) -> str:
-    label = getattr(component, "__qualname__", repr(component))
-    if not (inspect.isclass(component) and issubclass(component, Component)):
-        return f"lists {label}, which is no qgs component"
-    slot = SLOTS.get(getattr(component, "slot", ""))
-    if slot is None or not issubclass(component, slot.contract):
-        return f"lists {label}, which implements no slot's contract"
-    if not isinstance(getattr(component, "name", None), str):
-        return f"lists {label}, which has no `name`"
-    if inspect.isabstract(component):
-        missing = ", ".join(sorted(component.__abstractmethods__))
-        return f"lists {label}, which leaves {missing} abstract"
-    if not issubclass(component.Config, ComponentConfig) or "type" in component.Config.model_fields:
-        return f"lists {label}, whose Config is no ComponentConfig or has an option `type`"
-    return ""
+def _update(entry: EntryPoint) -> str:
+    return f"update {_release(entry)}, or do without the plugin"
 
 
-def _distribution(entry: EntryPoint) -> str:
+def _release(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
 
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
-from qgs.composer import PluginError, RecipeError, compose, resolve
+from qgs.cli import app
+from qgs.composer import PluginError, RecipeError, compose
+from qgs.composer.recipe import resolve
 from qgs.composer.registry import load_sound_plugins
-from qgs.types import Cameras, Views
+from qgs.contracts import Plugin, Queries
+from qgs.types import Cameras, QueryState, Views
 
 
 def test_a_component_that_refines_a_field_is_no_provider_of_it(write, install):
@@ -137,10 +141,34 @@ def test_component_whose_code_fails_is_reported_with_its_distribution(name, writ
 
 BROKEN_PLUGINS = {
     "raises at import": ("raise RuntimeError('no luck')", "RuntimeError: no luck"),
-    "is no Plugin": ("plugin = {}", "is no qgs.Plugin but dict"),
+    "is no Plugin": (
+        "plugin = {}",
+        "is no qgs.Plugin: its entry point leads to an object of type dict",
+    ),
+    "no object at its entry point": ("other = 1", "has no attribute 'plugin'"),
+    "unlisted component": (
+        "from qgs.components import LatentQueries\nfrom qgs.contracts import Plugin\n"
+        "plugin = Plugin('bad', 1, LatentQueries)",
+        "must give `components` as a tuple or a list, written `(Mine,)` for a single one",
+    ),
+    "nameless component": (
+        "from qgs.components import LatentQueries\nfrom qgs.contracts import Plugin\n"
+        "class Nameless(LatentQueries):\n    name = ''\n"
+        "plugin = Plugin('bad', 1, (Nameless,))",
+        "whose name '' is empty or has a slash or a blank",
+    ),
+    "option that no recipe can give": (
+        "from collections.abc import Callable\nfrom qgs.contracts import Plugin\n"
+        "from qgs.contracts import Centers, ComponentConfig\n"
+        "class Odd(Centers):\n    name = 'odd'\n"
+        "    class Config(ComponentConfig):\n        function: Callable = print\n"
+        "    def forward(self, offsets, state):\n        return offsets\n"
+        "plugin = Plugin('bad', 1, (Odd,))",
+        "lists Odd, whose Config has options that YAML cannot express",
+    ),
     "wrong contract version": (
-        "from qgs.contracts import Plugin\nplugin = Plugin('bad', 99, ())",
-        "contract version 99",
+        "from qgs.contracts import Plugin\nplugin = Plugin('bad', 0, ())",
+        "contract version 0",
     ),
     "other name": (
         "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 1, ())",
@@ -180,6 +208,28 @@ def test_broken_plugin_is_reported_by_distribution(name, write, install):
     assert reason in problem.reason
     assert "qgs-bad 0.7" in problem.fix
     resolve(write("recipe: 1\n", "other.yaml"))
+
+
+def test_fix_of_a_missing_dependency_is_to_install_it(write, install):
+    install("qgs-hungry", "hungry", "import a_package_that_nobody_has.inside")
+    with pytest.raises(RecipeError) as caught:
+        resolve(write("recipe: 1\nplugins: [hungry]\n"))
+    (problem,) = caught.value.problems
+    assert "No module named 'a_package_that_nobody_has'" in problem.reason
+    assert "install `a_package_that_nobody_has`, which qgs-hungry 1.2 needs" in problem.fix
+
+
+@pytest.mark.parametrize("module", ["_test_qgs_stale.gone", "qgs.gone"])
+def test_fix_of_a_module_that_a_release_lacks_is_another_release(module, write, install):
+    install("qgs-stale", "stale", f"import {module}")
+    with pytest.raises(RecipeError, match=r"fix: update qgs-stale 1\.2"):
+        resolve(write("recipe: 1\nplugins: [stale]\n"))
+
+
+def test_fix_of_newer_contracts_is_a_newer_qgs(write, install):
+    install("qgs-new", "new", "from qgs.contracts import Plugin\nplugin = Plugin('new', 99, ())")
+    with pytest.raises(RecipeError, match="fix: update qgs, or do without"):
+        resolve(write("recipe: 1\nplugins: [new]\n"))
 
 
 def test_two_distributions_with_one_plugin_name(write, install):
@@ -255,6 +305,25 @@ class Shapeless(Refinement):
     def forward(self, state):
         return state.replace(fields={"place": state.features[..., :2]})
 
+class Losing(Refinement):
+    name = "losing"
+    def forward(self, state):
+        return QueryState(state.features)
+
+class Placed(Queries):
+    name = "placed"
+    count = 3
+    provides = Silent.provides
+    def forward(self, batch_size):
+        place = torch.zeros(batch_size, 3, 3)
+        return QueryState(torch.zeros(batch_size, 3, self.dims.width), {"place": place})
+
+class Bare(Queries):
+    name = "bare"
+    count = 3
+    def forward(self, batch_size):
+        return torch.zeros(batch_size, 3, self.dims.width)
+
 class Boasting(CrossAttention):
     name = "boasting"
     @classmethod
@@ -263,7 +332,8 @@ class Boasting(CrossAttention):
     def forward(self, state, memory):
         return state.features
 
-plugin = Plugin("faulty", 1, (Exploding, ExplodingLoss, Closed, Silent, Shapeless, Boasting))
+STATES = (Silent, Shapeless, Losing, Placed, Bare, Boasting)
+plugin = Plugin("faulty", 1, (Exploding, ExplodingLoss, Closed, *STATES))
 """
 
 TINY = """
@@ -302,22 +372,84 @@ def test_data_that_cannot_be_opened_is_told_as_it_is(write, faulty):
         recipe.build_data()
 
 
+SAYS = r"says that it provides place \(3 float32\), but "
 LIES = {
-    "model.queries={type: faulty/silent}": "but the state that it returns has no field at all",
-    "model.decoder.refinement={type: faulty/shapeless}": r"it returns one of trailing shape \(2,\)",
+    "silent": (
+        ["model.queries={type: faulty/silent}"],
+        SAYS + "the state that it returns has no field at all",
+    ),
+    "shapeless": (
+        ["model.decoder.refinement={type: faulty/shapeless}"],
+        SAYS + r"it returns one of trailing shape \(2,\)",
+    ),
+    "losing": (
+        ["model.queries={type: faulty/placed}", "model.decoder.refinement={type: faulty/losing}"],
+        "loses place: the state that it returns has no field at all",
+    ),
+    "bare": (["model.queries={type: faulty/bare}"], "returns Tensor, not a QueryState"),
 }
 
 
-@pytest.mark.parametrize("lie", LIES)
-def test_a_component_that_lies_about_what_it_provides_is_reported(lie, write, faulty):
-    model = compose(write(TINY), [lie])
+@pytest.mark.parametrize("name", LIES)
+def test_a_component_that_does_not_give_the_state_it_must_is_reported(name, write, faulty):
+    overrides, told = LIES[name]
+    model = compose(write(TINY), overrides)
     cameras = Cameras(torch.eye(4).expand(1, 1, 4, 4), torch.full((1, 1, 4), 8.0), (16, 16))
-    with pytest.raises(PluginError, match=LIES[lie]) as caught:
+    with pytest.raises(PluginError, match=told) as caught:
         model(Views(torch.rand(1, 1, 3, 16, 16), cameras))
-    assert "qgs-faulty 0.3" in caught.value.reason
-    assert "says that it provides place (3 float32)" in caught.value.reason
+    assert f"qgs-faulty 0.3 fails: `faulty/{name}`" in caught.value.reason
     model = compose(write(TINY))
     assert model(Views(torch.rand(1, 1, 3, 16, 16), cameras)).gaussians.means.isfinite().all()
+
+
+def test_one_fault_of_a_plugin_does_not_hide_the_others_of_an_installation(install):
+    install("qgs-raises", "raises", "raise RuntimeError('no luck')")
+    install(
+        "qgs-moody",
+        "moody",
+        """
+        from pydantic import field_validator
+        from qgs.contracts import Centers, ComponentConfig, Plugin
+        class Moody(Centers):
+            name = "moody"
+            class Config(ComponentConfig):
+                mood: int = 1
+                @field_validator("mood")
+                @classmethod
+                def _refuse(cls, mood):
+                    raise ValueError("no mood will do")
+                model_config = {"validate_default": True}
+            def forward(self, offsets, state):
+                return offsets
+        plugin = Plugin("moody", 1, (Moody,))
+        """,
+    )
+    result = CliRunner().invoke(app, ["list"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    assert "moody/moody" in result.output
+    assert "qgs-raises 1.2 cannot be imported" in result.output
+    assert "qgs/latent" in result.output
+    assert CliRunner().invoke(app, ["schema"]).exit_code == 0
+
+
+def test_a_plugin_in_memory_is_reported_without_a_distribution():
+    class Silent(Queries):
+        name = "silent"
+        count = 3
+
+        def forward(self, batch_size: int) -> QueryState:
+            raise NotImplementedError
+
+        @classmethod
+        def provides(cls, config):
+            raise KeyError("oops")
+
+    recipe = {"recipe": 1, "plugins": ["mine"], "model": {"queries": {"type": "mine/silent"}}}
+    with pytest.raises(RecipeError) as caught:
+        resolve(recipe, plugins=[Plugin("mine", 1, (Silent,))])
+    (problem,) = caught.value.problems
+    assert problem.reason.startswith("the plugin `mine` fails: `provides` of `mine/silent` raises")
+    assert problem.fix == "mend it, or choose another component"
 
 
 def test_a_component_that_could_never_provide_what_it_says_is_refused(write, faulty):
