@@ -35,17 +35,22 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
             required.update(shape_fields(config))
         return required
 
+    def sigma_sq(self, state: QueryState) -> Tensor | float:
+        """Squared bandwidths along the axes of each anchor (B, N, 3), or one number when fixed."""
+        if self.config.bandwidth == "fixed":
+            return super().sigma_sq(state)
+        radii = support_radius(state[RAW_RADII], self.config)
+        return (self.config.sigma0 * radii).square().clamp_min(self.config.sigma_sq_min)
+
     def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
         """gamma b (B, N, M), float32, computed from the state that enters the layer."""
-        config = self.config
-        if config.bandwidth == "fixed":
+        config, sigma_sq = self.config, self.sigma_sq(state)
+        if not isinstance(sigma_sq, Tensor):
             return super().bias(state, memory)
         features = memory.once(
             f"ellipsoid.ray_features.{config.direction_eps:g}",
             lambda: ray_features(memory.patch_rays, config.direction_eps),
         )
-        radii = support_radius(state[RAW_RADII], config)
-        sigma_sq = (config.sigma0 * radii).square().clamp_min(config.sigma_sq_min)
         rotation = anchor_rotation(state[ROTATION])
         return ellipsoid_bias(
             state[CENTER], rotation, sigma_sq, features, config.bias_min, self.gamma

@@ -80,8 +80,10 @@ def anchor_features(center: Tensor, rotation: Tensor, sigma_sq: Tensor) -> tuple
     """
     center, rotation, sigma_sq = map(_raised, (center, rotation, sigma_sq))
     metric = (rotation / sigma_sq[..., None, :]) @ rotation.mT
-    inverse = (rotation * sigma_sq[..., None, :]) @ rotation.mT
-    adjugate = inverse / sigma_sq.prod(-1)[..., None, None]
+    # R is its own cofactor matrix but for its rounding, which this keeps out of the ratio.
+    cofactors = torch.linalg.cross(rotation.roll(-1, -1), rotation.roll(-2, -1), dim=-2)
+    weights = sigma_sq / sigma_sq.prod(-1, keepdim=True)
+    adjugate = (cofactors * weights[..., None, :]) @ cofactors.mT
     crossed = _crossed(center)
     mixed = adjugate @ crossed
     around = crossed.mT @ mixed
