@@ -165,10 +165,14 @@ def _load(entry: EntryPoint) -> InstalledPlugin:
 
 
 def _import_fix(entry: EntryPoint, error: BaseException) -> str:
+    release = _release(entry)
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    own = entry.value.partition(":")[0].strip()
+    if missing == own:
+        return f"install {release} again, its files are gone; or do without the plugin"
     package = (missing or "").partition(".")[0]
-    if package and package not in ("qgs", entry.value.partition(".")[0].partition(":")[0]):
-        return f"install `{package}`, which {_release(entry)} needs, or do without the plugin"
+    if package and package not in ("qgs", own.partition(".")[0]):
+        return f"install `{package}`, which {release} needs, or do without the plugin"
     return _update(entry)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 from typer.testing import CliRunner
 
@@ -168,6 +171,13 @@ def test_fix_of_a_module_that_a_release_lacks_is_another_release(module, write, 
     install("qgs-stale", "stale", f"import {module}")
     with pytest.raises(RecipeError, match=r"fix: update qgs-stale 1\.2"):
         resolve(write("recipe: 1\nplugins: [stale]\n"))
+
+
+def test_fix_of_a_module_that_is_gone_is_to_install_again(write, install):
+    install("qgs-gone", "gone", "")
+    Path(sys.path[0], "_test_qgs_gone.py").unlink()
+    with pytest.raises(RecipeError, match=r"fix: install qgs-gone 1\.2 again"):
+        resolve(write("recipe: 1\nplugins: [gone]\n"))
 
 
 def test_fix_of_newer_contracts_is_a_newer_qgs(write, install):
