@@ -15,6 +15,10 @@ class CannotCheck(Exception):  # noqa: N818 (no error: the reason of a skip)
     """A check cannot be made in this place; the message is the reason."""
 
 
+class ElsewhereError(RuntimeError):
+    """An error of another process; the message says what was raised there, and where."""
+
+
 def expect(holds: bool, seen: str) -> None:
     """Raise ContractError with what was `seen` unless the contract `holds`."""
     if not holds:

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 
 from qgs.testing.case import Case
-from qgs.testing.faults import CannotCheck
+from qgs.testing.faults import CannotCheck, ElsewhereError
 
 
 def ask(task: str, case: Case, **details: Any) -> dict[str, Any]:
-    """The answer of the other process; raises RuntimeError for one that it could not give.
+    """The answer of the other process; raises ElsewhereError for one that it could not give.
 
     Raises CannotCheck for a component that no other process can import.
     """
@@ -42,10 +42,10 @@ def ask(task: str, case: Case, **details: Any) -> dict[str, Any]:
     line = process.stdout.readline()
     if not line:
         _process.cache_clear()
-        raise RuntimeError("the other process died")
+        raise ElsewhereError("the other process died")
     answer = json.loads(line)
     if "error" in answer:
-        raise RuntimeError(f"in another process: {answer['error']}")
+        raise ElsewhereError(f"in another process: {answer['error']}")
     return answer
 
 

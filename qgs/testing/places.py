@@ -8,18 +8,23 @@ from pathlib import Path
 
 import torch
 
+from qgs.testing.faults import ElsewhereError
+
 SUITE = Path(__file__).parent
 TORCH = Path(torch.__file__).parent
 
 
-def raised(error: Exception, component: type) -> str:
-    """Type and message of `error`, and the place of it that the author of `component` can mend.
+def raised(error: Exception, file: str | None) -> str:
+    """Type and message of `error`, and the place of it that the author of a component can mend.
 
-    That is the last place in the package of the component; for an error that never passed there
-    the first one outside of this suite and of torch, else the last of all.
+    file: that defines the component, None for none. The place is the last one in its package; for
+    an error that never passed there the first one outside of this suite and of torch, else the last
+    of all.
     """
+    if isinstance(error, ElsewhereError):
+        return str(error)
     frames = traceback.extract_tb(error.__traceback__)
-    root = package_of(component)
+    root = package_of(file) if file else None
     theirs = [f for f in frames if not _lies_in(f.filename, SUITE)]
     own = [f for f in theirs if root is not None and _lies_in(f.filename, root)]
     others = [f for f in theirs if not _lies_in(f.filename, TORCH)]
@@ -28,14 +33,13 @@ def raised(error: Exception, component: type) -> str:
     return f"{what} (raised under {place.filename}:{place.lineno})"
 
 
-def package_of(component: type) -> Path | None:
-    """The outermost package folder that holds the module of `component`, or the module's file.
+def file_of(component: type) -> str | None:
+    """The file that defines a class; None for one that was defined in no file."""
+    return getattr(sys.modules.get(component.__module__), "__file__", None)
 
-    None for a class that was defined in no file.
-    """
-    file = getattr(sys.modules.get(component.__module__), "__file__", None)
-    if file is None:
-        return None
+
+def package_of(file: str) -> Path:
+    """The outermost package folder that holds the module `file`, or the file itself."""
     path = Path(file).resolve()
     while (path.parent / "__init__.py").exists():
         path = path.parent

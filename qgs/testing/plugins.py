@@ -15,7 +15,7 @@ from qgs.composer.registry import (
 from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
 from qgs.testing.case import Case
 from qgs.testing.expected import fault_of
-from qgs.testing.places import raised
+from qgs.testing.places import file_of, raised
 from qgs.testing.registry import TIERS, Tier, checks_for, tiers_given
 from qgs.testing.running import CaseRun, Outcome
 from qgs.testing.wording import described, options_of
@@ -102,7 +102,7 @@ def _lacking(component: type[Component]) -> str:
     try:
         component.Config()
     except Exception as error:
-        return f"its default options are refused: {raised(error, component)}"
+        return f"its default options are refused: {raised(error, file_of(component))}"
     raise AssertionError("a component with default options has a case")
 
 

@@ -11,7 +11,7 @@ from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.expected import BASICS, is_expected, reason_of
 from qgs.testing.faults import CannotCheck, ContractError
-from qgs.testing.places import raised
+from qgs.testing.places import file_of, raised
 from qgs.testing.registry import Check
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
@@ -82,7 +82,7 @@ def run_check(check: Check, case: Case, expected: Expected | None = None) -> Out
 
 def _failed(check: Check, case: Case, error: Exception, expected: Expected | None) -> Outcome:
     crashed = not isinstance(error, ContractError)
-    seen = error.seen if isinstance(error, ContractError) else raised(error, case.component)
+    seen = raised(error, file_of(case.component)) if crashed else error.seen
     if expected is not None and is_expected(error, expected):
         told = f"{reason_of(expected)} (seen: {seen})"
         return Outcome(case, check, "expected failure", told, crashed=crashed)

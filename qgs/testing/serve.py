@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from qgs.testing.audit import root_of, watched
+from qgs.testing.places import raised
 
 _events: dict[str, list[str]] = {}
 """What importing did, by root of the package."""
@@ -30,7 +31,7 @@ def serve(threads: int) -> None:
         try:
             answer = {"import": _import, "run": _run}[request["task"]](request)
         except Exception as error:
-            answer = {"error": f"{type(error).__name__}: {error}"}
+            answer = {"error": raised(error, request["file"])}
         print(json.dumps(answer), file=out, flush=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import ClassVar
 
 import torch
@@ -42,3 +43,12 @@ class GivesNumbers(Loss):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
         return {"error": (rendering.rgb - target.images).square().mean().item()}
+
+
+class CannotBeCalledElsewhere(MlpFeedForward):
+    name: ClassVar[str] = "cannot_be_called_elsewhere"
+
+    def forward(self, features: Tensor) -> Tensor:
+        if sys.argv[0] == "-c":
+            raise RuntimeError("far from home")
+        return super().forward(features)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from contract_mutants import broken
-from contract_mutants.broken import CannotBeBuilt, CannotBeCalled
+from contract_mutants.broken import CannotBeBuilt, CannotBeCalled, CannotBeCalledElsewhere
 from pydantic import ConfigDict
 
 from qgs.testing import CHECKS, Case, CaseRun, checks_for, parametrize_with_checks, run_check
@@ -24,11 +24,12 @@ def _line(text: str) -> int:
         (CannotBeBuilt, "builds", "raise RuntimeError"),
         (CannotBeCalled, "runs", "features @ torch.ones(3, 3)"),
         (CannotBeCalled, "sizes_vary", "features @ torch.ones(3, 3)"),
+        (CannotBeCalledElsewhere, "saved_weights_run_elsewhere", "far from home"),
     ],
 )
 def test_an_error_is_told_with_its_place_in_the_component(component, check, culprit) -> None:
     outcome = run_check(CHECKS[check], Case(component.Config()))
-    assert f"(raised under {BROKEN}:{_line(culprit)})" in outcome.message
+    assert f" (raised under {BROKEN}:{_line(culprit)})\n" in outcome.message
 
 
 @pytest.mark.parametrize(
