@@ -47,15 +47,19 @@ class RendererConfig(ComponentConfig):
 class Renderer(Component, torch.nn.Module):
     """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
 
-    Differentiable in every Gaussian parameter and in the cameras' c2w and intrinsics. Zero
-    Gaussians, and Gaussians behind the camera, off screen or huge, give finite images and finite
-    gradients.
+    Differentiable in every Gaussian parameter and in the tensors of the cameras that
+    `camera_gradients` names. Zero Gaussians, and Gaussians behind the camera, off screen or huge,
+    give finite images and finite gradients.
 
-    devices: types of the devices that it renders on.
+    devices: types of the devices that it renders on. camera_gradients: of "c2w" and "intrinsics",
+    those with a gradient on all of these devices; poses stay rigid, so that of c2w counts along
+    rotations and translations alone. Another one that requires a gradient is refused with a
+    ValueError where there is none, never left without it in silence.
     """
 
     slot: ClassVar[str] = "renderer"
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
+    camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 
     class Config(RendererConfig):
         """The common settings."""
@@ -80,5 +84,6 @@ class Renderer(Component, torch.nn.Module):
         """Render every scene from each of its cameras.
 
         background: RGB (3,); None takes the configured one.
-        Raises ValueError when Gaussians and cameras disagree in batch size or device.
+        Raises ValueError when Gaussians and cameras disagree in batch size or device, and for
+        cameras that require a gradient which it does not have.
         """

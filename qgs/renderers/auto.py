@@ -16,6 +16,7 @@ class AutoRenderer(Renderer):
     """Chooses by where the Gaussians are, each time, and never by what can be imported."""
 
     name = "auto"
+    camera_gradients = GsplatRenderer.camera_gradients
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:

@@ -27,6 +27,7 @@ class GsplatRenderer(Renderer):
 
     name = "gsplat"
     devices = ("cuda",)
+    camera_gradients = ("c2w",)
 
     def __init__(self, config: RendererConfig) -> None:
         super().__init__(config)

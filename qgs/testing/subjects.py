@@ -11,9 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.contracts import FieldSpec, Loss
+from qgs.contracts import FieldSpec, Loss, Renderer
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.testing.case import Case
+from qgs.testing.trees import mapped, tracked
 from qgs.types import (
     Cameras,
     Gaussians,
@@ -52,6 +53,19 @@ def inputs_of(case: Case, sizes: Sizes = Sizes(), seed: int = 0) -> Inputs:
     """What a component of the slot of `case` is called with."""
     maker = Maker(case, sizes, torch.Generator().manual_seed(seed))
     return {name: MAKERS[name](maker) for name in ARGUMENTS[case.slot]}
+
+
+def tracked_inputs(case: Case, inputs: Inputs) -> Inputs:
+    """A copy that asks for gradients, of cameras only for those that a renderer declares."""
+    copy, component = tracked(inputs), case.component
+    if not issubclass(component, Renderer):
+        return copy
+    declared = tuple(f"cameras.{name}" for name in component.camera_gradients)
+
+    def visit(name: str, x: Tensor) -> Tensor:
+        return x.detach() if name.startswith("cameras.") and name not in declared else x
+
+    return mapped(copy, visit)
 
 
 def required_fields(case: Case) -> dict[str, FieldSpec]:

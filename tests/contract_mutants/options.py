@@ -11,7 +11,7 @@ import torch
 from pydantic import ConfigDict, field_serializer
 from torch import nn
 
-from qgs.components import FreeCenters, MlpFeedForward
+from qgs.components import FreeCenters, Mlp, MlpFeedForward
 from qgs.contracts import (
     ComponentConfig,
     Fields,
@@ -139,3 +139,27 @@ class HasADeadParameter(MlpFeedForward):
     def __init__(self, config: MlpFeedForward.Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.unused = nn.Linear(dims.width, dims.width)
+
+
+class MovesItsNorm(MlpFeedForward):
+    """Its parameters are not where saved weights have them."""
+
+    name: ClassVar[str] = "moves_its_norm"
+
+    def __init__(self, config: MlpFeedForward.Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.layer_norm = self.norm
+        del self.norm
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return self.mlp(self.layer_norm(features))
+
+
+class HalvesItsMlp(MlpFeedForward):
+    """Its parameters are not of the sizes that saved weights have."""
+
+    name: ClassVar[str] = "halves_its_mlp"
+
+    def __init__(self, config: MlpFeedForward.Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.mlp = Mlp(dims.width, 2 * dims.width, dims.width)

@@ -7,7 +7,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from contract_mutants import broken, halves, import_io, modules, options, pictures, reads
+from contract_mutants import (
+    broken,
+    halves,
+    import_io,
+    learning,
+    modules,
+    options,
+    pictures,
+    reads,
+    training,
+    views,
+)
 
 from qgs.contracts import Component
 from qgs.testing import CHECKS, Case, run_check
@@ -32,6 +43,16 @@ class Mutant:
     def __str__(self) -> str:
         return f"{self.check}-{self.component.name}"
 
+
+PINNED = {
+    "norm.weight": (32,),
+    "norm.bias": (32,),
+    "mlp.fc1.weight": (128, 32),
+    "mlp.fc1.bias": (128,),
+    "mlp.fc2.weight": (32, 128),
+    "mlp.fc2.bias": (32,),
+}
+"""What saved weights of `qgs/mlp` hold in a model of width 32."""
 
 MUTANTS = [
     Mutant("builds", broken.CannotBeBuilt, "RuntimeError: no kernel for width 32"),
@@ -109,6 +130,38 @@ MUTANTS = [
     Mutant("geometry_is_float32_under_autocast", halves.DecodesInHalf, "opacities: values differ"),
     Mutant("geometry_is_float32_under_autocast", halves.BiasesInHalf, "explain.geometry"),
     Mutant("geometry_is_float32_under_autocast", halves.MeasuresInHalf, "volume: values differ"),
+    Mutant("batch_independence", training.BatchNormed, "in training, scene 0 has a gradient"),
+    Mutant("batch_independence", training.CentresOnTheBatch, "in training, beside another scene"),
+    Mutant("inputs_are_not_changed", training.MutatesInTraining, "forward pass in training"),
+    Mutant("forward_keeps_no_state", training.CountsInTraining, "in training changes _steps"),
+    Mutant("forward_keeps_no_state", training.BatchNormed, "in training changes the state"),
+    Mutant("forward_keeps_no_state", training.KeepsACache, "changes _cache"),
+    Mutant("forward_keeps_no_state", training.KeepsALog, "KeepsALog._log['last'][0]"),
+    Mutant("forward_keeps_no_state", training.SmoothsItsNoise, "changes the state: seen"),
+    Mutant("training_draws_from_torch", training.SeedsInTraining, "torch is in one state"),
+    Mutant("training_draws_from_torch", training.DropsByNumpy, "numpy's or random's"),
+    Mutant("training_draws_from_torch", training.DropsByPython, "numpy's or random's"),
+    Mutant("training_draws_from_torch", training.DropsByItsOwnGenerator, "from one seed differ"),
+    Mutant("view_permutation", views.DeclaresAnOrder, "`ordered_views` is declared"),
+    Mutant("view_permutation", views.DeclaresAnOrderOfPhotos, "`ordered_views` is declared"),
+    Mutant("view_permutation", views.NumbersPhotos, "with permuted views"),
+    Mutant("view_permutation", views.DimsLaterViews, "with permuted views, depth"),
+    Mutant("view_permutation", views.WeighsTheFirstView, "with permuted views, error"),
+    Mutant("gradients_match_differences", learning.DetachedLoss, "but has no gradient"),
+    Mutant("terms_have_gradients", learning.DetachedLoss, "of the term error"),
+    Mutant("terms_have_gradients", learning.HasAnIdleTerm, "of the term contrast"),
+    Mutant("gradients_reach_inputs", learning.DetachedAttention, "memory.keys, memory.values"),
+    Mutant("gradients_reach_inputs", learning.IgnoresWhereItIs, "state.fields.place.center"),
+    Mutant("gradients_reach_inputs", learning.LearnsAConstant, "no gradient reaches features"),
+    Mutant("gradients_reach_inputs", learning.StandsStill, "no gradient reaches offsets"),
+    Mutant("memory_depends_on_images", learning.ClosesItsEyes, "`values` stays as it is"),
+    Mutant("render_gradients_match_differences", learning.ForgetsDepth, "`gaussians.means`"),
+    Mutant("camera_gradients_match_differences", learning.TurnsPosesOnly, "`cameras.c2w`"),
+    Mutant("camera_gradients_match_differences", learning.HoldsItsLens, "and gets none"),
+    Mutant("camera_gradients_match_differences", learning.RefusesWhatItDeclares, "is refused"),
+    Mutant("camera_gradients_match_differences", learning.DeclaresAGradientInSize, "names size"),
+    Mutant("state_dict_keys", options.MovesItsNorm, "'norm.bias'", case={"state_dict": PINNED}),
+    Mutant("state_dict_keys", options.HalvesItsMlp, "(128, 32)", case={"state_dict": PINNED}),
 ]
 
 SLOW = {"compiles"}

@@ -1,4 +1,4 @@
-"""Chance enters through torch's global generator alone, and only while parameters are drawn."""
+"""Chance enters through torch's global generator alone: in initial parameters and in training."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import MODULES, PARAMETRIC, check
 from qgs.testing.subjects import inputs_of
-from qgs.testing.trees import difference
+from qgs.testing.trees import cloned, difference
 
 
 @check(PARAMETRIC)
@@ -45,6 +45,26 @@ def check_forward_leaves_random_state(case: Case) -> None:
     module(*inputs.values())
     expect(torch.equal(torch_before, torch.get_rng_state()), "it draws from torch's generator")
     expect(before == _other_generators(), "it draws from numpy's or random's generator")
+
+
+@check(MODULES)
+def check_training_draws_from_torch(case: Case) -> None:
+    """In training, chance is drawn from torch's global generator alone, which nothing seeds."""
+    module, before = case.lively().train(), _other_generators()
+    first, other, again = (_training_pass(case, module, seed) for seed in (1, 2, 1))
+    expect(before == _other_generators(), "in training it uses numpy's or random's generator")
+    seeded = torch.equal(first[1], other[1])
+    expect(not seeded, "after training passes from two seeds, torch is in one state")
+    found = difference(first[0], again[0])
+    expect(not found, f"two training passes from one seed differ: {found}")
+
+
+def _training_pass(case: Case, module: Any, seed: int) -> tuple[Any, torch.Tensor]:
+    """Outputs, and torch's random state after them, of a forward pass from `seed`."""
+    with torch.random.fork_rng(devices=()):
+        torch.default_generator.manual_seed(seed)
+        outputs = cloned(module(*inputs_of(case).values()))
+        return outputs, torch.get_rng_state()
 
 
 @check(MODULES)

@@ -10,9 +10,10 @@ from torch import Tensor
 from qgs.contracts import CrossAttention, Encoder
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
+from qgs.testing.modes import each_mode
 from qgs.testing.registry import MODULES, PER_QUERY, check
-from qgs.testing.subjects import QUERY_INPUTS, Sizes, inputs_of
-from qgs.testing.trees import distance, floating, mapped, scalar, tracked
+from qgs.testing.subjects import QUERY_INPUTS, Inputs, Sizes, inputs_of, tracked_inputs
+from qgs.testing.trees import distance, floating, leaves, mapped, scalar
 from qgs.types import ImageMemory
 
 RTOL, ATOL = 1e-4, 1e-5
@@ -26,15 +27,39 @@ TOKENS = {"keys": 2, "values": 2, "features": 1, "patch_rays": 1}
 
 @check(MODULES - {"queries", "losses"})
 def check_batch_independence(case: Case) -> None:
-    """What is computed for a scene has a gradient of exactly zero in every other scene."""
-    module, inputs = case.lively(), tracked(inputs_of(case))
+    """What is computed for a scene does not depend on any other scene, in training neither.
+
+    Its gradient there is exactly zero, and other scenes beside it leave its numbers as they are.
+    """
+    module = case.lively()
+    for mode in each_mode(module):
+        _expect_no_gradient(module, tracked_inputs(case, inputs_of(case)), mode)
+        _expect_no_influence(module, inputs_of(case), inputs_of(case, seed=1), mode)
+
+
+def _expect_no_gradient(module: Any, inputs: Inputs, mode: str) -> None:
     outputs = floating(module(*inputs.values()))
     total = scalar({name: tensor[:1] for name, tensor in outputs.items()})
-    given = floating(inputs)
+    given = {name: x for name, x in floating(inputs).items() if x.requires_grad}
     slopes = torch.autograd.grad(total, list(given.values()), allow_unused=True)
     for name, slope in zip(given, slopes, strict=True):
         leak = 0.0 if slope is None else slope[1:].abs().max().item()
-        expect(leak == 0, f"scene 0 has a gradient of {leak:.3g} in `{name}` of scene 1")
+        expect(leak == 0, f"in {mode}, scene 0 has a gradient of {leak:.3g} in `{name}` of scene 1")
+
+
+def _expect_no_influence(module: Any, inputs: Inputs, others: Inputs, mode: str) -> None:
+    different = leaves(others)
+    beside = mapped(inputs, lambda name, x: torch.cat([x[:1], different[name][1:]]))
+    first, second = (_first_scene(module, given) for given in (inputs, beside))
+    found = distance(first, second, RTOL, ATOL)
+    expect(not found, f"in {mode}, beside another scene, {found}")
+
+
+def _first_scene(module: Any, inputs: Inputs) -> Any:
+    """What a module gives for scene 0, always from the same random state."""
+    with torch.random.fork_rng(devices=()), torch.no_grad():
+        torch.default_generator.manual_seed(0)
+        return mapped(module(*inputs.values()), lambda _, x: x[:1])
 
 
 @check(PER_QUERY)

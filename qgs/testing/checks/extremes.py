@@ -11,8 +11,15 @@ from torch import Tensor
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import MODULES, check
-from qgs.testing.subjects import QUERY_INPUTS, Inputs, inputs_of, is_place, required_fields
-from qgs.testing.trees import floating, mapped, not_finite, scalar, tracked
+from qgs.testing.subjects import (
+    QUERY_INPUTS,
+    Inputs,
+    inputs_of,
+    is_place,
+    required_fields,
+    tracked_inputs,
+)
+from qgs.testing.trees import floating, mapped, not_finite, scalar
 
 LARGE = 1e4
 
@@ -90,7 +97,7 @@ def _changed(case: Case, change: Callable[[str, Tensor], Tensor]) -> Inputs:
 
 
 def _expect_finite(case: Case, what: str, inputs: Inputs) -> None:
-    module, given = case.lively(), tracked(inputs)
+    module, given = case.lively(), tracked_inputs(case, inputs)
     outputs = module(*given.values())
     broken = not_finite(outputs)
     expect(not broken, f"with {what}, {', '.join(broken)} is not finite")

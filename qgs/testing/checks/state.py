@@ -7,9 +7,11 @@ from torch import Tensor
 
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
+from qgs.testing.memory import remembered
+from qgs.testing.modes import each_mode
 from qgs.testing.registry import MODULES, check
-from qgs.testing.subjects import inputs_of
-from qgs.testing.trees import cloned, described, difference, leaves, scalar, tracked
+from qgs.testing.subjects import inputs_of, tracked_inputs
+from qgs.testing.trees import cloned, described, difference, leaves, scalar
 from qgs.types import QueryState
 
 
@@ -17,16 +19,17 @@ from qgs.types import QueryState
 def check_inputs_are_not_changed(case: Case) -> None:
     """Neither the forward nor the backward pass changes an input, in numbers or in names."""
     module = case.lively()
-    inputs = tracked(inputs_of(case))
-    before = cloned(inputs)
-    outputs = module(*inputs.values())
-    found = difference(before, cloned(inputs))
-    expect(not found, f"after the forward pass the inputs differ: {found}")
-    total = scalar(outputs)
-    if total.requires_grad:
-        total.backward()
-    found = difference(before, cloned(inputs))
-    expect(not found, f"after the backward pass the inputs differ: {found}")
+    for mode in each_mode(module):
+        inputs = tracked_inputs(case, inputs_of(case))
+        before = cloned(inputs)
+        outputs = module(*inputs.values())
+        found = difference(before, cloned(inputs))
+        expect(not found, f"after the forward pass in {mode} the inputs differ: {found}")
+        total = scalar(outputs)
+        if total.requires_grad:
+            total.backward()
+        found = difference(before, cloned(inputs))
+        expect(not found, f"after the backward pass in {mode} the inputs differ: {found}")
 
 
 @check(MODULES - {"queries"})
@@ -46,14 +49,20 @@ def check_outputs_share_no_memory(case: Case) -> None:
 
 @check(MODULES)
 def check_forward_keeps_no_state(case: Case) -> None:
-    """A forward pass changes no parameter, no buffer, and no attribute that later passes see."""
+    """A forward pass leaves no trace: in no parameter, buffer or attribute, a private one or not.
+
+    In training as in evaluation. What is to be computed once for all layers belongs into
+    `ImageMemory.once`, what depends on sizes alone into a function of them.
+    """
     module = case.lively()
-    before, kept = cloned(dict(module.state_dict())), _attributes(module)
-    module(*inputs_of(case).values())
-    found = difference(before, dict(module.state_dict()))
-    expect(not found, f"after a forward pass the state dict differs: {found}")
-    changed = [name for name, value in _attributes(module).items() if kept.get(name) != value]
-    expect(not changed, f"a forward pass changes {', '.join(changed)}")
+    for mode in each_mode(module):
+        before, kept = cloned(_tensors(module)), remembered(module)
+        module(*inputs_of(case).values())
+        found = difference(before, _tensors(module))
+        expect(not found, f"a forward pass in {mode} changes the state: {found}")
+        now = remembered(module)
+        changed = sorted(n for n in kept.keys() | now.keys() if kept.get(n) != now.get(n))
+        expect(not changed, f"a forward pass in {mode} changes {', '.join(changed)}")
 
 
 @check({"refinement", "queries"})
@@ -90,12 +99,6 @@ def _names(names: set[str]) -> str:
     return ", ".join(sorted(names))
 
 
-def _attributes(module: torch.nn.Module) -> dict[str, str]:
-    """Plain values that the parts of a module hold, as text."""
-    return {
-        f"{name}.{key}" if name else key: repr(value)
-        for name, part in module.named_modules()
-        for key, value in vars(part).items()
-        if isinstance(value, str | int | float | bool | tuple | list | dict | Tensor | None)
-        and not key.startswith("_")
-    }
+def _tensors(module: torch.nn.Module) -> dict[str, Tensor]:
+    """Parameters and buffers, those that are not saved too."""
+    return dict(module.named_parameters()) | dict(module.named_buffers())
