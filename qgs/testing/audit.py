@@ -2,68 +2,106 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-EVENTS = (
+from qgs.testing.unaudited import UNAUDITED, audited
+
+EVENTS = frozenset(UNAUDITED) | {
     "open",
+    "os.chmod",
+    "os.chown",
+    "os.link",
+    "os.listdir",
+    "os.mkdir",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.scandir",
+    "os.symlink",
+    "os.truncate",
+    "os.utime",
+    "sqlite3.connect",
+    "socket.bind",
     "socket.connect",
     "socket.getaddrinfo",
-    "subprocess.Popen",
-    "os.system",
+    "socket.gethostbyname",
+    "socket.sendto",
     "os.exec",
-)
+    "os.fork",
+    "os.posix_spawn",
+    "os.system",
+    "subprocess.Popen",
+}
+"""Files, connections and processes. `shutil`, `tempfile` and `glob` come down to these."""
+
 CODE = (".py", ".pyc", ".so", ".pyd", ".dll", ".dylib")
 
-_watches: list[tuple[str, list[str]]] = []
+
+@dataclass(frozen=True)
+class Deed:
+    """Something done outside of the process. files: of the code that did it, outermost last."""
+
+    text: str
+    files: tuple[str, ...]
+
+    def is_done_by(self, root: str) -> bool:
+        """Whether code of `root` (see `root_of`) did it, by itself or through what it calls."""
+        folder = root.endswith(os.sep)
+        return any(file.startswith(root) if folder else file == root for file in self.files)
+
+
+_watches: list[list[Deed]] = []
 _installed = False
 
 
 @contextmanager
-def watched(file: str) -> Iterator[list[str]]:
-    """Collect what the code of the package of `file` itself opens, connects to or starts.
+def watched() -> Iterator[list[Deed]]:
+    """Collect what is opened, connected to or started.
 
-    Reading code is no event, and neither is what another package does when it is imported.
+    Reading code is no deed, and what a module does when it is imported is none of the importer's.
     """
     global _installed
     if not _installed:
         sys.addaudithook(_hook)  # cannot be taken out again; it is idle outside of watches
         _installed = True
-    events: list[str] = []
-    _watches.append((root_of(file), events))
-    try:
-        yield events
-    finally:
-        _watches.pop()
+    deeds: list[Deed] = []
+    with audited():
+        _watches.append(deeds)
+        try:
+            yield deeds
+        finally:
+            _watches.pop()
 
 
 def root_of(file: str) -> str:
-    """The folder of the package that `file` belongs to, or `file` itself."""
-    path = Path(file).resolve()
-    return str(path.parent if (path.parent / "__init__.py").exists() else path)
+    """The folder of the topmost package that `file` belongs to, with a separator, or `file`."""
+    path = Path(file).absolute()
+    if not (path.parent / "__init__.py").exists():
+        return str(path)
+    package = path.parent
+    while (package.parent / "__init__.py").exists():
+        package = package.parent
+    return f"{package}{os.sep}"
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if not _watches or event not in EVENTS:
         return
-    if event == "open" and str(arguments[0]).endswith(CODE):
+    what = arguments[0] if arguments else ""
+    if event == "open" and str(what).endswith(CODE):
         return
-    root, events = _watches[-1]
-    if _is_done_by(root, sys._getframe(1)):
-        events.append(f"{event} {arguments[0]!r}")
+    _watches[-1].append(Deed(f"{event} {what!r}", tuple(_files(sys._getframe(1)))))
 
 
-def _is_done_by(root: str, frame: FrameType | None) -> bool:
-    """Whether the code of `root` acts here, and not a module that it imports."""
-    while frame is not None:
-        file = frame.f_code.co_filename
-        if file.startswith(root):
-            return True
-        if file.startswith("<frozen importlib"):
-            return False
+def _files(frame: FrameType | None) -> Iterator[str]:
+    """Files of the code that acts here, as far as the import statement that runs it."""
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        yield frame.f_code.co_filename
         frame = frame.f_back
-    return False

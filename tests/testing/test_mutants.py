@@ -11,6 +11,8 @@ from contract_mutants import (
     broken,
     halves,
     import_io,
+    import_weights,
+    io_mutants,
     learning,
     modules,
     options,
@@ -67,6 +69,14 @@ MUTANTS = [
     Mutant("builds_on_meta", options.AllocatesOnCpu, "scale is allocated"),
     Mutant("registers_its_parameters", options.HidesATensor, "keeps scale outside"),
     Mutant("build_does_no_io", options.ReadsWhenBuilt, "open '/dev/null'"),
+    *(
+        Mutant(
+            "build_does_no_io", io_mutants.ReachesOut, f"built: {event} '/dev/null", {"way": way}
+        )
+        for way, (_, event) in io_mutants.WAYS.items()
+    ),
+    Mutant("import_does_no_io", import_weights.LoadsAtImport, "safetensors.safe_open 'nowhere"),
+    Mutant("import_does_no_io", DeepInside, "os.listdir '.'"),
     Mutant("import_does_no_io", import_io.ReadsAtImport, "open '/dev/null'"),
     Mutant("same_seed_same_parameters", options.DrawsElsewhere, "differ: mlp.fc1.weight"),
     Mutant("build_respects_the_seed", options.SeedsItself, "torch is in one state"),

@@ -7,11 +7,14 @@ import inspect
 import torch
 from torch import nn
 
-from qgs.testing.audit import watched
+from qgs.testing.audit import root_of, watched
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.other_process import ask
 from qgs.testing.registry import ALL_SLOTS, PARAMETRIC, check
+
+SHOWN = 5
+"""Files and connections that a message names."""
 
 
 @check(PARAMETRIC)
@@ -42,14 +45,21 @@ def check_registers_its_parameters(case: Case) -> None:
 
 @check(ALL_SLOTS - {"data"})
 def check_build_does_no_io(case: Case) -> None:
-    """Building opens no file and no connection and starts no process."""
-    with watched(inspect.getfile(case.component)) as events:
+    """Building touches no file, opens no connection and starts no process."""
+    with watched() as deeds:
         case.build()
-    expect(not events, f"while it is built: {', '.join(events)}")
+    root = root_of(inspect.getfile(case.component))
+    own = [deed.text for deed in deeds if deed.is_done_by(root)]
+    expect(not own, f"while it is built: {_listed(own)}")
 
 
 @check(ALL_SLOTS)
 def check_import_does_no_io(case: Case) -> None:
-    """Importing the module opens no file but code, no connection, and starts no process."""
-    events = ask("import", case)["events"]
-    expect(not events, f"while {case.component.__module__} is imported: {', '.join(events)}")
+    """Importing the package touches no file but code, opens no connection, starts no process."""
+    deeds = ask("import", case)["deeds"]
+    expect(not deeds, f"while {case.component.__module__} is imported: {_listed(deeds)}")
+
+
+def _listed(deeds: list[str]) -> str:
+    first, more = ", ".join(deeds[:SHOWN]), len(deeds) - SHOWN
+    return first if more <= 0 else f"{first} and {more} more"

@@ -136,7 +136,8 @@ def _with_explanation(module: Any, inputs: Inputs) -> dict[str, Any]:
     outputs = leaves(module(*inputs.values()))
     if isinstance(module, CrossAttention | SelfAttention):
         queries = torch.arange(inputs["state"].features.shape[1])
-        weights = module.explain(*inputs.values(), queries)
+        explain: Any = module.explain
+        weights = explain(*inputs.values(), queries)
         if weights is not None and weights.geometry is not None:
             outputs[EXPLAINED] = weights.geometry
     return outputs

@@ -1,0 +1,1 @@
+"""Components of the package, in a package of their own."""
