@@ -21,6 +21,7 @@ from contract_mutants import (
     training,
     views,
 )
+from contract_mutants.packaged.components.feed_forward import DeepInside
 
 from qgs.contracts import Component
 from qgs.testing import CHECKS, Case, run_check
