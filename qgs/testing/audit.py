@@ -95,6 +95,7 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if not _watches or event not in EVENTS:
         return
     what = arguments[0] if arguments else ""
+    what = os.fspath(what) if isinstance(what, os.PathLike) else what
     if event == "open" and str(what).endswith(CODE):
         return
     _watches[-1].append(Deed(f"{event} {what!r}", tuple(_files(sys._getframe(1)))))
