@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from qgs.composer.slots import SLOTS
+from qgs.composer.soundness import component_fault
 from qgs.contracts import (
     Component,
     ComponentConfig,
@@ -43,7 +43,7 @@ class Case:
         of normally distributed numbers, such as `{"my.quat": lambda x: F.normalize(x, dim=-1)}`.
     state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
         pins nothing.
-    Raises TypeError for what is no options, and for options of no component that a recipe can name.
+    Raises TypeError for what is no options, and for those of no component that recipes could name.
     """
 
     config: ComponentConfig
@@ -56,13 +56,9 @@ class Case:
         if inspect.isclass(self.config) or isinstance(self.config, Component):
             raise TypeError(f"{described(self.config)} is no options; write {case_of(self.config)}")
         component = component_of(self.config)
-        slot = SLOTS.get(getattr(component, "slot", ""))
-        named = isinstance(getattr(component, "name", None), str)
-        if slot is None or not issubclass(component, slot.contract) or not named:
-            raise TypeError(
-                f"{component.__qualname__} is no component that a recipe can name; give it a "
-                "`name` and derive it from the contract of a slot, such as qgs.contracts.Encoder"
-            )
+        fault = component_fault(component)
+        if fault:
+            raise TypeError(f"no case can be made of {component.__qualname__}, {fault}")
 
     @property
     def component(self) -> type[Component]:

@@ -6,7 +6,7 @@ import pytest
 from contract_mutants.modules import Counts
 
 from qgs.components import MlpFeedForward
-from qgs.contracts import Component, ViewsConfig
+from qgs.contracts import Centers, Component, ViewsConfig
 from qgs.testing import Case, check_plugin, checks_for, parametrize_with_checks
 
 CASE = Case(MlpFeedForward.Config())
@@ -15,6 +15,10 @@ EXAMPLE = r"give \[Case\(MlpFeedForward.Config\("
 
 class Slotless(Component):
     name = "slotless"
+
+
+class Formless(Centers):
+    name = "formless"
 
 
 class Nameless(MlpFeedForward):
@@ -63,8 +67,10 @@ def test_a_case_is_made_of_the_options_of_a_component() -> None:
         (MlpFeedForward, r"the class MlpFeedForward is no options; write Case\(MlpFeedForward.Con"),
         (MlpFeedForward.Config, r"is no options; write Case\(MlpFeedForward.Config\(\)\)"),
         (CASE.build(), r"an instance of MlpFeedForward is no options; write Case\(MlpFeedForward"),
-        (Slotless.Config(), "Slotless is no component that a recipe can name"),
-        (Nameless.Config(), "Nameless is no component that a recipe can name"),
+        (Slotless.Config(), "can be made of Slotless, which implements no slot's contract"),
+        (Nameless.Config(), "can be made of Nameless, which has no `name`"),
+        (Centers.Config(), "can be made of Centers, which has no `name`"),
+        (Formless.Config(), "can be made of Formless, which leaves forward abstract"),
     ],
 )
 def test_what_is_no_options_is_refused(given, message) -> None:
