@@ -13,11 +13,36 @@ What every component must do, whoever wrote it. [Write a plugin](plugin.md) show
 tests make these checks; `qgs check-plugin NAME` makes them for all components of an installed
 plugin.
 
-`core` checks are what a component needs to work at all, `extended` ones are slower or find rarer
-trouble. A component that cannot pass a check says so with a reason, and an expected failure that
-passes is a failure:
+`core` checks are what a component needs to work at all, `extended` ones take seconds for each case.
+All are made unless `tiers=["core"]`, or `qgs check-plugin NAME --core`, leaves the slower ones out.
+
+A component that cannot be built or called fails `builds` or `runs`, which tell the error with its
+place in the component's own package. Checks that then end with an error too are skipped and refer
+to it.
+
+## Known failures
+
+A component that cannot pass a check says so with a reason. An expected failure that passes is a
+failure:
 
     @parametrize_with_checks([Case(Mine.Config())], expected_failures={"NAME": "the reason"})
+
+A reason stands for a check that sees the contract broken. Where the check ends with an error
+instead, the error is named by its class, and any other one is a failure:
+
+    {"float64_stays_float64": ExpectedError(NotImplementedError, "the kernel has no float64")}
+
+Where only some cases fail, give a function of the case:
+
+    expected_failures=lambda case: {"NAME": "..."} if case.config.bandwidth == "fixed" else {}
+
+A plugin states the same in `exemptions` of its `Plugin`, by component class, or by options:
+
+    exemptions={Mine: {"NAME": "..."}, Mine.Config(bandwidth="fixed"): {"OTHER": "..."}}
+
+`builds` and `runs` cannot be expected to fail: a component that does neither is held to nothing.
+
+## The checks
 
 """
 
