@@ -2,38 +2,78 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
+from qgs.components import LatentQueries
 from qgs.composer import RecipeError
 from qgs.composer.recipe import Recipe, resolve
-from qgs.contracts import CONTRACT_VERSION, Plugin
+from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Fields, Plugin
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import Maker, Sizes, required_fields
 from qgs.testing.trees import scalar
+from qgs.types import QueryState
 
 PLUGIN = "under_test"
+GIVEN = "given_fields"
+"""Names of the plugin that offers the component, and of the queries that it may need."""
 
 
 @check(MODULES - {"renderer"})
 def check_unmet_requirement_fails_at_compose(case: Case) -> None:
-    """In a recipe without what it needs a component is refused by name; else the model runs."""
-    needed = set(required_fields(case))
+    """A recipe that lacks one thing a component needs is refused by name; one with all runs."""
+    needed = required_fields(case)
+    for missing in needed:
+        given = {name: spec for name, spec in needed.items() if name != missing}
+        told = _refusal(case, given)
+        expect(bool(told), f"a recipe without {missing} is composed")
+        expect(missing in told, f"the refusal does not name {missing}, which is missing: {told}")
+    told = _refusal(case, needed)
+    expect(not told, f"a recipe that gives it all it requires is refused: {told}")
+    run_training_step(_resolved(case, needed), case)
+
+
+def _refusal(case: Case, given: Fields) -> str:
+    """What is said of a recipe in which the queries provide `given` alone; "" if it is accepted."""
     try:
-        recipe = resolve(recipe_with(case), plugins=(_plugin(case),))
+        _resolved(case, given)
     except RecipeError as error:
-        told = [name for name in needed if name in str(error)]
-        expect(bool(needed), f"a recipe that gives it all it requires is refused: {error}")
-        expect(len(told) == len(needed), f"the refusal does not name what is missing: {error}")
-        return
-    expect(not needed, f"a recipe without {', '.join(sorted(needed))} is composed")
-    run_training_step(recipe, case)
+        return str(error)
+    return ""
 
 
-def recipe_with(case: Case) -> dict[str, Any]:
+def _resolved(case: Case, given: Fields) -> Recipe:
+    components = [case.component]
+    recipe = _recipe_with(case)
+    if given:
+        components.append(_queries_with(case, given))
+        recipe["model"]["queries"]["type"] = f"{PLUGIN}/{GIVEN}"
+    return resolve(recipe, plugins=(Plugin(PLUGIN, CONTRACT_VERSION, components),))
+
+
+def _queries_with(case: Case, given: Fields) -> type[Component]:
+    """Queries that provide the fields `given`, as the inputs of the case have them."""
+
+    class GivenQueries(LatentQueries):
+        name: ClassVar[str] = GIVEN
+
+        @classmethod
+        def provides(cls, config: ComponentConfig) -> Fields:
+            return given
+
+        def forward(self, batch_size: int) -> QueryState:
+            sizes = Sizes(batch=batch_size, queries=self.count)
+            maker = Maker(case, sizes, torch.Generator().manual_seed(0))
+            fields = {name: maker.field(name, spec) for name, spec in given.items()}
+            return super().forward(batch_size).replace(fields=fields)
+
+    return GivenQueries
+
+
+def _recipe_with(case: Case) -> dict[str, Any]:
     """A small recipe of built-in components, but for the one under test."""
     dims, slot = case.dims, case.slot
     chosen = {"type": f"{PLUGIN}/{case.component.name}", **case.config.model_dump(mode="json")}
@@ -59,25 +99,22 @@ def recipe_with(case: Case) -> dict[str, Any]:
 
 
 def run_training_step(recipe: Recipe, case: Case) -> None:
-    """A forward pass with rendering and losses, and its backward pass."""
+    """A forward pass, one view rendered and held against the target, and the backward pass."""
     maker = Maker(case, Sizes(), torch.Generator().manual_seed(0))
     model, losses = recipe.build_model().train(), recipe.build_losses()
     views = maker.target()
+    target = views.select([0])
     total = torch.zeros((), dtype=torch.float64)
     for prediction in model(views).layers.values():
-        rendering = model.render(prediction.gaussians, views.cameras)
+        rendering = model.render(prediction.gaussians, target.cameras)
         for loss in losses.values():
             seen = rendering
             if loss.renderings == "none":
                 seen = type(rendering)(
                     rendering.rgb[:, :0], rendering.alpha[:, :0], rendering.depth[:, :0]
                 )
-            total = total + scalar(loss(prediction, seen, views))
+            total = total + scalar(loss(prediction, seen, target))
     total.backward()
     expect(
         bool(total.isfinite()), "the model that it is composed into gives a loss that is not finite"
     )
-
-
-def _plugin(case: Case) -> Plugin:
-    return Plugin(PLUGIN, CONTRACT_VERSION, (case.component,))
