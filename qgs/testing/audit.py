@@ -51,10 +51,9 @@ class Deed:
     text: str
     files: tuple[str, ...]
 
-    def is_done_by(self, root: str) -> bool:
-        """Whether code of `root` (see `root_of`) did it, by itself or through what it calls."""
-        folder = root.endswith(os.sep)
-        return any(file.startswith(root) if folder else file == root for file in self.files)
+    def is_done_by(self, package: Path) -> bool:
+        """Whether code of the folder or file `package` did it, or what that code called."""
+        return any(Path(file).resolve().is_relative_to(package) for file in self.files)
 
 
 _watches: list[list[Deed]] = []
@@ -80,17 +79,6 @@ def watched() -> Iterator[list[Deed]]:
             _watches.pop()
 
 
-def root_of(file: str) -> str:
-    """The folder of the topmost package that `file` belongs to, with a separator, or `file`."""
-    path = Path(file).absolute()
-    if not (path.parent / "__init__.py").exists():
-        return str(path)
-    package = path.parent
-    while (package.parent / "__init__.py").exists():
-        package = package.parent
-    return f"{package}{os.sep}"
-
-
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if not _watches or event not in EVENTS:
         return
@@ -104,5 +92,6 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 def _files(frame: FrameType | None) -> Iterator[str]:
     """Files of the code that acts here, as far as the import statement that runs it."""
     while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
-        yield frame.f_code.co_filename
+        if not frame.f_code.co_filename.startswith("<"):
+            yield frame.f_code.co_filename
         frame = frame.f_back

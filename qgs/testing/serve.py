@@ -10,8 +10,8 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from qgs.testing.audit import Deed, root_of, watched
-from qgs.testing.places import raised
+from qgs.testing.audit import Deed, watched
+from qgs.testing.places import package_of, raised
 
 _deeds: list[Deed] = []
 """What was done by all that was imported so far."""
@@ -39,8 +39,8 @@ def serve(threads: int) -> None:
 
 def _import(request: dict[str, Any]) -> dict[str, Any]:
     _module(request)
-    root = root_of(request["file"])
-    return {"deeds": [deed.text for deed in _deeds if deed.is_done_by(root)]}
+    package = package_of(request["file"])
+    return {"deeds": [deed.text for deed in _deeds if deed.is_done_by(package)]}
 
 
 def _run(request: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Components that are sound in an unusual way pass the checks that look closest."""
+"""Components that are sound in an unusual way, or of an unusual size, pass."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import pytest
 from contract_mutants.halves import TurnsInFull
 from contract_mutants.reads import PassesFieldsOn
 
-from qgs.contracts import Component
+from qgs.components import ContentCrossAttention
+from qgs.contracts import ModelDims
 from qgs.testing import CHECKS, Case, run_check
+
+THREE_HEADS = ModelDims(width=48, heads=3, depth=1)
 
 
 @pytest.mark.parametrize(
-    ("check", "component"),
+    ("check", "case"),
     [
-        ("geometry_is_float32_under_autocast", TurnsInFull),
-        ("reads_within_requires", TurnsInFull),
-        ("reads_within_requires", PassesFieldsOn),
+        ("geometry_is_float32_under_autocast", Case(TurnsInFull.Config())),
+        ("reads_within_requires", Case(TurnsInFull.Config())),
+        ("reads_within_requires", Case(PassesFieldsOn.Config())),
+        ("saved_weights_run_elsewhere", Case(ContentCrossAttention.Config(), THREE_HEADS)),
     ],
 )
-def test_a_sound_component_passes(check: str, component: type[Component]) -> None:
-    outcome = run_check(CHECKS[check], Case(component.Config()))
+def test_a_sound_component_passes(check: str, case: Case) -> None:
+    outcome = run_check(CHECKS[check], case)
     assert outcome.verdict == "passed", outcome.message

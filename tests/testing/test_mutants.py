@@ -10,6 +10,7 @@ import pytest
 from contract_mutants import (
     broken,
     halves,
+    heads,
     import_io,
     import_weights,
     io_mutants,
@@ -89,6 +90,8 @@ MUTANTS = [
     Mutant("query_permutation", modules.NumbersQueries, "with permuted queries"),
     Mutant("view_permutation", modules.NumbersTokens, "with permuted views"),
     Mutant("sizes_vary", modules.KnowsSixQueries, "`output` is of shape"),
+    Mutant("sizes_vary", heads.KnowsTwoHeads, "in a model of width 48 with 3 heads, RuntimeError"),
+    Mutant("sizes_vary", heads.KnowsItsWidth, "(2, 6, 32), not (2, 6, 48)"),
     Mutant("parameters_learn", options.HasADeadParameter, "no gradient reaches unused.weight"),
     Mutant("gradients_match_differences", modules.CutsItsGradient, "Jacobian"),
     Mutant("render_gradients_match_differences", pictures.DoublesAGradient, "gaussians.colors"),

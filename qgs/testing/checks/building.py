@@ -7,10 +7,11 @@ import inspect
 import torch
 from torch import nn
 
-from qgs.testing.audit import root_of, watched
+from qgs.testing.audit import watched
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.other_process import ask
+from qgs.testing.places import package_of
 from qgs.testing.registry import ALL_SLOTS, PARAMETRIC, check
 
 SHOWN = 5
@@ -48,8 +49,8 @@ def check_build_does_no_io(case: Case) -> None:
     """Building touches no file, opens no connection and starts no process."""
     with watched() as deeds:
         case.build()
-    root = root_of(inspect.getfile(case.component))
-    own = [deed.text for deed in deeds if deed.is_done_by(root)]
+    package = package_of(inspect.getfile(case.component))
+    own = [deed.text for deed in deeds if deed.is_done_by(package)]
     expect(not own, f"while it is built: {_listed(own)}")
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, TypeAlias
 
 import torch
 
 from qgs.testing.case import Case
-from qgs.testing.faults import expect
+from qgs.testing.faults import ContractError, expect
+from qgs.testing.places import file_of, raised
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import Maker, Sizes, inputs_of
 from qgs.testing.trees import distance, leaves, mapped
@@ -24,11 +26,37 @@ VARIED = (
 )
 
 
+THREE_HEADS = {"width": 48, "heads": 3}
+"""Sizes of another model, no multiples of the usual ones."""
+
+
 @check(MODULES)
 def check_sizes_vary(case: Case) -> None:
-    """One instance takes any number of scenes, queries and views, and gives the shapes it must."""
+    """One instance takes any number of scenes, queries and views, and gives the shapes it must.
+
+    So does one of a model of another width and number of heads.
+    """
+    turned = Sizes(image=(case.size[1], case.size[0]))
+    _expect_shapes(case, (*VARIED, turned))
+    other = case.with_dims(**THREE_HEADS)
+    if case.has_parameters and not other.problems(other.size):
+        _expect_it_fits(other)
+
+
+def _expect_it_fits(case: Case) -> None:
+    """Expect it of a component that is known to run in models of other sizes."""
+    where = f"in a model of width {case.dims.width} with {case.dims.heads} heads"
+    try:
+        _expect_shapes(case, VARIED[:2])
+    except ContractError as error:
+        expect(False, f"{where}, {error.seen}")
+    except Exception as error:
+        expect(False, f"{where}, {raised(error, file_of(case.component))}")
+
+
+def _expect_shapes(case: Case, varied: Iterable[Sizes]) -> None:
     module = case.lively()
-    for sizes in (*VARIED, Sizes(image=(case.size[1], case.size[0]))):
+    for sizes in varied:
         if sizes.image and case.slot == "encoder" and case.problems(sizes.image):
             continue  # the component refuses these images, and says so
         outputs = module(*inputs_of(case, sizes).values())
