@@ -67,10 +67,14 @@ def tiers_given(given: Iterable[Tier]) -> tuple[Tier, ...]:
     if isinstance(given, str):
         tier = given if given in TIERS else TIERS[0]
         raise ValueError(f'tiers is the text "{given}" and no list; write tiers=["{tier}"]')
+    if not isinstance(given, Iterable):
+        raise ValueError(f'tiers is {given!r} and no list; leave them out, or tiers=["core"]')
     tiers = tuple(given)
     if not tiers:
         raise ValueError('with no tiers nothing is checked; leave them out, or tiers=["core"]')
     for tier in tiers:
         if tier not in TIERS:
-            raise ValueError(f"there is no tier `{tier}`; {did_you_mean(tier, TIERS, 'tiers')}")
+            raise ValueError(
+                f"there is no tier `{tier}`; {did_you_mean(str(tier), TIERS, 'tiers')}"
+            )
     return tiers

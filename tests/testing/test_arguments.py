@@ -85,6 +85,8 @@ def test_what_is_no_options_is_refused(given, message) -> None:
         ("extended", r'the text "extended" and no list; write tiers=\["extended"\]'),
         ("cor", r'write tiers=\["core"\]'),
         ((), "with no tiers nothing is checked"),
+        (None, "tiers is None and no list"),
+        ([["core"]], r"there is no tier `\['core'\]`"),
         (["cor"], "there is no tier `cor`; did you mean `core`"),
         (["core", "all"], "there is no tier `all`; tiers: core, extended"),
     ],

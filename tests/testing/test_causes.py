@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 from contract_mutants import broken
 from contract_mutants.broken import CannotBeBuilt, CannotBeCalled, CannotBeCalledElsewhere
 from pydantic import ConfigDict
@@ -30,6 +33,44 @@ def _line(text: str) -> int:
 def test_an_error_is_told_with_its_place_in_the_component(component, check, culprit) -> None:
     outcome = run_check(CHECKS[check], Case(component.Config()))
     assert f" (raised under {BROKEN}:{_line(culprit)})\n" in outcome.message
+
+
+PLACED = """
+from qgs.components import MlpFeedForward
+from placed_package.maths import root
+
+class Placed(MlpFeedForward):
+    name = "placed"
+
+    def forward(self, features):
+        return root(super().forward(features))
+"""
+MATHS = """
+import torch
+
+def root(x):
+    return torch.linalg.cholesky(x.mT @ x - 1e6)
+"""
+
+
+def test_the_place_may_be_anywhere_in_the_package(tmp_path, monkeypatch) -> None:
+    package = tmp_path / "placed_package"
+    for folder in (package, package / "attention"):
+        folder.mkdir()
+        (folder / "__init__.py").touch()
+    (package / "attention" / "placed.py").write_text(PLACED)
+    (package / "maths.py").write_text(MATHS)
+    monkeypatch.syspath_prepend(tmp_path)
+    placed = import_module("placed_package.attention.placed").Placed
+    outcome = run_check(CHECKS["runs"], Case(placed.Config()))
+    assert f"(raised under {package / 'maths.py'}:5)" in outcome.message
+
+
+def test_a_class_of_no_file_has_a_place_too() -> None:
+    scope = {"__name__": "of_no_file", "root": partial(torch.linalg.cholesky)}
+    exec(PLACED.replace("from placed_package.maths import root", ""), scope)
+    outcome = run_check(CHECKS["runs"], Case(scope["Placed"].Config()))
+    assert "(raised under <string>:9)" in outcome.message
 
 
 @pytest.mark.parametrize(
