@@ -56,6 +56,7 @@ class CaseRun:
         """Make the next check."""
         outcome = run_check(check, self.case, self.expected.get(check.name))
         if outcome.verdict != "failed":
+            self.cause = "" if check.name == self.cause else self.cause
             return outcome
         if self.cause and outcome.crashed and check.name != self.cause:
             why = f"ends with an error as `{self.cause}` does: see that check"

@@ -5,13 +5,16 @@ from __future__ import annotations
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
 from contract_mutants import broken
 from contract_mutants.broken import CannotBeBuilt, CannotBeCalled, CannotBeCalledElsewhere
 from pydantic import ConfigDict
+from torch import Tensor
 
+from qgs.components import MlpFeedForward
 from qgs.testing import CHECKS, Case, CaseRun, checks_for, parametrize_with_checks, run_check
 
 BROKEN = Path(broken.__file__)
@@ -33,6 +36,17 @@ def _line(text: str) -> int:
 def test_an_error_is_told_with_its_place_in_the_component(component, check, culprit) -> None:
     outcome = run_check(CHECKS[check], Case(component.Config()))
     assert f" (raised under {BROKEN}:{_line(culprit)})\n" in outcome.message
+
+
+class FailsAtFirst(MlpFeedForward):
+    name = "fails_at_first"
+    calls: ClassVar[list[int]] = []
+
+    def forward(self, features: Tensor) -> Tensor:
+        self.calls.append(1)
+        if len(self.calls) == 1 or features.dtype == torch.float64:
+            raise RuntimeError("not now")
+        return super().forward(features)
 
 
 PLACED = """
@@ -116,3 +130,15 @@ def test_a_check_alone_tells_its_own_error() -> None:
         checks["runs"]()
     with pytest.raises(pytest.skip.Exception, match="as `runs` does"):
         checks["sizes_vary"]()
+
+
+def test_a_cause_that_went_away_excuses_nothing() -> None:
+    """As with tests that are run again where they failed."""
+    run = CaseRun(Case(FailsAtFirst.Config()))
+    assert [
+        run.make(CHECKS[name]).verdict for name in ("runs", "runs", "float64_stays_float64")
+    ] == [
+        "failed",
+        "passed",
+        "failed",
+    ]
