@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map
 
 LAYERS = {
     "linear",
@@ -42,7 +42,7 @@ class LearnedLayers(TorchFunctionMode):
         """Call `func` and keep what it gives."""
         given = func(*args, **(kwargs or {}))
         if _is_learned(func, tree_leaves((args, kwargs))):
-            self.outputs.append(given)
+            self.outputs.append(tree_map(_copied, given))
         return given
 
 
@@ -55,10 +55,17 @@ class ReplayedLayers(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call `func`, but for a layer."""
-        if _is_learned(func, tree_leaves((args, kwargs))):
-            given = next(self._outputs)
-            return given.float() if isinstance(given, Tensor) else tuple(x.float() for x in given)
-        return func(*args, **(kwargs or {}))
+        layer = _is_learned(func, tree_leaves((args, kwargs)))
+        given = next(self._outputs, None) if layer else None
+        return func(*args, **(kwargs or {})) if given is None else tree_map(_raised, given)
+
+
+def _copied(value: Any) -> Any:
+    return value.clone() if isinstance(value, Tensor) else value
+
+
+def _raised(value: Any) -> Any:
+    return value.float() if isinstance(value, Tensor) else value
 
 
 def _is_learned(func: Any, operands: list[Any]) -> bool:

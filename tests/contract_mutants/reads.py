@@ -44,7 +44,15 @@ class ReadsWhatItCopies(ContentSelfAttention):
 
     def forward(self, state: QueryState) -> Tensor:
         copy = state.replace(2 * state.features)
-        return super().forward(copy) + copy["anchor.raw_radius"]
+        return super().forward(copy) + copy.fields.get("anchor.raw_radius", 0)
+
+
+class ReadsInTraining(ContentSelfAttention):
+    name: ClassVar[str] = "reads_in_training"
+
+    def forward(self, state: QueryState) -> Tensor:
+        missing = self.training and "anchor.center" not in state.fields
+        return super().forward(state) * (0.5 if missing else 1)
 
 
 class SearchesTheFields(NoRefinement):

@@ -133,6 +133,7 @@ MUTANTS = [
     Mutant("reads_within_requires", reads.LooksForAField, "reads anchor.center"),
     Mutant("reads_within_requires", reads.ReadsInTry, "reads anchor.center"),
     Mutant("reads_within_requires", reads.ReadsWhatItCopies, "reads anchor.raw_radius"),
+    Mutant("reads_within_requires", reads.ReadsInTraining, "reads anchor.center"),
     Mutant("reads_within_requires", reads.SearchesTheFields, "goes through all fields"),
     Mutant("reads_within_requires", reads.PeeksAtTheRendering, "although `renderings` is none"),
     Mutant("geometry_is_float32_under_autocast", halves.MatmulThenFloat, "output: values differ"),

@@ -9,6 +9,7 @@ from qgs.composer.providers import variants
 from qgs.contracts import FieldSpec, Loss
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
+from qgs.testing.modes import each_mode
 from qgs.testing.recording import Reads, recorded
 from qgs.testing.registry import STATEFUL, check
 from qgs.testing.subjects import Maker, Sizes, inputs_of
@@ -61,7 +62,10 @@ def _required(case: Case) -> dict[str, FieldSpec]:
 
 
 def _reads(case: Case) -> tuple[Reads, Exception | None]:
-    """What a forward pass looks at, and how it failed, perhaps for what it found there."""
+    """What forward passes look at, in evaluation and in training, and how one failed.
+
+    It may have failed for what it found where it had nothing to look for.
+    """
     maker = Maker(case, Sizes(), torch.Generator().manual_seed(1))
     known = _fields_of_other_options(case)
 
@@ -71,7 +75,8 @@ def _reads(case: Case) -> tuple[Reads, Exception | None]:
     module = case.lively()
     inputs, reads = recorded(inputs_of(case), absent)
     try:
-        module(*inputs.values())
+        for _ in each_mode(module):
+            module(*inputs.values())
     except Exception as error:
         return reads, error
     return reads, None
