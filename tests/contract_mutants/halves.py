@@ -62,7 +62,7 @@ class TurnsInFull(TurnsInHalf):
     name: ClassVar[str] = "turns_in_full"
 
     def turned(self, step: Tensor, center: Tensor) -> Tensor:
-        step += 1
+        step *= 2
         return (step.to(center)[..., None, :] * TURN.T.to(center)).sum(-1)
 
 
