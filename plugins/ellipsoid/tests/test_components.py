@@ -10,14 +10,14 @@ import torch.nn.functional as F
 from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
 from qgs_ellipsoid.decoding import AxisScaledCenters
-from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, anchor_rotation
+from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
 from qgs_ellipsoid.head import EllipsoidHead, radii_along
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_ellipsoid.rotations import quat_product, turned
 from qgs_locus.fields import CENTER, RadiusOptions, support_radius
 
 from qgs import QueryState
-from qgs.components import posact
+from qgs.components import GaussianHead, posact
 from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
 from qgs.geometry.rotations import quat_to_matrix
@@ -129,36 +129,35 @@ def test_bandwidths_have_their_floor_along_each_axis() -> None:
 
 
 def test_a_radius_along_a_direction_reaches_the_surface() -> None:
-    state = _state()
-    rotation = anchor_rotation(state[ROTATION])
-    radii = support_radius(state[RAW_RADII], RadiusOptions())
-    quats = F.normalize(torch.randn(2, 5, 4, 4), dim=-1)
-    along = radii_along(rotation, radii, quats)
-    directions = quat_to_matrix(quats)
-    axes = anchor_axes(state, RadiusOptions())
-    surface = directions * along[..., None, :]
-    in_ball = torch.linalg.solve(axes[:, :, None], surface)
+    radii, quats = 0.1 + torch.rand(2, 5, 3), F.normalize(torch.randn(2, 5, 4, 4), dim=-1)
+    along = radii_along(radii, quats)
+    surface = quat_to_matrix(quats) * along[..., None, :]
+    in_ball = surface / radii[:, :, None, :, None]
     torch.testing.assert_close(in_ball.norm(dim=-2), torch.ones(2, 5, 4, 3))
 
 
-def test_gaussians_turn_with_their_anchor() -> None:
-    config = EllipsoidHead.Config(gaussians_per_query=3, init_std=0.5, scales="world")
-    head, state = EllipsoidHead(config, DIMS), _state()
-    identity = torch.tensor([1.0, 0, 0, 0]).expand(2, 5, 4)
-    plain, turned_ = head(state.replace(fields={ROTATION: identity})), head(state)
-    expected = anchor_rotation(state[ROTATION])[:, :, None] @ quat_to_matrix(plain.quats)
-    torch.testing.assert_close(quat_to_matrix(turned_.quats), expected, atol=1e-5, rtol=0)
-    assert torch.equal(turned_.scales, plain.scales)
+def test_gaussians_turn_and_grow_with_their_anchor() -> None:
+    head = EllipsoidHead(EllipsoidHead.Config(gaussians_per_query=3, init_std=0.5), DIMS)
+    plain = GaussianHead(GaussianHead.Config(gaussians_per_query=3), DIMS)
+    plain.load_state_dict(head.state_dict())
+    state = _state()
+    local, placed = plain(state), head(state)
+    axes = quat_to_matrix(local.quats)
+    expected = anchor_rotation(state[ROTATION])[:, :, None] @ axes
+    torch.testing.assert_close(quat_to_matrix(placed.quats), expected, atol=1e-5, rtol=0)
+    radii = support_radius(state[RAW_RADII], RadiusOptions())
+    torch.testing.assert_close(placed.scales, local.scales * radii_along(radii, local.quats))
+    for name in ("offsets", "opacities", "colors"):
+        assert torch.equal(getattr(placed, name), getattr(local, name))
 
 
-def test_aligned_gaussians_scale_with_the_radii() -> None:
-    config = EllipsoidHead.Config(gaussians_per_query=2, rotations="anchor")
-    head, state = EllipsoidHead(config, DIMS), _state()
+def test_gaussians_along_the_axes_of_the_anchor_scale_with_its_radii() -> None:
+    head, state = EllipsoidHead(EllipsoidHead.Config(gaussians_per_query=2), DIMS), _state()
     with torch.no_grad():
         head.linear.weight.zero_()
         head.linear.bias.view(2, 14)[:, 9] = 1.0
     scales = head(state).scales
-    radii = support_radius(state[RAW_RADII], config)
+    radii = support_radius(state[RAW_RADII], RadiusOptions())
     torch.testing.assert_close(scales, (0.075 / math.e * radii)[:, :, None].expand_as(scales))
 
 
@@ -176,17 +175,14 @@ ANCHORED = {"queries": {"type": "ellipsoid/anchored"}}
         ({"refinement": {"radii": False, "radius_min": 0.5}}, ".radius_min", "no effect"),
         ({"cross_attention": {"bandwidth": "fixed", "radius_min": 0.5}}, ".radius_min",
          "no effect"),
-        ({"head": {"rotations": "world", "scales": "world"}}, "", "nothing follows"),
-        ({"head": {"scales": "world", "radius_min": 0.5}}, ".radius_min", "no effect"),
     ],
 )  # fmt: skip
 def test_options_without_effect_are_refused(options: dict, path: str, why: str) -> None:
     ((slot, given),) = options.items()
-    kinds = {"refinement": "refine", "cross_attention": "ray_biased", "head": "gaussian_head"}
-    component = {slot: {"type": f"ellipsoid/{kinds[slot]}", **given}}
-    model = component if slot == "head" else {"decoder": component}
+    kinds = {"refinement": "refine", "cross_attention": "ray_biased"}
+    decoder = {slot: {"type": f"ellipsoid/{kinds[slot]}", **given}}
     with pytest.raises(RecipeError) as caught:
-        resolve({**ELLIPSOID, "model": {**ANCHORED, **model}})
+        resolve({**ELLIPSOID, "model": {**ANCHORED, "decoder": decoder}})
     (problem,) = caught.value.problems
     assert problem.path.endswith(path)
     assert why in problem.reason

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from qgs_ellipsoid import from_locus
+from qgs_ellipsoid.conversion import from_locus
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION
 from qgs_locus.anchors import AnchoredQueries
 from torch import Tensor

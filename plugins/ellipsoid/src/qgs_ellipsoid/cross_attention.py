@@ -17,23 +17,17 @@ from qgs_ellipsoid.ray_bias import ellipsoid_bias, ray_features
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
     """`locus/ray_biased` whose bias measures a ray's distance in the metric of the anchor.
 
-    Floors, clamp and gamma are LocusGS's; the floor of (sigma0 r)^2 holds along each axis.
+    Its options, floors, clamp and gamma are LocusGS's; the floor of (sigma0 r)^2 holds along each
+    axis, and a fixed bandwidth knows no shape.
     """
 
     name: ClassVar[str] = "ray_biased"
 
-    class Config(RayBiasedCrossAttention.Config):
-        """As `locus/ray_biased`. bandwidth: "fixed" measures all anchors by sigma0, as LocusGS."""
-
-    config: Config
-
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def requires(cls, config: RayBiasedCrossAttention.Config) -> Fields:
         """Those of `locus/ray_biased`, with a shape for its radius."""
-        required = dict(super().requires(config))
-        if required.pop(RAW_RADIUS, None):
-            required.update(shape_fields(config))
-        return required
+        shape = shape_fields(config) if config.bandwidth == "radius" else {}
+        return {n: f for n, f in super().requires(config).items() if n != RAW_RADIUS} | dict(shape)
 
     def sigma_sq(self, state: QueryState) -> Tensor | float:
         """Squared bandwidths along the axes of each anchor (B, N, 3), or one number when fixed."""

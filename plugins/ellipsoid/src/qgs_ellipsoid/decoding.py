@@ -15,17 +15,12 @@ from qgs_ellipsoid.fields import anchor_axes, shape_fields
 
 
 class AxisScaledCenters(RadiusScaledCenters):
-    """mean = mu + R diag(r) posact(offset)."""
+    """mean = mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
 
     name: ClassVar[str] = "axis_scaled"
 
-    class Config(RadiusScaledCenters.Config):
-        """As `locus/radius_scaled`."""
-
-    config: Config
-
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def requires(cls, config: RadiusScaledCenters.Config) -> Fields:
         """Centres and shapes."""
         return {**CENTER_FIELD, **shape_fields(config)}
 

@@ -51,9 +51,9 @@ class EllipsoidRefinement(Refinement):
     @classmethod
     def requires(cls, config: Config) -> Fields:
         """Whatever is refined."""
-        center = CENTER_FIELD if config.center else {}
-        rotation = ROTATION_FIELD if config.rotation else {}
-        return {**center, **rotation, **(radii_field(config) if config.radii else {})}
+        parts = {"center": CENTER_FIELD, "rotation": ROTATION_FIELD, "radii": radii_field(config)}
+        chosen = [fields for part, fields in parts.items() if getattr(config, part)]
+        return {name: spec for fields in chosen for name, spec in fields.items()}
 
     @classmethod
     def provides(cls, config: Config) -> Fields:
@@ -63,15 +63,16 @@ class EllipsoidRefinement(Refinement):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """Something must be refined, and every option must matter."""
-        if not (config.center or config.rotation or config.radii):
+        if not cls.requires(config):
             reason = "`center`, `rotation` and `radii` are all false: nothing is refined"
             fix = "set one of them to true, or use `qgs/none` in the slot `refinement`"
             yield Problem("", reason, fix)
-        limits = ("input_limit", "output_limit")
         if not config.center:
-            yield from without_effect(config, ("center_step", *limits), "`center` is false")
+            idle = ("center_step", "input_limit", "output_limit")
+            yield from without_effect(config, idle, "`center` is false")
         elif config.center_step == "linear":
-            yield from without_effect(config, limits, "`center_step` is linear")
+            idle = ("input_limit", "output_limit")
+            yield from without_effect(config, idle, "`center_step` is linear")
         if not config.radii:
             yield from without_effect(config, ("radius_bound", "radius_min"), "`radii` is false")
 

@@ -1,0 +1,102 @@
+"""What the lines of a plugin are for: its mathematics, its options, or being a plugin.
+
+    python tools/plugin_lines.py plugins/ellipsoid/src
+
+Counts lines of code: no blank ones, comments or docstrings. Of a component, `name`, `requires`,
+`provides` and the heads of classes and constructors are declarations; the fields of its Config and
+`problems`, which refuses them, are options. Field specs are the state. What is left is mathematics.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import sys
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+DECLARING = ("requires", "provides")
+LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+}
+
+
+def code_lines(source: str) -> set[int]:
+    """Numbers of the lines that hold code."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    spans = [(t.start[0], t.end[0]) for t in tokens if t.type not in LAYOUT]
+    lines = {line for first, last in spans for line in range(first, last + 1)}
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            lines -= set(_lines(node))
+    return lines
+
+
+def purposes(source: str, is_package: bool) -> dict[int, str]:
+    """Line number to purpose, for the lines that are no mathematics."""
+    found: dict[int, str] = {}
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found |= dict.fromkeys(_lines(node), "imports")
+        elif is_package:
+            found |= dict.fromkeys(_lines(node), "registration")
+        elif _declares_state(node):
+            found |= dict.fromkeys(_lines(node), "state")
+        elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            found |= _of_component(node)
+    return found
+
+
+def _of_component(node: ast.ClassDef) -> dict[int, str]:
+    found = {node.lineno: "declarations"}
+    for member in node.body:
+        match member:
+            case ast.FunctionDef(name=name) if name in DECLARING:
+                found |= dict.fromkeys(_lines(member), "declarations")
+            case ast.FunctionDef(name="problems"):
+                found |= dict.fromkeys(_lines(member), "options")
+            case ast.FunctionDef(name="__init__"):
+                found |= dict.fromkeys((member.lineno, member.body[0].lineno), "declarations")
+            case ast.AnnAssign(target=ast.Name(id="name" | "config")):
+                found |= dict.fromkeys(_lines(member), "declarations")
+            case ast.ClassDef(name="Config"):
+                found |= dict.fromkeys(_lines(member), "options") | {member.lineno: "declarations"}
+    return found
+
+
+def _declares_state(node: ast.stmt) -> bool:
+    """Whether it names a field of the state, or says what such a field holds."""
+    if isinstance(node, ast.Assign):
+        return isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    said = node.returns if isinstance(node, ast.FunctionDef) else None
+    said = node.annotation if isinstance(node, ast.AnnAssign) else said
+    return isinstance(said, ast.Name) and said.id == "Fields"
+
+
+def _lines(node: ast.AST) -> Iterator[int]:
+    assert isinstance(node, ast.stmt)
+    decorators = [d.lineno for d in getattr(node, "decorator_list", [])]
+    last = node.end_lineno or node.lineno
+    return iter(range(min([node.lineno, *decorators]), last + 1))
+
+
+def main() -> None:
+    total: Counter[str] = Counter()
+    for path in sorted(Path(sys.argv[1]).rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        known = purposes(source, path.name == "__init__.py")
+        counted = Counter(known.get(line, "mathematics") for line in code_lines(source))
+        print(f"{path.name:22}", ", ".join(f"{n} {kind}" for kind, n in counted.most_common()))
+        total += counted
+    print(f"{'in all':22}", ", ".join(f"{n} {kind}" for kind, n in total.most_common()))
+
+
+if __name__ == "__main__":
+    main()
