@@ -8,7 +8,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from guide_checks import check_list
+from guide_checks import check_list, testing_page
 from guide_reference import reference
 
 
@@ -16,6 +16,7 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages that are no files of the repository."""
     from mkdocs.structure.files import File  # pyright: ignore[reportMissingImports]
 
-    files.append(File.generated(config, "recipes.md", content=reference()))
-    files.append(File.generated(config, "checks.md", content=check_list()))
+    pages = {"recipes.md": reference, "checks.md": check_list, "api/testing.md": testing_page}
+    for path, written in pages.items():
+        files.append(File.generated(config, path, content=written()))
     return files

@@ -10,6 +10,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from guide_docstrings import entries, joined
+
 from qgs.composer.registry import Registry, load_registry
 from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.composer.show import dump
@@ -72,7 +74,7 @@ def option_table(config: type[ComponentConfig]) -> str:
     schema = config.model_json_schema()
     if not schema.get("properties"):
         return "No options."
-    meanings = option_meanings(config)
+    meanings = {name: in_yaml(text, config) for name, text in option_meanings(config).items()}
     rows = ["| option | values | default | meaning |", "|---|---|---|---|"]
     for name, option in schema["properties"].items():
         option_schema = _resolved(option, schema.get("$defs", {}))
@@ -85,20 +87,37 @@ def option_table(config: type[ComponentConfig]) -> str:
 
 
 def option_meanings(config: type[ComponentConfig]) -> dict[str, str]:
-    """What the docstrings of `config` and its bases say of each option.
-
-    They are written `name, other: meaning. third: meaning.`
-    """
-    names = "|".join(map(re.escape, config.model_fields))
-    entry = re.compile(rf"(?:^|(?<=\. )|(?<=\n))((?:{names})(?:, (?:{names}))*): ")
+    """What the docstrings of `config` and its bases say of each option."""
     found: dict[str, str] = {}
     for base in config.__mro__:
-        text = inspect.cleandoc(base.__doc__ or "").replace("\n\n", "\n").strip()
-        parts = entry.split(re.sub(r"(?<=[^.\n])\n|(?<=\.)\n(?=[a-z_]+:)", " ", text))
-        for listed, meaning in zip(parts[1::2], parts[2::2], strict=True):
-            for name in listed.split(", "):
-                found.setdefault(name, " ".join(meaning.split()))
+        text = joined(inspect.cleandoc(base.__doc__ or "").replace("\n\n", "\n"))
+        own: dict[str, str] = {}
+        names: list[str] = []
+        for line in text.splitlines():
+            for listed, meaning in entries(line, config.model_fields):
+                names = listed.split(", ") if listed else names
+                own |= {name: f"{own.get(name, '')} {meaning}".strip() for name in names}
+        found = own | found
     return found
+
+
+def in_yaml(text: str, config: type[ComponentConfig]) -> str:
+    """`text` of a docstring with Python's words for values of `config` as a recipe has them."""
+    for python, yaml in {"None": "null", "True": "true", "False": "false"}.items():
+        text = re.sub(rf"(?<![\w`]){python}(?![\w`])", f"`{yaml}`", text)
+    for word in _choices(config.model_json_schema()):
+        text = text.replace(f'"{word}"', f"`{word}`")
+    return text
+
+
+def _choices(schema: Any) -> set[str]:
+    """Every word that `schema` lets an option choose."""
+    if isinstance(schema, list):
+        return {word for item in schema for word in _choices(item)}
+    if not isinstance(schema, dict):
+        return set()
+    own = {value for value in schema.get("enum", ()) if isinstance(value, str)}
+    return own | {word for item in schema.values() for word in _choices(item)}
 
 
 def values_of(schema: Mapping[str, Any]) -> str:
@@ -133,7 +152,8 @@ def _slot_section(slot: str, registry: Registry) -> str:
         listed = ", ".join(f"`{name}: {{type: {kind}}}`" for name, kind in DEFAULT_LOSSES.items())
         default = f"Names are free. Default: {listed}."
     elif slot == "data":
-        default = f"{default} A recipe without `data` has none."
+        kind = SLOTS[slot].default
+        default = f"A recipe without `data` has none; `data` without a `type` is `{kind}`."
     parts = [
         f"## Slot `{'.'.join(place)}`",
         "",
@@ -142,10 +162,16 @@ def _slot_section(slot: str, registry: Registry) -> str:
         default,
     ]
     for name, component in registry.components(slot).items():
-        summary = inspect.cleandoc(component.__doc__ or "")
+        summary = in_yaml(_summary(component), component.Config)
         parts += ["", f"### `{name}` {{ #{slot}-{name.replace('/', '-')} }}", "", summary, ""]
         parts += [option_table(component.Config), "", *_fields_of(component)]
     return "\n".join(parts) + "\n"
+
+
+def _summary(component: type[Component]) -> str:
+    """The docstring, but for paragraphs on attributes, which are no options."""
+    paragraphs = inspect.cleandoc(component.__doc__ or "").split("\n\n")
+    return "\n\n".join(text for text in paragraphs if not re.match(r"\w+: ", text))
 
 
 def _contract_line(slot: str) -> str:
@@ -177,9 +203,14 @@ def _resolved(schema: Any, definitions: Mapping[str, Any]) -> Any:
 
 def _bounds(schema: Mapping[str, Any]) -> Iterator[str]:
     signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-    found = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    found = [f"{sign} {_bound(schema[key])}" for key, sign in signs.items() if key in schema]
     if found:
         yield ", ".join(found)
+
+
+def _bound(value: float) -> str:
+    power = round(value).bit_length() - 1
+    return f"2^{power}" if power > 30 and value == 2.0**power else f"{value:g}"
 
 
 def _yaml(value: Any) -> str:

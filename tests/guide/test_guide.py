@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from importlib import import_module
 from pathlib import Path
 
 import guide_errors
@@ -11,28 +10,14 @@ import guide_reference
 import pytest
 import torch
 import yaml
+from guide_pages import blocks, text_of
 
-import qgs
 from qgs.cli.new_plugin import rendered
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import load_registry
 from qgs.composer.slots import SLOTS
 from qgs.contracts import ComponentConfig, ModelDims
 from qgs.types import QueryState
-
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = sorted(path for path in DOCS.rglob("*.md"))
-BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
-
-
-def text_of(page: str) -> str:
-    return (DOCS / page).read_text(encoding="utf-8")
-
-
-def blocks(page: str, kind: str) -> dict[str, str]:
-    """Title, or position, to text of the blocks of one kind."""
-    found = BLOCK.findall(text_of(page))
-    return {t or str(i): text for i, (k, t, text) in enumerate(found) if k == kind}
 
 
 def test_messages_are_those_that_are_raised() -> None:
@@ -88,45 +73,6 @@ def test_the_tutorials_components_and_their_test_are_short() -> None:
     assert len(blocks_of["change: tests/test_components.py"].splitlines()) < 10
 
 
-def test_every_reference_to_code_exists() -> None:
-    for page in PAGES:
-        for name in re.findall(r"\]\[([a-z_]+(?:\.\w+)+)\]", page.read_text(encoding="utf-8")):
-            assert _found(name), f"{page.name} refers to {name}"
-
-
-def _found(name: str) -> bool:
-    parts = name.split(".")
-    for split in range(len(parts), 0, -1):
-        try:
-            thing = import_module(".".join(parts[:split]))
-        except ModuleNotFoundError:
-            continue
-        for part in parts[split:]:
-            thing = getattr(thing, part, None)
-        return thing is not None
-    return False
-
-
-def test_every_module_of_the_reference_exists() -> None:
-    for page in PAGES:
-        for name in re.findall(r"^::: ([\w.]+)", page.read_text(encoding="utf-8"), re.MULTILINE):
-            assert _found(name), f"{page.name} documents {name}"
-
-
-def test_options_named_beside_equations_exist() -> None:
-    registry = load_registry(["locus"])
-    known = {name for _, config, _ in guide_reference.SECTIONS for name in config.model_fields}
-    for slot in SLOTS:
-        for component in registry.components(slot).values():
-            known |= set(component.Config.model_fields)
-    table = text_of("equations.md").split("## Where paper")[0]
-    cells = [row.rstrip(" |").rpartition("|")[2] for row in table.splitlines() if "][" in row]
-    named = {name.rpartition(".")[2] for cell in cells for name in re.findall(r"`([\w.]+)`", cell)}
-    named = {name for name in named if f"[`{name}`]" not in table}
-    assert len(named) > 20
-    assert named <= known
-
-
 def _configs() -> dict[str, type[ComponentConfig]]:
     registry = load_registry(guide_reference.PLUGINS)
     sections = {title: config for title, config, _ in guide_reference.SECTIONS}
@@ -161,16 +107,3 @@ def test_reference_has_every_slot_and_component() -> None:
     for slot in SLOTS:
         for name in load_registry(guide_reference.PLUGINS).components(slot):
             assert f"### `{name}` {{ #{slot}-{name.replace('/', '-')} }}" in page
-
-
-def test_pages_are_in_the_navigation() -> None:
-    site = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
-    listed = set(re.findall(r": ([\w/]+\.md)$", site, re.MULTILINE))
-    assert listed == {str(page.relative_to(DOCS)) for page in PAGES} | {"recipes.md", "checks.md"}
-
-
-def test_public_names_are_documented() -> None:
-    page = text_of("api/qgs.md") + text_of("api/types.md") + text_of("api/contracts.md")
-    types = vars(import_module("qgs.types"))
-    missing = [n for n in qgs.__all__ if n not in types and f"qgs.{n}" not in page]
-    assert missing == ["CONTRACT_VERSION", "Plugin"], "both are on the page of contracts"
