@@ -69,7 +69,7 @@ class DropsByNumpy(MlpFeedForward):
 
     def forward(self, features: Tensor) -> Tensor:
         update = super().forward(features)
-        return update * (numpy.random.rand() > 0.1) if self.training else update
+        return update * numpy.random.rand() if self.training else update
 
 
 class DropsByPython(MlpFeedForward):
@@ -77,7 +77,7 @@ class DropsByPython(MlpFeedForward):
 
     def forward(self, features: Tensor) -> Tensor:
         update = super().forward(features)
-        return update * (random.random() > 0.1) if self.training else update
+        return update * random.random() if self.training else update
 
 
 class DropsByItsOwnGenerator(MlpFeedForward):

@@ -23,10 +23,12 @@ from contract_mutants import (
     training,
     views,
 )
+from contract_mutants.company import ALSO, BROKEN
 from contract_mutants.packaged.components.feed_forward import DeepInside
+from contract_mutants.sound import DropsOut, ReadsTheFirstViewMost, RefusesIntrinsics
 
 from qgs.contracts import Component
-from qgs.testing import CHECKS, Case, run_check
+from qgs.testing import CHECKS, Case, checks_for, run_check
 
 
 @dataclass(frozen=True)
@@ -201,3 +203,25 @@ def test_the_mutant_is_caught(mutant: Mutant) -> None:
     assert mutant.seen in outcome.message
     assert mutant.component.name in outcome.message
     assert check.contract in outcome.message
+
+
+@pytest.mark.parametrize(
+    "component", dict.fromkeys(m.component for m in MUTANTS if m.component.name not in BROKEN)
+)
+def test_no_other_check_fails(component: type[Component]) -> None:
+    mutants = [mutant for mutant in MUTANTS if mutant.component is component]
+    case = mutants[0].to_case()
+    outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
+    failed = {outcome.check.name: outcome.message for outcome in outcomes if not outcome.ok}
+    meant = {m.check for m in mutants if CHECKS[m.check].tier == "core" and m.to_case() == case}
+    expected = meant | ALSO.get(component.name, {}).keys()
+    assert failed.keys() == expected, [failed[name] for name in failed.keys() - expected]
+
+
+@pytest.mark.parametrize("component", [DropsOut, ReadsTheFirstViewMost, RefusesIntrinsics])
+def test_what_is_sound_passes(component: type[Component]) -> None:
+    case = Case(component.Config())
+    failed = [
+        o.message for o in (run_check(c, case) for c in checks_for(case, ["core"])) if not o.ok
+    ]
+    assert not failed
