@@ -98,7 +98,7 @@ ALSO: Mapping[str, Mapping[str, str]] = {
         ("drops_by_numpy", "drops_by_python", "drops_by_its_own_generator"),
         _because("no two training passes agree", "batch_independence"),
     ),
-    "detached_attention": _because("where it attends to has no effect", "parameters_learn"),
+    "takes_roots_of_zero": _because("its gradient is nowhere a number", "batch_independence"),
     "learns_a_constant": _because("the norm of zeros is zero", "parameters_learn"),
     "refuses_what_it_declares": _because(
         "gradients in what is declared are asked for there",

@@ -173,6 +173,7 @@ MUTANTS = [
     Mutant("gradients_reach_inputs", learning.IgnoresWhereItIs, "state.fields.place.center"),
     Mutant("gradients_reach_inputs", learning.LearnsAConstant, "no gradient reaches features"),
     Mutant("gradients_reach_inputs", learning.StandsStill, "no gradient reaches offsets"),
+    Mutant("unmet_requirement_fails_at_compose", learning.TakesRootsOfZero, "gradients are not"),
     Mutant("memory_depends_on_images", learning.ClosesItsEyes, "`values` stays as it is"),
     Mutant("render_gradients_match_differences", learning.ForgetsDepth, "`gaussians.means`"),
     Mutant("camera_gradients_match_differences", learning.TurnsPosesOnly, "`cameras.c2w`"),

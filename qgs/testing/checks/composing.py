@@ -14,7 +14,7 @@ from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import Maker, Sizes, required_fields
-from qgs.testing.trees import scalar
+from qgs.testing.trees import not_finite, scalar
 from qgs.types import QueryState
 
 PLUGIN = "under_test"
@@ -99,22 +99,34 @@ def _recipe_with(case: Case) -> dict[str, Any]:
 
 
 def run_training_step(recipe: Recipe, case: Case) -> None:
-    """A forward pass, one view rendered and held against the target, and the backward pass."""
+    """A forward pass, one view rendered and held against the target, and the backward pass.
+
+    Raises ContractError for predictions, images, losses or gradients that are not finite.
+    """
     maker = Maker(case, Sizes(), torch.Generator().manual_seed(0))
     model, losses = recipe.build_model().train(), recipe.build_losses()
     views = maker.target()
     target = views.select([0])
     total = torch.zeros((), dtype=torch.float64)
     for prediction in model(views).layers.values():
+        _expect_finite("prediction", prediction)
         rendering = model.render(prediction.gaussians, target.cameras)
+        _expect_finite("rendering", rendering)
         for loss in losses.values():
             seen = rendering
             if loss.renderings == "none":
                 seen = type(rendering)(
                     rendering.rgb[:, :0], rendering.alpha[:, :0], rendering.depth[:, :0]
                 )
-            total = total + scalar(loss(prediction, seen, target))
+            terms = loss(prediction, seen, target)
+            _expect_finite("losses", terms)
+            total = total + scalar(terms)
     total.backward()
-    expect(
-        bool(total.isfinite()), "the model that it is composed into gives a loss that is not finite"
-    )
+    slopes = {n: p.grad for n, p in model.named_parameters() if p.grad is not None}
+    expect(bool(slopes), "in the model that it is composed into nothing gets a gradient")
+    _expect_finite("gradients", slopes)
+
+
+def _expect_finite(what: str, tree: Any) -> None:
+    broken = not_finite(tree)
+    expect(not broken, f"composed into a model, {what} are not finite: {', '.join(broken)}")
