@@ -1,0 +1,117 @@
+"""The code of "Write a plugin in 15 minutes", without an installation.
+
+The slow tests in tests/outside type every command of the page in a fresh environment.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from guide_pages import blocks
+
+from qgs.cli.new_plugin import rendered
+from qgs.composer import RecipeError
+from qgs.composer.recipe import resolve
+from qgs.contracts import ModelDims
+from qgs.testing import Case, checks_for, run_check
+from qgs.types import QueryState
+
+PACKAGE = "qgs_sightline"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The distribution as it is at the end of the page."""
+    folder = tmp_path_factory.mktemp("qgs-sightline")
+    files = {str(path): text for path, text in rendered("sightline")}
+    for kind in ("python", "yaml"):
+        for title, text in blocks("plugin.md", kind).items():
+            verb, _, path = title.partition(": ")
+            if path:
+                assert (path in files) == (verb == "change"), f"{title}: new or changed?"
+                files[path] = text
+    for path, text in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def package(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    monkeypatch.syspath_prepend(folder / "src")
+    yield import_module(PACKAGE)
+    for name in [name for name in sys.modules if name.partition(".")[0] == PACKAGE]:
+        del sys.modules[name]
+
+
+def test_the_page_shows_what_new_plugin_writes() -> None:
+    written = {str(path): text for path, text in rendered("sightline")}
+    code = blocks("plugin.md", "python")
+    shown = {title: text for title, text in code.items() if ":" not in title}
+    assert len(shown) == 3, "the component, the plugin and the test"
+    assert {title: written[title] for title in shown} == shown
+    assert blocks("plugin.md", "toml").popitem()[1] in written["pyproject.toml"]
+
+
+def test_components_and_their_test_are_short() -> None:
+    code = blocks("plugin.md", "python")
+    assert len(code["new: src/qgs_sightline/frustum.py"].splitlines()) < 50
+    assert len(code["src/qgs_sightline/abstaining.py"].splitlines()) < 50
+    assert len(code["change: tests/test_components.py"].splitlines()) < 10
+
+
+def test_the_pages_test_checks_every_component(folder: Path, package: ModuleType) -> None:
+    test = runpy.run_path(str(folder / "tests/test_components.py"))["test_contract"]
+    (mark,) = test.pytestmark
+    checked = {(bound.check.name, bound.run.case.component) for (bound,) in _arguments(mark)}
+    expected = {
+        (check.name, component)
+        for component in package.plugin.components
+        for check in checks_for(Case(component.Config()))
+    }
+    assert checked == expected
+
+
+def _arguments(mark: pytest.Mark) -> list[tuple]:
+    return [tuple(getattr(value, "values", (value,))) for value in mark.args[1]]
+
+
+def test_the_second_component_keeps_its_contract(package: ModuleType) -> None:
+    case = Case(package.FrustumCenters.Config(far=5.0))
+    outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert [outcome.message for outcome in outcomes if outcome.verdict != "passed"] == []
+
+
+def test_the_second_component_computes_its_formula(package: ModuleType) -> None:
+    config = package.FrustumCenters.Config(near=0.5, far=8.0, slope=2.0)
+    centers = package.FrustumCenters(config, ModelDims(16, 2, 1))
+    state = QueryState(torch.zeros(1, 1, 16))
+    middle, corner = centers(torch.tensor([[[[0.0, 0.0, 0.0], [50.0, -50.0, 50.0]]]]), state)[0, 0]
+    assert middle.tolist() == [0.0, 0.0, 2.0], "depth is the geometric mean of near and far"
+    assert corner.tolist() == [16.0, -16.0, 8.0], "the far corner of the frustum"
+
+
+def test_the_recipes_work(
+    folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    recipe = resolve("frustum.yaml", plugins=[package.plugin])
+    assert recipe.tree["model"]["centers"]["type"] == "sightline/frustum"
+    assert recipe.tree["model"]["decoder"]["cross_attention"]["type"] == "sightline/abstaining"
+    model = recipe.build_model("meta")
+    assert isinstance(model.centers, package.FrustumCenters)
+
+
+def test_an_option_that_does_not_fit_is_told_as_the_page_says(
+    folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    with pytest.raises(RecipeError, match="far must be more than near, 9\n  fix: set it farther"):
+        resolve("frustum.yaml", ["model.centers.near=9"], plugins=[package.plugin])
