@@ -91,6 +91,10 @@ class RecordedFields(Mapping[str, Tensor]):
             self._reads.asked.add(name)
         return self._held[name] if name in self._held else self._absent(name)
 
+    def __or__(self, fields: Mapping[str, Tensor]) -> RecordedFields:
+        """As of the dict that a state usually holds; none of its fields is looked at."""
+        return self.changed(fields)
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._every(sys._getframe(1).f_code))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -79,5 +79,5 @@ class PassesFieldsOn(ContentSelfAttention):
     name: ClassVar[str] = "passes_fields_on"
 
     def forward(self, state: QueryState) -> Tensor:
-        doubled = replace(state, features=2 * state.features)
-        return super().forward(QueryState(doubled.features, doubled.fields).replace())
+        doubled: Any = replace(state, features=2 * state.features)
+        return super().forward(QueryState(doubled.features, doubled.fields | {}).replace())
