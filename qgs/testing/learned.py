@@ -21,7 +21,7 @@ LAYERS = {
     "multi_head_attention_forward",
     "scaled_dot_product_attention",
 }
-"""Functions of torch that are layers of a network, whatever they are given."""
+"""Functions of torch that are layers of a network, if anything in them is learned."""
 
 PRODUCTS = {"matmul", "__matmul__", "__rmatmul__", "mm", "mv", "bmm", "addmm", "baddbmm", "einsum"}
 """Functions of torch that are as often geometry: a rotation of points is one."""
@@ -70,6 +70,5 @@ def _raised(value: Any) -> Any:
 
 def _is_learned(func: Any, operands: list[Any]) -> bool:
     name = getattr(func, "__name__", "")
-    if name in LAYERS:
-        return True
-    return name in PRODUCTS and all(x.requires_grad for x in operands if isinstance(x, Tensor))
+    learned = [x.requires_grad for x in operands if isinstance(x, Tensor)]
+    return (name in LAYERS and any(learned)) or (name in PRODUCTS and all(learned))

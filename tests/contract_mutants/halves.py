@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from qgs.components import ContentCrossAttention, FreeCenters, GaussianHead, LatentQueries
@@ -54,6 +55,13 @@ class TurnsInHalf(Refinement):
         center = state["place.center"]
         moved = center + self.turned(self.step(state.features), center)
         return state.replace(fields={"place.center": moved})
+
+
+class LinearThenFloat(TurnsInHalf):
+    name: ClassVar[str] = "linear_then_float"
+
+    def turned(self, step: Tensor, center: Tensor) -> Tensor:
+        return step.to(center) + F.linear(center, TURN.to(center)).to(center)
 
 
 class TurnsInFull(TurnsInHalf):

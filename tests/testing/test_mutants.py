@@ -140,6 +140,7 @@ MUTANTS = [
     Mutant("reads_within_requires", reads.PeeksAtTheRendering, "although `renderings` is none"),
     Mutant("geometry_is_float32_under_autocast", halves.MatmulThenFloat, "output: values differ"),
     Mutant("geometry_is_float32_under_autocast", halves.TurnsInHalf, "place.center: values differ"),
+    Mutant("geometry_is_float32_under_autocast", halves.LinearThenFloat, "place.center: values"),
     Mutant(
         "geometry_is_float32_under_autocast",
         halves.PlacesQueriesInHalf,

@@ -78,9 +78,9 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
         expect(kept, f"under autocast `{name}` is {described(tensor)}, not float32")
     with ReplayedLayers(layers.outputs):
         exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
-    for name in seen.keys() - _without_frame(case):
-        found = distance({name: exact[name]}, {name: seen[name]}, RTOL, ATOL)
-        expect(not found, f"under autocast, against float32, {found}")
+    placed = {name: x for name, x in seen.items() if name not in _without_frame(case)}
+    found = distance({name: exact[name] for name in placed}, placed, RTOL, ATOL)
+    expect(not found, f"under autocast, against float32, {found}")
 
 
 @check(MODULES)
