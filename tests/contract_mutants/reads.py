@@ -81,3 +81,15 @@ class PassesFieldsOn(ContentSelfAttention):
     def forward(self, state: QueryState) -> Tensor:
         doubled: Any = replace(state, features=2 * state.features)
         return super().forward(QueryState(doubled.features, doubled.fields | {}).replace())
+
+
+class DrawsAnchorsIn(Loss):
+    name: ClassVar[str] = "draws_anchors_in"
+    renderings = "none"
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        radius = prediction.state.fields.get("anchor.raw_radius")
+        small = prediction.gaussians.scales.mean()
+        return {"small": small if radius is None else small + radius.mean()}

@@ -138,6 +138,7 @@ MUTANTS = [
     Mutant("reads_within_requires", reads.ReadsInTraining, "reads anchor.center"),
     Mutant("reads_within_requires", reads.SearchesTheFields, "goes through all fields"),
     Mutant("reads_within_requires", reads.PeeksAtTheRendering, "although `renderings` is none"),
+    Mutant("reads_within_requires", reads.DrawsAnchorsIn, "reads anchor.raw_radius"),
     Mutant("geometry_is_float32_under_autocast", halves.MatmulThenFloat, "output: values differ"),
     Mutant("geometry_is_float32_under_autocast", halves.TurnsInHalf, "place.center: values differ"),
     Mutant("geometry_is_float32_under_autocast", halves.LinearThenFloat, "place.center: values"),
