@@ -74,6 +74,8 @@ def diff(
 
     resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
     names = [path.name if first.name != second.name else str(path) for path in (first, second)]
+    if first == second:
+        names = [f"{first.name} {letter}" for letter in "AB"]
     for table in difference_tables(*resolved, *names):
         Console().print(table)
 
