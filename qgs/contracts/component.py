@@ -109,6 +109,10 @@ class Component(ABC):
     A slot's contract sets `slot`; a final class sets `name` and nests its `Config`. A recipe
     selects it as `type: PLUGIN/NAME`. Classmethods are called with a decoded config before
     anything is built.
+
+    A forward pass treats scenes apart and changes neither its inputs nor what the component keeps,
+    in training neither; there, and there alone, it may draw from torch's global generator. What it
+    reads gets a gradient.
     """
 
     slot: ClassVar[str]

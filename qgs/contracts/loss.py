@@ -18,7 +18,8 @@ class Loss(Component, torch.nn.Module):
     """(LayerPrediction, Rendering, target Views) -> named 0-d tensors, already weighted.
 
     Called for each supervised layer; the objective is the sum of all terms, weighted by layer. The
-    rendering shows the target's cameras. Term names are unique within a recipe.
+    rendering shows the target's cameras. Term names are unique within a recipe. Every term has a
+    gradient in the prediction or in the rendering.
 
     renderings: which renderings of the target views the terms need, where training may render few
     views at a time (`training.render_views`). "each": a term is the mean over target views of what

@@ -1,0 +1,58 @@
+"""What a module keeps beside its state dict is seen to change."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import count
+from types import SimpleNamespace
+
+import numpy
+import pytest
+import torch
+from torch import nn
+
+from qgs.testing.memory import remembered
+
+
+class Keeper(nn.Module):
+    def __init__(self, kept: object) -> None:
+        super().__init__()
+        self.part = nn.Linear(2, 2)
+        self.part._kept = kept
+
+
+KEPT = {
+    "a list that grows": ([], lambda kept: kept.append(0)),
+    "a number in a nested list": ({"a": [[1]]}, lambda kept: kept["a"][0].__setitem__(0, 2)),
+    "a queue of constant length": (deque([1, 2], maxlen=2), lambda kept: kept.append(3)),
+    "a set": ({1}, lambda kept: kept.add(2)),
+    "a tensor": (torch.zeros(1000), lambda kept: kept[500:501].add_(1)),
+    "an array": (numpy.zeros(1000), lambda kept: kept.__setitem__(500, 1)),
+    "an attribute of an object": (SimpleNamespace(n=[0]), lambda kept: kept.n.append(1)),
+    "an iterator": (count(), next),
+}
+
+
+@pytest.mark.parametrize("what", KEPT)
+def test_a_change_is_seen(what: str) -> None:
+    kept, change = KEPT[what]
+    module = Keeper(kept)
+    before = remembered(module)
+    assert remembered(module) == before
+    change(kept)
+    assert [name for name, value in remembered(module).items() if before.get(name) != value]
+
+
+def test_what_contains_itself_comes_to_an_end() -> None:
+    circle: list[object] = []
+    circle.append(circle)
+    assert remembered(Keeper(circle))["part._kept"] == "1 items"
+
+
+def test_what_torch_keeps_is_left_to_it() -> None:
+    module = Keeper(None)
+    before = remembered(module)
+    module.train(False)
+    module.register_forward_hook(lambda *_: None)
+    module.part.weight.data.add_(1)
+    assert remembered(module) == before
