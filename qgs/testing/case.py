@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from qgs.composer.soundness import component_fault
+from qgs.composer.yaml12 import dump
 from qgs.contracts import (
     Component,
     ComponentConfig,
@@ -77,9 +78,10 @@ class Case:
 
     @property
     def label(self) -> str:
-        """Slot and name, and the options that differ from their defaults."""
+        """Slot and name, and the options that differ from their defaults, in YAML."""
+        values = self.config.model_dump(mode="json")
         changed = [
-            f"{name}={getattr(self.config, name)}"
+            dump({name: values[name]}, flow=True).strip().removeprefix("{").removesuffix("}")
             for name, option in type(self.config).model_fields.items()
             if option.is_required() or getattr(self.config, name) != option.get_default()
         ]
