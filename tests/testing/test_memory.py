@@ -18,7 +18,7 @@ class Keeper(nn.Module):
     def __init__(self, kept: object) -> None:
         super().__init__()
         self.part = nn.Linear(2, 2)
-        self.part._kept = kept
+        vars(self.part)["_kept"] = kept
 
 
 KEPT = {
