@@ -18,7 +18,7 @@ from qgs.composer.show import dump
 from qgs.composer.slots import DEFAULT_LOSSES, SLOTS, slot_at
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
-PLUGINS = ("locus",)
+PLUGINS = ("locus", "ellipsoid")
 
 SECTIONS: tuple[tuple[str, type[ComponentConfig], str], ...] = (
     ("Top level", RecipeSettings, ""),
@@ -47,9 +47,9 @@ PLACES = {
 
 INTRODUCTION = """# Recipe reference
 
-Every key that a recipe may have, written from the options of `qgs` and `qgs-locus` when this site
-was built. Defaults are in YAML's notation. An option that nothing reads, because of another one, is
-refused unless it has its default.
+Every key that a recipe may have, written from the options of `qgs`, `qgs-locus` and `qgs-ellipsoid`
+when this site was built. Defaults are in YAML's notation. An option that nothing reads, because of
+another one, is refused unless it has its default.
 
 Besides what stands below, a recipe has `extends` (one recipe or a list, relative to the file),
 `plugins` (a list of names), `swap` (pattern of places to component) and `decoder.layers` (0-based
