@@ -85,9 +85,9 @@ def test_support_shows_the_ellipsoid_of_a_turned_anchor() -> None:
 def test_refinement_moves_only_what_it_is_told_to() -> None:
     state = _state()
     for chosen in ((True, False, False), (False, True, False), (False, False, True)):
-        told = dict(zip(("center", "rotation", "radii"), chosen, strict=True))
+        told = dict(zip(("center", "rotation", "radius"), chosen, strict=True))
         refined = EllipsoidRefinement(EllipsoidRefinement.Config(**told), DIMS)(state)
-        fields = {"center": CENTER, "rotation": ROTATION, "radii": RAW_RADII}
+        fields = {"center": CENTER, "rotation": ROTATION, "radius": RAW_RADII}
         moved = {key: not torch.equal(refined[f], state[f]) for key, f in fields.items()}
         assert moved == told
         assert refined.features is state.features
@@ -107,7 +107,8 @@ def test_a_refinement_that_starts_at_zero_can_learn() -> None:
     for name, field in state.fields.items():
         torch.testing.assert_close(refined[name], field)
     sum((refined[name] * torch.randn_like(refined[name])).sum() for name in state.fields).backward()
-    assert all(head.fc2.weight.grad.abs().sum() > 0 for head in refinement.heads.values())
+    heads = (refinement.center_mlp, refinement.rotation_mlp, refinement.radius_mlp)
+    assert all(head.fc2.weight.grad.abs().sum() > 0 for head in heads)
 
 
 def test_centers_follow_their_formula() -> None:
@@ -168,11 +169,11 @@ ANCHORED = {"queries": {"type": "ellipsoid/anchored"}}
 @pytest.mark.parametrize(
     ("options", "path", "why"),
     [
-        ({"refinement": {"center": False, "rotation": False, "radii": False}}, "", "nothing is"),
+        ({"refinement": {"center": False, "rotation": False, "radius": False}}, "", "nothing is"),
         ({"refinement": {"center_step": "linear", "input_limit": 7.0}}, ".input_limit",
          "no effect"),
         ({"refinement": {"center": False, "center_step": "linear"}}, ".center_step", "no effect"),
-        ({"refinement": {"radii": False, "radius_min": 0.5}}, ".radius_min", "no effect"),
+        ({"refinement": {"radius": False, "radius_min": 0.5}}, ".radius_min", "no effect"),
         ({"cross_attention": {"bandwidth": "fixed", "radius_min": 0.5}}, ".radius_min",
          "no effect"),
     ],

@@ -41,7 +41,7 @@ LOCUS: dict[str, Any] = {
 def _ellipsoid(radius_refined: bool, bound: str) -> dict[str, Any]:
     radius = {"radius_bound": bound}
     model, decoder = LOCUS["model"], LOCUS["model"]["decoder"]
-    refined = {"rotation": False, "radii": radius_refined, **(radius if radius_refined else {})}
+    refined = {"rotation": False, "radius": radius_refined, **(radius if radius_refined else {})}
     decoder = decoder | {
         "cross_attention": {"type": "ellipsoid/ray_biased", "gamma_init": 0.5, **radius},
         "refinement": {"type": "ellipsoid/refine", **refined},

@@ -21,7 +21,7 @@ plugin = Plugin(
         EllipsoidQueries.Config(count=8, init_radii=(0.5, 1.0, 2.0), radius_bound="offset"),
         EllipsoidCrossAttention.Config(bandwidth="fixed"),
         EllipsoidRefinement.Config(center=False, zero_init=True),
-        EllipsoidRefinement.Config(rotation=False, radii=False, center_step="linear"),
+        EllipsoidRefinement.Config(rotation=False, radius=False, center_step="linear"),
         AxisScaledCenters.Config(offset="linear"),
     ),
 )

@@ -26,7 +26,8 @@ class EllipsoidQueries(Queries):
     class Config(RadiusOptions):
         """count: N. std: of the features. center_init: where anchors start, see `locus/anchored`.
 
-        init_radii: semi-axes that every anchor starts with, along the axes of the world.
+        init_radii: softplus of the raw radii that every anchor starts with, along the axes of the
+        world: its semi-axes, but for `radius_min`.
         """
 
         count: int = Field(default=4096, ge=1)

@@ -9,11 +9,11 @@ from torch import Tensor
 
 
 def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A LocusGS state dict as one of the same recipe with `ellipsoid` components.
+    """A LocusGS state dict as one of the same recipe with ellipsoidal anchors and LocusGS's head.
 
-    Radii become three equal ones and the rotation is the identity. A refinement that changes the
-    radius changes all three by as much; for its rotation, which LocusGS lacks, the recipe says
-    `rotation: false`, or the head's initial weights are kept by loading with `strict=False`.
+    Radii become three equal ones and the rotation the identity; a refinement changes all three by
+    as much as LocusGS's changes its one. A model with `rotation: false` then is LocusGS; the head
+    of one that refines rotations is not in the result and keeps its own weights (`strict=False`).
     Raises ValueError for weights without anchors that have a radius.
     """
     if "queries.raw_radius" not in weights:
@@ -21,16 +21,11 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
             "there is no `queries.raw_radius`: the weights are of no LocusGS whose anchors have a "
             "radius; give the state dict of a model with `locus/anchored` and `radius: true`"
         )
-    converted = {_renamed(name): _tripled(name, values) for name, values in weights.items()}
+    converted = {name: _tripled(name, values) for name, values in weights.items()}
+    converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).to(weights["queries.raw_radius"])
     converted["queries.rotation"] = identity.repeat(len(weights["queries.raw_radius"]), 1)
     return converted
-
-
-def _renamed(name: str) -> str:
-    name = name.replace("queries.raw_radius", "queries.raw_radii")
-    name = name.replace("refinements.0.center_mlp.", "refinements.0.heads.center.")
-    return name.replace("refinements.0.radius_mlp.", "refinements.0.heads.radii.")
 
 
 def _tripled(name: str, values: Tensor) -> Tensor:

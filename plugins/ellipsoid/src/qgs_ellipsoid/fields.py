@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch.nn.functional as F
 from qgs_locus.fields import RadiusOptions, radius_field, support_radius
 from torch import Tensor
 
@@ -10,6 +9,7 @@ from qgs.contracts import Fields, FieldSpec
 from qgs.geometry.precision import full_precision
 from qgs.geometry.rotations import quat_to_matrix
 from qgs.types import QueryState
+from qgs_ellipsoid.rotations import unit_quats
 
 ROTATION = "ellipsoid.rotation"
 RAW_RADII = "ellipsoid.raw_radii"
@@ -21,7 +21,7 @@ ROTATION_FIELD: Fields = {
 
 
 def radii_field(options: RadiusOptions) -> Fields:
-    """Raw radii (B, N, 3), one per axis of the anchor, read as LocusGS reads its one."""
+    """Raw radii (B, N, 3) along the axes of the anchor, read as LocusGS reads its one."""
     (scalar,) = radius_field(options).values()
     return {RAW_RADII: FieldSpec((3,), encoding=scalar.encoding)}
 
@@ -34,7 +34,7 @@ def shape_fields(options: RadiusOptions) -> Fields:
 @full_precision
 def anchor_rotation(quats: Tensor) -> Tensor:
     """R (..., 3, 3), anchor to world, of quaternions (..., 4) of any length; 0 is the identity."""
-    return quat_to_matrix(F.normalize(quats, dim=-1))
+    return quat_to_matrix(unit_quats(quats))
 
 
 def anchor_axes(state: QueryState, options: RadiusOptions) -> Tensor:

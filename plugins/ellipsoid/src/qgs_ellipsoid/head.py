@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
-import torch.nn.functional as F
 from qgs_locus.fields import RadiusOptions, support_radius
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from qgs.geometry.precision import full_precision
 from qgs.geometry.rotations import quat_to_matrix
 from qgs.types import GaussianAttributes, QueryState
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, shape_fields
-from qgs_ellipsoid.rotations import quat_product
+from qgs_ellipsoid.rotations import quat_product, unit_quats
 
 
 class EllipsoidHead(GaussianHead):
@@ -41,10 +40,10 @@ class EllipsoidHead(GaussianHead):
     def forward(self, state: QueryState) -> GaussianAttributes:
         """(B, N, D) and the anchors' shapes -> attributes of (B, N, K) Gaussians."""
         local = super().forward(state)
-        turn = F.normalize(state[ROTATION], dim=-1)[:, :, None].expand_as(local.quats)
-        radii = support_radius(state[RAW_RADII], self.config)
-        along = radii_along(radii, local.quats)
-        return replace(local, quats=quat_product(turn, local.quats), scales=local.scales * along)
+        quats = unit_quats(local.quats)
+        turn = unit_quats(state[ROTATION])[:, :, None].expand_as(quats)
+        scales = local.scales * radii_along(support_radius(state[RAW_RADII], self.config), quats)
+        return replace(local, quats=quat_product(turn, quats), scales=scales)
 
 
 @full_precision

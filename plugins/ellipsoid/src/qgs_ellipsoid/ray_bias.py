@@ -51,7 +51,19 @@ def _crossed(v: Tensor) -> Tensor:
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
 
 
+def _cofactors(matrix: Tensor) -> Tensor:
+    """Cofactor matrices of (..., 3, 3)."""
+    return torch.linalg.cross(matrix.roll(-1, -1), matrix.roll(-2, -1), dim=-2)
+
+
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+
+
+def _unit(directions: Tensor) -> Tensor:
+    """Directions of length 1; the z axis for those of length 0."""
+    length = directions.norm(dim=-1, keepdim=True)
+    upward = directions.new_tensor([0.0, 0.0, 1.0])
+    return torch.where(length > 0, directions / torch.where(length > 0, length, 1), upward)
 
 
 @full_precision
@@ -59,17 +71,15 @@ def ray_features(patch_rays: Tensor, direction_eps: float = 1e-6) -> Tensor:
     """26 features of each ray, float64: (B, M, 6) -> (B, 26, M).
 
     The 20 of the numerator are the products of m, m_i d_j without their trace, and the products of
-    d; the 6 of the denominator the products of d again, or of an axis for a ray of no direction.
-    direction_eps: floor of |d| before the ray is normalised.
+    d; the 6 of the denominator those of the unit direction. direction_eps: floor of |d| before the
+    ray is normalised; a direction that stays shorter for it counts as in LocusGS's bias.
     """
     moments, directions = map(_raised, normalised_rays(patch_rays, direction_eps))
     mixed = moments[..., :, None] * directions[..., None, :]
     trace_free = [mixed[..., i, i] - mixed[..., 2, 2] for i in (0, 1)]
     trace_free += [mixed[..., i, j] for i, j in OFF_DIAGONAL]
-    upward = directions.new_tensor([0.0, 0.0, 1.0])
-    directed = torch.where(directions.square().sum(-1, keepdim=True) > 0.25, directions, upward)
     numerator = [*_products(moments), *trace_free, *_products(directions)]
-    return torch.stack([*numerator, *_products(directed)], -2)
+    return torch.stack([*numerator, *_products(_unit(directions))], -2)
 
 
 @full_precision
@@ -81,7 +91,7 @@ def anchor_features(center: Tensor, rotation: Tensor, sigma_sq: Tensor) -> tuple
     center, rotation, sigma_sq = map(_raised, (center, rotation, sigma_sq))
     metric = (rotation / sigma_sq[..., None, :]) @ rotation.mT
     # R is its own cofactor matrix but for its rounding, which this keeps out of the ratio.
-    cofactors = torch.linalg.cross(rotation.roll(-1, -1), rotation.roll(-2, -1), dim=-2)
+    cofactors = _cofactors(rotation)
     weights = sigma_sq / sigma_sq.prod(-1, keepdim=True)
     adjugate = (cofactors * weights[..., None, :]) @ cofactors.mT
     crossed = _crossed(center)
@@ -137,8 +147,8 @@ class _ClampedRatio(torch.autograd.Function):
         (gradient,) = gradients
         at_lower = ratio <= lower
         inside = gradient.masked_fill(at_lower | (ratio >= 0), 0)
-        above, below, features = (x.to(gradient) for x in factors)
-        parts = [torch.zeros_like(x) for x in (above, below, features)]
+        above, below, features = factors
+        parts = [torch.zeros_like(x) for x in factors]
         for rows in _blocks(ratio):
             fall = inside[:, rows] / (below[:, rows] @ features[:, NUMERATOR:])
             rise = -fall * ratio[:, rows]
@@ -147,8 +157,7 @@ class _ClampedRatio(torch.autograd.Function):
             if ctx.needs_input_grad[2]:
                 parts[2][:, :NUMERATOR] += above[:, rows].mT @ fall
                 parts[2][:, NUMERATOR:] += below[:, rows].mT @ rise
-        to_factors = (part.to(x) for part, x in zip(parts, factors, strict=True))
-        return (*to_factors, gradient.masked_fill(~at_lower, 0).sum(), None)
+        return (*parts, gradient.masked_fill(~at_lower, 0).sum().to(lower), None)
 
 
 def _blocks(pairs: Tensor) -> list[slice]:
@@ -168,14 +177,15 @@ def ellipsoid_bias_direct(
     gamma: Tensor,
     direction_eps: float = 1e-6,
 ) -> Tensor:
-    """`ellipsoid_bias` by its definition: rays are brought to where the ellipsoid is a unit ball.
+    """`ellipsoid_bias` by its definition, in coordinates where the ellipsoid is a unit ball.
 
-    Through (B, N, M, 3) points and directions; patch_rays (B, M, 6), not normalised.
+    There a direction is W d and the moment around the centre cof(W) (m - mu x d), with W' W = A;
+    through (B, N, M, 3) tensors. patch_rays (B, M, 6), not normalised.
     """
     moments, directions = normalised_rays(patch_rays, direction_eps)
-    nearest = torch.linalg.cross(directions, moments, dim=-1)
+    around = moments[:, None] - torch.linalg.cross(center[:, :, None], directions[:, None], dim=-1)
     whitening = (rotation / sigma_sq.sqrt()[..., None, :]).mT
-    points = torch.einsum("bnij,bnmj->bnmi", whitening, nearest[:, None] - center[:, :, None])
-    along = torch.einsum("bnij,bmj->bnmi", whitening, directions)
-    moment_sq = torch.linalg.cross(points, along, dim=-1).square().sum(-1)
-    return gamma * (-0.5 * moment_sq / along.square().sum(-1)).clamp(bias_min, 0)
+    moment = torch.einsum("bnij,bnmj->bnmi", _cofactors(whitening), around)
+    along = torch.einsum("bnij,bmj->bnmi", whitening, _unit(directions))
+    distance_sq = moment.square().sum(-1) / along.square().sum(-1)
+    return gamma * (-0.5 * distance_sq).clamp(bias_min, 0)

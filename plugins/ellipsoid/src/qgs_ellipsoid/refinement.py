@@ -23,14 +23,14 @@ class EllipsoidRefinement(Refinement):
     name: ClassVar[str] = "refine"
 
     class Config(RadiusOptions):
-        """center, rotation, radii: what is refined; the last two are the shape.
+        """center, rotation, radius: what is refined; the last two are the shape.
 
         center_step, input_limit, output_limit, zero_init: see `locus/refine`.
         """
 
         center: bool = True
         rotation: bool = True
-        radii: bool = True
+        radius: bool = True
         center_step: Literal["posact", "linear"] = "posact"
         input_limit: float | None = Field(default=100.0, gt=0)
         output_limit: float | None = Field(default=1000.0, gt=0)
@@ -40,18 +40,24 @@ class EllipsoidRefinement(Refinement):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        chosen = [name for name in ("center", "rotation", "radii") if getattr(config, name)]
-        self.heads = nn.ModuleDict({name: Mlp(dims.width, dims.width, 3) for name in chosen})
-        if config.zero_init:
-            for head in self.heads.values():
-                assert isinstance(head, Mlp)
-                nn.init.zeros_(head.fc2.weight)
-                nn.init.zeros_(head.fc2.bias)
+        if config.center:
+            self.center_mlp = self._head()
+        if config.radius:
+            self.radius_mlp = self._head()
+        if config.rotation:
+            self.rotation_mlp = self._head()
+
+    def _head(self) -> Mlp:
+        head = Mlp(self.dims.width, self.dims.width, 3)
+        if self.config.zero_init:
+            nn.init.zeros_(head.fc2.weight)
+            nn.init.zeros_(head.fc2.bias)
+        return head
 
     @classmethod
     def requires(cls, config: Config) -> Fields:
         """Whatever is refined."""
-        parts = {"center": CENTER_FIELD, "rotation": ROTATION_FIELD, "radii": radii_field(config)}
+        parts = {"center": CENTER_FIELD, "rotation": ROTATION_FIELD, "radius": radii_field(config)}
         chosen = [fields for part, fields in parts.items() if getattr(config, part)]
         return {name: spec for fields in chosen for name, spec in fields.items()}
 
@@ -64,7 +70,7 @@ class EllipsoidRefinement(Refinement):
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """Something must be refined, and every option must matter."""
         if not cls.requires(config):
-            reason = "`center`, `rotation` and `radii` are all false: nothing is refined"
+            reason = "`center`, `rotation` and `radius` are all false: nothing is refined"
             fix = "set one of them to true, or use `qgs/none` in the slot `refinement`"
             yield Problem("", reason, fix)
         if not config.center:
@@ -73,23 +79,23 @@ class EllipsoidRefinement(Refinement):
         elif config.center_step == "linear":
             idle = ("input_limit", "output_limit")
             yield from without_effect(config, idle, "`center_step` is linear")
-        if not config.radii:
-            yield from without_effect(config, ("radius_bound", "radius_min"), "`radii` is false")
+        if not config.radius:
+            yield from without_effect(config, ("radius_bound", "radius_min"), "`radius` is false")
 
     def forward(self, state: QueryState) -> QueryState:
         """A state with moved centres, turned rotations and changed raw radii."""
-        step = {name: at_least_float32(head(state.features)) for name, head in self.heads.items()}
         refined: dict[str, Tensor] = {}
-        if "center" in step:
-            refined[CENTER] = state[CENTER] + self._moved(step["center"])
-        if "rotation" in step:
-            refined[ROTATION] = turned(state[ROTATION], step["rotation"])
-        if "radii" in step:
-            refined[RAW_RADII] = state[RAW_RADII] + step["radii"]
+        if self.config.center:
+            refined[CENTER] = state[CENTER] + self._center_step(state.features)
+        if self.config.rotation:
+            refined[ROTATION] = turned(state[ROTATION], self.rotation_mlp(state.features))
+        if self.config.radius:
+            step = at_least_float32(self.radius_mlp(state.features))
+            refined[RAW_RADII] = state[RAW_RADII] + step
         return state.replace(fields=refined)
 
-    def _moved(self, step: Tensor) -> Tensor:
-        config = self.config
+    def _center_step(self, features: Tensor) -> Tensor:
+        step, config = self.center_mlp(features), self.config
         if config.center_step == "linear":
-            return step
+            return at_least_float32(step)
         return posact(step, config.input_limit, config.output_limit)

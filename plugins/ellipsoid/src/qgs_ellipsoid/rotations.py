@@ -10,6 +10,14 @@ from qgs.geometry.precision import full_precision
 
 
 @full_precision
+def unit_quats(quats: Tensor) -> Tensor:
+    """Quaternions (..., 4) of length 1; the identity for those of length 0."""
+    length = quats.norm(dim=-1, keepdim=True)
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return torch.where(length > 0, quats / torch.where(length > 0, length, 1), identity)
+
+
+@full_precision
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
     """Hamilton product (..., 4): the rotation `right`, then the rotation `left`."""
     w, v = left[..., :1], left[..., 1:]
