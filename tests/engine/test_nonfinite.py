@@ -65,8 +65,13 @@ def spoiling(call: int, value: float = NAN) -> Callable[..., Any]:
 
 
 def test_a_good_step_shows_nothing_and_keeps_no_hook(step: Step) -> None:
+    def hooks() -> list[dict]:
+        modules = step.objective.modules()
+        return [dict(kept) for m in modules for kept in (m._forward_hooks, m._forward_pre_hooks)]
+
+    before = hooks()
     assert step.first() is None
-    assert not any(m._forward_hooks or m._forward_pre_hooks for m in step.objective.modules())
+    assert hooks() == before
     assert not any(p._backward_hooks for p in step.objective.parameters())
 
 
