@@ -133,6 +133,33 @@ def test_gradients_of_factored_equal_those_of_direct() -> None:
         torch.testing.assert_close(fast, direct)
 
 
+@pytest.mark.parametrize(("depth", "longest"), [(3.0, 1e-2), (30.0, 1.0)])
+def test_gradients_keep_their_digits_in_float32(depth: float, longest: float) -> None:
+    center = torch.randn(2, 30, 3) + torch.tensor([0.0, 0.0, depth])
+    quats = torch.randn(2, 30, 4)
+    sigma_sq = torch.tensor([1e-3, 1e-3, longest]).repeat(2, 30, 1)
+    origins = 0.1 * torch.randn(2, 30, 3)
+    directions = F.normalize(center - origins + 0.03 * torch.randn(2, 30, 3), dim=-1)
+    rays = torch.cat([torch.linalg.cross(origins, directions), directions], -1)
+    weight = torch.randn(2, 30, 30)
+
+    def gradients(fast: bool, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        leaves = [x.to(dtype).requires_grad_() for x in (center, quats, sigma_sq)]
+        rotation, gamma = anchor_rotation(leaves[1]), ONE.to(dtype)
+        place = (leaves[0], rotation, leaves[2])
+        if fast:
+            bias = ellipsoid_bias(*place, ray_features(rays.to(dtype)), -1e9, gamma)
+        else:
+            bias = ellipsoid_bias_direct(*place, rays.to(dtype), -1e9, gamma)
+        return torch.autograd.grad((bias * weight.to(dtype)).sum(), leaves)
+
+    exact = gradients(fast=False, dtype=torch.float64)
+    seen, direct = (gradients(fast, torch.float32) for fast in (True, False))
+    for best, ours, theirs in zip(exact, seen, direct, strict=True):
+        error, usual = ((x - best).norm() / best.norm() for x in (ours, theirs))
+        assert error <= max(3 * usual, 1e-6)
+
+
 def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     anchors, rays = _anchors(50), ray_features(_plucker(*_lines(20)))
 
