@@ -45,6 +45,19 @@ def test_supports_around_or_behind_the_camera_have_no_outline(cameras):
     ellipses = project_support(SpatialSupport(centers, axes), cameras[:, :1])
     assert ellipses.whole.tolist() == [False, False, True]
     assert ellipses.axes.isfinite().all()
+    assert ellipses.points.isfinite().all()
+
+
+def test_a_centre_is_drawn_where_it_lies_though_its_support_reaches_behind_the_camera(cameras):
+    photo = np.full((128, 128, 3), 255, np.uint8)
+    lens, camera = cameras.intrinsics[0, 0], cameras[:, :1]
+    center = camera.c2w[0, 0, :3, :3] @ torch.tensor([0.1, 0.0, 0.5]) + camera.c2w[0, 0, :3, 3]
+    support = SpatialSupport(center[None, None], torch.eye(3)[None, None])
+    drawn = support_picture(photo, support, camera, {0: CATEGORICAL[0]})
+    rows, columns = np.nonzero((drawn.astype(int) - drawn[0, 0] != 0).any(-1))
+    scale = 128 / camera.size[1]
+    assert abs(columns.mean() + 0.5 - scale * (lens[0] * 0.2 + lens[2]).item()) < 1
+    assert abs(rows.mean() + 0.5 - scale * lens[3].item()) < 1
 
 
 def test_support_picture_draws_the_chosen_in_their_colour(cameras):

@@ -50,9 +50,9 @@ def _draw_center(
     color: Color,
     radius: float,
 ) -> None:
-    if ellipses.depths[index] <= 0 or not ellipses.whole[index]:
+    if ellipses.depths[index] <= 0:
         return
-    x, y = (ellipses.centers[index] * scale).tolist()
+    x, y = (ellipses.points[index] * scale).clamp(-1e5, 1e5).tolist()
     r = radius * OVERSAMPLING
     draw.ellipse((x - r, y - r, x + r, y + r), fill=(*color, 190))
 

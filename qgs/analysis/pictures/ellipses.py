@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from qgs.geometry.precision import full_precision
-from qgs.geometry.projection import to_camera
+from qgs.geometry.projection import to_camera, to_pixels
 from qgs.types import Cameras, SpatialSupport
 
 
@@ -16,12 +16,14 @@ from qgs.types import Cameras, SpatialSupport
 class Ellipses:
     """Outlines in one image, pixels. whole: the ellipsoid is in front of the camera, all of it.
 
-    centers: (N, 2). axes: (N, 2, 2), semi-axes as columns. depths: (N,) camera-frame z of the
-    ellipsoids' centres. Only rows where `whole` is true are ellipses.
+    centers: (N, 2) of the outlines. axes: (N, 2, 2), semi-axes as columns. Only rows where `whole`
+    is true are ellipses. points: (N, 2) the ellipsoids' own centres in the image, at camera-frame
+    z `depths` (N,); only those of positive depth mean something.
     """
 
     centers: Tensor
     axes: Tensor
+    points: Tensor
     depths: Tensor
     whole: Tensor
 
@@ -51,4 +53,6 @@ def _outlines(centers_N3: Tensor, axes_N33: Tensor, intrinsics: Tensor) -> Ellip
     shape = conic[:, :2, :2] + centers[:, :, None] * centers[:, None, :]
     lengths, directions = torch.linalg.eigh(torch.where(whole[:, None, None], shape, 0))
     axes = directions * lengths.clamp_min(0).sqrt()[:, None, :]
-    return Ellipses(centers, axes, centers_N3[:, 2], whole)
+    depths = centers_N3[:, 2]
+    in_front = torch.where(depths[:, None] > 0, centers_N3, centers_N3.new_tensor([0, 0, 1]))
+    return Ellipses(centers, axes, to_pixels(in_front, intrinsics), depths, whole)
