@@ -9,9 +9,9 @@ Counts lines of code: no blank ones, comments or docstrings. Of a component, `na
 
 from __future__ import annotations
 
+import argparse
 import ast
 import io
-import sys
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
@@ -88,8 +88,14 @@ def _lines(node: ast.AST) -> Iterator[int]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description="What the lines of a plugin are for.")
+    parser.add_argument("folder", type=Path, help="the plugin's src")
+    folder = parser.parse_args().folder
+    paths = sorted(folder.rglob("*.py"))
+    if not paths:
+        parser.error(f"there is no Python file under {folder}")
     total: Counter[str] = Counter()
-    for path in sorted(Path(sys.argv[1]).rglob("*.py")):
+    for path in paths:
         source = path.read_text(encoding="utf-8")
         known = purposes(source, path.name == "__init__.py")
         counted = Counter(known.get(line, "mathematics") for line in code_lines(source))
