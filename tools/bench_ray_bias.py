@@ -1,0 +1,79 @@
+"""The attention bias of one layer: ellipsoidal anchors against LocusGS's, in turn, in one run.
+
+    python tools/bench_ray_bias.py [--anchors 1024] [--rays 4096] [--rounds 15]
+
+Prints medians, and medians of the ratios to LocusGS round by round, without and with the backward
+pass.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from qgs_ellipsoid.fields import anchor_rotation
+from qgs_ellipsoid.ray_bias import ellipsoid_bias, ellipsoid_bias_direct
+from qgs_ellipsoid.ray_bias import ray_features as ellipsoid_features
+from qgs_locus.ray_bias import ray_bias, ray_features
+from torch import Tensor
+
+
+def biases(anchors: int, rays: int) -> dict[str, Callable[[], Tensor]]:
+    """The bias (1, N, M) by name, of the same anchors and rays."""
+    center = (torch.randn(1, anchors, 3) + torch.tensor([0.0, 0.0, 1.5])).requires_grad_()
+    rotation = anchor_rotation(torch.randn(1, anchors, 4)).requires_grad_()
+    sigma_sq = (1e-3 + 0.05 * torch.rand(1, anchors, 3)).requires_grad_()
+    origins = 0.3 * torch.randn(1, rays, 3)
+    directions = F.normalize(torch.randn(1, rays, 3), dim=-1)
+    plucker = torch.cat([torch.linalg.cross(origins, directions), directions], -1)
+    isotropic, shaped = ray_features(plucker), ellipsoid_features(plucker)
+    gamma = torch.tensor(0.1)
+    place = (center, rotation, sigma_sq)
+    return {
+        "locus": lambda: ray_bias(center, sigma_sq[..., :1], isotropic, -20.0, gamma),
+        "ellipsoid": lambda: ellipsoid_bias(*place, shaped, -20.0, gamma),
+        "ellipsoid, direct": lambda: ellipsoid_bias_direct(*place, plucker, -20.0, gamma),
+    }
+
+
+def seconds(run: Callable[[], object]) -> float:
+    """Wall-clock seconds of one call."""
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
+    """Time every run in turn, once a round, and print what came out."""
+    for run in runs.values():
+        run()
+    times = [{name: seconds(run) for name, run in runs.items()} for _ in range(rounds)]
+    for name in runs:
+        median = statistics.median(row[name] for row in times)
+        ratio = statistics.median(row[name] / row["locus"] for row in times)
+        print(f"  {name:18} {1e3 * median:8.2f} ms   {ratio:6.2f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The bias of one layer, against LocusGS's.")
+    parser.add_argument("--anchors", type=int, default=1024)
+    parser.add_argument("--rays", type=int, default=4096)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    runs = biases(options.anchors, options.rays)
+    print(f"{options.anchors} anchors, {options.rays} rays, {options.threads} threads; forward")
+    with torch.no_grad():
+        compare(dict(runs), options.rounds)
+    print("forward and backward")
+    compare({n: lambda run=run: run().sum().backward() for n, run in runs.items()}, options.rounds)
+
+
+if __name__ == "__main__":
+    main()
