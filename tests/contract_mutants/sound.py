@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -40,3 +41,13 @@ class ReadsTheFirstViewMost(ContentCrossAttention):
         values = memory.values.unflatten(2, (views, -1))
         first = (values[:, :, :1] + values).flatten(2, 3)
         return self.core(state.features, memory.keys, first)
+
+
+class LeavesItselfOut(MlpFeedForward):
+    """Stochastic depth: half of its training passes update nothing."""
+
+    name: ClassVar[str] = "leaves_itself_out"
+
+    def forward(self, features: Tensor) -> Tensor:
+        update = super().forward(features)
+        return update * (torch.rand(()) > 0.5).to(update) if self.training else update

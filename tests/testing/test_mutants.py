@@ -25,7 +25,12 @@ from contract_mutants import (
 )
 from contract_mutants.company import ALSO, BROKEN
 from contract_mutants.packaged.components.feed_forward import DeepInside
-from contract_mutants.sound import DropsOut, ReadsTheFirstViewMost, RefusesIntrinsics
+from contract_mutants.sound import (
+    DropsOut,
+    LeavesItselfOut,
+    ReadsTheFirstViewMost,
+    RefusesIntrinsics,
+)
 
 from qgs.contracts import Component
 from qgs.testing import CHECKS, Case, checks_for, run_check
@@ -221,7 +226,9 @@ def test_no_other_check_fails(component: type[Component]) -> None:
     assert failed.keys() == expected, [failed[name] for name in failed.keys() - expected]
 
 
-@pytest.mark.parametrize("component", [DropsOut, ReadsTheFirstViewMost, RefusesIntrinsics])
+@pytest.mark.parametrize(
+    "component", [DropsOut, LeavesItselfOut, ReadsTheFirstViewMost, RefusesIntrinsics]
+)
 def test_what_is_sound_passes(component: type[Component]) -> None:
     case = Case(component.Config())
     failed = [

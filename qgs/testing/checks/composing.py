@@ -11,6 +11,7 @@ from qgs.composer import RecipeError
 from qgs.composer.recipe import Recipe, resolve
 from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Fields, Plugin
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import expect
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import Maker, Sizes, required_fields
@@ -98,6 +99,7 @@ def _recipe_with(case: Case) -> dict[str, Any]:
     return {"recipe": 1, "plugins": [PLUGIN], "model": model, "losses": losses}
 
 
+@drawn_from(0)
 def run_training_step(recipe: Recipe, case: Case) -> None:
     """A forward pass, one view rendered and held against the target, and the backward pass.
 
