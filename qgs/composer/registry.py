@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 import qgs
 from qgs.composer.builtin import BUILTIN
-from qgs.composer.soundness import fault_of
+from qgs.composer.soundness import plugin_fault
 from qgs.contracts import ENTRY_POINT_GROUP, Component, ComponentConfig, Plugin
 
 
@@ -59,7 +59,10 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
     """The options that `component` has by default; None if they do not make a Config."""
     try:
         return component.Config()
-    except Exception:  # an option must be given, or the code of a stranger's validator fails
+    except (
+        Exception,
+        SystemExit,
+    ):  # an option must be given, or the code of a stranger's validator fails
         return None
 
 
@@ -156,7 +159,7 @@ def _load(entry: EntryPoint) -> InstalledPlugin:
             f"`{entry.value}`: {type(error).__name__}: {error}",
             _import_fix(entry, error),
         ) from error
-    fault = fault_of(plugin, entry.name)
+    fault = plugin_fault(plugin, entry.name)
     if fault:
         reason = f"the plugin `{entry.name}` of {distribution} {fault.reason}"
         raise PluginError(reason, fault.fix or _update(entry))

@@ -9,10 +9,20 @@ from dataclasses import dataclass
 from functools import cache
 
 from qgs.composer.slots import SLOTS
-from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Plugin, WeightLayout
+from qgs.contracts import (
+    CONTRACT_VERSION,
+    Component,
+    ComponentConfig,
+    Plugin,
+    Renderer,
+    WeightLayout,
+)
 
 NAME = re.compile(r"[^\s/]+")
 """Of a component: `type: PLUGIN/NAME` must be read as it was written."""
+
+DEVICES = ("cpu", "cuda")
+"""Types of the devices that a renderer can render on."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +36,7 @@ class Fault:
     fix: str = ""
 
 
-def fault_of(plugin: object, name: str) -> Fault | None:
+def plugin_fault(plugin: object, name: str) -> Fault | None:
     """The first fault of what the entry point `name` leads to; None for a sound plugin."""
     if not isinstance(plugin, Plugin):
         kind = type(plugin).__name__
@@ -87,7 +97,13 @@ def component_fault(component: object) -> str:
         return f"whose name {name!r} is empty or has a slash or a blank"
     if inspect.isabstract(component):
         return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
+    if issubclass(component, Renderer) and not _are_devices(component.devices):
+        return f"whose `devices` is {component.devices!r}; give some of {DEVICES} as a tuple"
     return _config_fault(component.Config)
+
+
+def _are_devices(given: object) -> bool:
+    return isinstance(given, tuple) and bool(given) and all(name in DEVICES for name in given)
 
 
 def _config_fault(config: object) -> str:

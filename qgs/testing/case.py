@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from pydantic_core import to_jsonable_python
 from torch import Tensor, nn
 
 from qgs.composer.soundness import component_fault
@@ -22,8 +23,14 @@ from qgs.contracts import (
     Renderer,
     component_of,
 )
+from qgs.testing.arguments import (
+    refuse_other_dims,
+    refuse_other_makers,
+    refuse_other_shapes,
+    refuse_other_size,
+)
 from qgs.testing.faults import CannotCheck
-from qgs.testing.wording import case_of, described
+from qgs.testing.wording import case_of, named
 
 SMALL = ModelDims(width=32, heads=2, depth=2)
 
@@ -44,7 +51,8 @@ class Case:
         of normally distributed numbers, such as `{"my.quat": lambda x: F.normalize(x, dim=-1)}`.
     state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
         pins nothing.
-    Raises TypeError for what is no options, and for those of no component that recipes could name.
+    Raises TypeError for what is no options, and for those of no component that recipes could name;
+    TypeError or ValueError for sizes, fields and shapes that are none.
     """
 
     config: ComponentConfig
@@ -55,11 +63,17 @@ class Case:
 
     def __post_init__(self) -> None:
         if inspect.isclass(self.config) or isinstance(self.config, Component):
-            raise TypeError(f"{described(self.config)} is no options; write {case_of(self.config)}")
+            raise TypeError(f"{named(self.config)} is no options; write {case_of(self.config)}")
         component = component_of(self.config)
         fault = component_fault(component)
         if fault:
             raise TypeError(f"no case can be made of {component.__qualname__}, {fault}")
+        refuse_other_dims(self.dims)
+        refuse_other_size(self.image_size)
+        refuse_other_shapes(self.state_dict)
+        if self.fields:
+            read, written = component.requires(self.config), component.provides(self.config)
+            refuse_other_makers(self.fields, {*read, *written})
 
     @property
     def component(self) -> type[Component]:
@@ -79,9 +93,8 @@ class Case:
     @property
     def label(self) -> str:
         """Slot and name, and the options that differ from their defaults, in YAML."""
-        values = self.config.model_dump(mode="json")
         changed = [
-            dump({name: values[name]}, flow=True).strip().removeprefix("{").removesuffix("}")
+            _in_yaml(name, getattr(self.config, name))
             for name, option in type(self.config).model_fields.items()
             if option.is_required() or getattr(self.config, name) != option.get_default()
         ]
@@ -134,3 +147,9 @@ class Case:
     def with_dims(self, **sizes: int) -> Case:
         """The same component in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes), state_dict=None)
+
+
+def _in_yaml(option: str, value: Any) -> str:
+    """`option: value`, of an option that recipes cannot express too."""
+    written = {option: to_jsonable_python(value, fallback=repr)}
+    return dump(written, flow=True).strip().removeprefix("{").removesuffix("}")

@@ -5,14 +5,17 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from qgs.contracts import CONTRACT_VERSION, ComponentConfig
+from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.expected import ExpectedFailures, expected_of
-from qgs.testing.registry import TIERS, Check, Tier, checks_for, tiers_given
+from qgs.testing.registry import TIERS, Check, Tier, case_given, checks_for, tiers_given
 from qgs.testing.running import CaseRun
-from qgs.testing.wording import case_of, described
+from qgs.testing.wording import case_of, named
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,17 @@ def parametrize_with_checks(
         Strict: a check that passes is a failure. A reason stands for a check that sees the contract
         broken; for one that ends with an error, write `ExpectedError(ItsClass, reason)`.
     tiers: "core", "extended". contract_version: what the components were written for.
-    Raises TypeError for what is no list of cases, or no expected failures; ValueError for no cases,
-    for no tiers or unknown ones, for expected failures that no check can be, and for another
-    contract version than the installed one.
+    Raises TypeError for what is no list of cases, no expected failures or no contract version;
+    ValueError for no cases, for no tiers or unknown ones, for expected failures that no check can
+    be, and for another contract version than the installed one; MissingExtraError without pytest.
     """
-    import pytest
-
+    pytest = _pytest()
     chosen, wanted = cases_given(cases), tiers_given(tiers)
+    if type(contract_version) is not int:
+        raise TypeError(
+            f"contract_version is {named(contract_version)}; write it as a number, such as "
+            f"contract_version={CONTRACT_VERSION}"
+        )
     if contract_version != CONTRACT_VERSION:
         raise ValueError(
             f"these tests are of contract version {contract_version}, this qgs has version "
@@ -76,17 +83,26 @@ def parametrize_with_checks(
     return pytest.mark.parametrize("check", parameters)
 
 
+def _pytest() -> ModuleType:
+    try:
+        return import_module("pytest")
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            "parametrize_with_checks needs pytest, which is not installed: run `pip install "
+            "pytest`, or make the checks with `qgs check-plugin` or qgs.testing.run_check"
+        ) from error
+
+
 def cases_given(given: Iterable[Case]) -> list[Case]:
     """At least one case; raises TypeError for what is none, ValueError where there are none."""
     if isinstance(given, Case):
         raise TypeError(f"the cases are no list but the one case {given.label}; give [Case(...)]")
     single = inspect.isclass(given) or isinstance(given, str | ComponentConfig)
     if single or not isinstance(given, Iterable):
-        raise TypeError(f"the cases are no list but {described(given)}; give [{case_of(given)}]")
+        raise TypeError(f"the cases are no list but {named(given)}; give [{case_of(given)}]")
     cases = list(given)
     for case in cases:
-        if not isinstance(case, Case):
-            raise TypeError(f"{described(case)} is no case; give {case_of(case)}")
+        case_given(case)
     if not cases:
         raise ValueError("there are no cases to check; give [Case(MyComponent.Config())]")
     return cases

@@ -10,7 +10,7 @@ from qgs.contracts import Expected, ExpectedError
 from qgs.testing.case import Case
 from qgs.testing.faults import ContractError
 from qgs.testing.registry import CHECKS
-from qgs.testing.wording import described
+from qgs.testing.wording import named
 
 ExpectedFailures: TypeAlias = Mapping[str, Expected] | Callable[[Case], Mapping[str, Expected]]
 """Check -> why it fails, for all cases, or as a function of the case."""
@@ -33,7 +33,7 @@ def expected_of(
     return [_sound(given, cases)] * len(cases)
 
 
-def fault_of(name: str, expected: Any, cases: Iterable[Case]) -> str:
+def expectation_fault(name: str, expected: Any, cases: Iterable[Case]) -> str:
     """Why the check `name` of `cases` cannot be expected to fail like this; "" if it can."""
     if name not in CHECKS:
         return f"there is no check `{name}`; {did_you_mean(str(name), CHECKS, 'checks')}"
@@ -43,18 +43,18 @@ def fault_of(name: str, expected: Any, cases: Iterable[Case]) -> str:
     if name in BASICS:
         return f"`{name}` cannot be expected to fail: the other checks would mean nothing"
     reason = expected.reason if isinstance(expected, ExpectedError) else expected
-    if not (isinstance(reason, str) and reason.strip()):
+    if reason is not None and not isinstance(reason, str):
+        return f"the expected failure of `{name}` is {named(reason)}; write the reason as a text"
+    if not (reason and reason.strip()):
         return f"the expected failure of `{name}` needs a reason"
-    if isinstance(expected, ExpectedError) and not _is_narrow(expected.error):
-        return f"the expected error of `{name}` is {expected.error!r}; name the class it is of"
-    return ""
+    return _error_fault(name, expected.error) if isinstance(expected, ExpectedError) else ""
 
 
-def is_expected(error: Exception, expected: Expected | None) -> bool:
+def is_expected(error: BaseException, expected: Expected) -> bool:
     """Whether a check that ended with `error` failed as it is known to."""
     if isinstance(expected, ExpectedError):
         return isinstance(error, expected.error)
-    return expected is not None and isinstance(error, ContractError)
+    return isinstance(error, ContractError)
 
 
 def reason_of(expected: Expected) -> str:
@@ -65,19 +65,23 @@ def reason_of(expected: Expected) -> str:
 def _sound(given: Any, cases: Sequence[Case]) -> Mapping[str, Expected]:
     if not isinstance(given, Mapping):
         raise TypeError(
-            f"the expected failures are no mapping but {described(given)}; "
+            f"the expected failures are no mapping but {named(given)}; "
             'write {"name_of_a_check": "the reason"}, or a function that gives it for a case'
         )
     for name, expected in given.items():
-        fault = fault_of(name, expected, cases)
+        fault = expectation_fault(name, expected, cases)
         if fault:
             raise ValueError(fault)
     return given
 
 
-def _is_narrow(error: Any) -> bool:
+def _error_fault(name: str, error: Any) -> str:
     kinds = error if isinstance(error, tuple) else (error,)
-    return bool(kinds) and all(
-        isinstance(kind, type) and issubclass(kind, Exception) and kind is not Exception
-        for kind in kinds
-    )
+    what = f"the expected error of `{name}` is {error!r}"
+    if not kinds or not all(isinstance(k, type) and issubclass(k, Exception) for k in kinds):
+        return f"{what}; name the class it is of"
+    if Exception in kinds:
+        return f"{what}, which every error is; name the class it is of"
+    if any(issubclass(ContractError, k) or issubclass(k, ContractError) for k in kinds):
+        return f"{what}, which a broken contract is too; give the reason alone, or another class"
+    return ""

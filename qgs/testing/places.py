@@ -14,7 +14,7 @@ SUITE = Path(__file__).parent
 TORCH = Path(torch.__file__).parent
 
 
-def raised(error: Exception, file: str | None) -> str:
+def raised(error: BaseException, file: str | None) -> str:
     """Type and message of `error`, and the place of it that the author of a component can mend.
 
     file: that defines the component, None for none. The place is the last one in its package; for

@@ -12,13 +12,13 @@ from qgs.composer.registry import (
     default_config,
     load_plugin,
 )
-from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
+from qgs.contracts import Component, ComponentConfig, Expected, ModelDims, Plugin
 from qgs.testing.case import Case
-from qgs.testing.expected import fault_of
+from qgs.testing.expected import expectation_fault
 from qgs.testing.places import file_of, raised
 from qgs.testing.registry import TIERS, Tier, checks_for, tiers_given
 from qgs.testing.running import CaseRun, Outcome
-from qgs.testing.wording import described, options_of
+from qgs.testing.wording import named, options_of
 
 DEPTHS = (2, 12)
 """Decoder depths that are tried, in turn, until the component's `problems` accepts one."""
@@ -27,8 +27,11 @@ DEPTHS = (2, 12)
 def cases_of(installed: InstalledPlugin) -> list[Case]:
     """The plugin's examples, and every component with its default options.
 
-    Raises PluginError for `examples` that are no options of its components.
+    Raises TypeError for what is no InstalledPlugin, PluginError for `examples` that are no options
+    of its components.
     """
+    if not isinstance(installed, InstalledPlugin):
+        raise TypeError(f"{named(installed)} is no installed plugin; {_loading(installed)}")
     plugin = installed.plugin
     for example in plugin.examples:
         fault = _example_fault(example, plugin.components)
@@ -70,14 +73,24 @@ def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[Outcome]:
     """Every check of every case of the plugin `name`, case by case.
 
-    Raises PluginError for a plugin that is unusable or has unsound examples or exemptions, and
-    ValueError as `tiers_given` does.
+    Raises TypeError for what is no name, PluginError for a plugin that is unusable or has unsound
+    examples or exemptions, and ValueError as `tiers_given` does.
     """
     wanted = tiers_given(tiers)
+    if not isinstance(name, str):
+        raise TypeError(f"{named(name)} is no name of a plugin; write one, such as 'locus'")
     installed = load_plugin(name)
     cases = cases_of(installed)
     runs = map(CaseRun, cases, exemptions_of(installed, cases))
     return (run.make(check) for run in runs for check in checks_for(run.case, wanted))
+
+
+def _loading(given: Any) -> str:
+    """What to write for an InstalledPlugin, after `qgs.composer.registry`'s functions."""
+    if isinstance(given, Plugin):
+        return "write cases_of(qgs.composer.registry.not_installed(plugin))"
+    name = given if isinstance(given, str) else "locus"
+    return f"write cases_of(qgs.composer.registry.load_plugin({name!r}))"
 
 
 def _fitting(config: ComponentConfig) -> Case:
@@ -90,7 +103,7 @@ def _accepts(case: Case) -> bool:
     """Whether `problems` has none; where it raises, the checks of the case tell it."""
     try:
         return not case.problems(case.size)
-    except Exception:
+    except (Exception, SystemExit):
         return False
 
 
@@ -101,33 +114,33 @@ def _lacking(component: type[Component]) -> str:
         return f"there is no default for {', '.join(required)}"
     try:
         component.Config()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return f"its default options are refused: {raised(error, file_of(component))}"
     raise AssertionError("a component with default options has a case")
 
 
 def _example_fault(example: Any, components: Sequence[type[Component]]) -> str:
     if not isinstance(example, ComponentConfig):
-        return f"{described(example)} is no options; list {options_of(example)}"
+        return f"{named(example)} is no options; list {options_of(example)}"
     component = type(example).__component__
     if component is None or component not in components:
-        return f"{described(example)} is of no component of the plugin"
+        return f"{named(example)} is of no component of the plugin"
     return ""
 
 
 def _exemption_fault(owner: Any, exempted: Any, cases: list[Case]) -> str:
     concerned = [case for case in cases if _concerns(owner, case)]
     if not concerned:
-        what = described(owner)
+        what = named(owner)
         if inspect.isclass(owner) and issubclass(owner, Component):
             return f"{what} is no component of the plugin that is checked"
         return f"{what} is neither a component of the plugin nor the options of one of its cases"
     if not isinstance(exempted, Mapping):
-        return f"those of {described(owner)} are no mapping of checks to reasons"
+        return f"those of {named(owner)} are no mapping of checks to reasons"
     for name, expected in exempted.items():
-        fault = fault_of(name, expected, concerned)
+        fault = expectation_fault(name, expected, concerned)
         if fault:
-            return f"those of {described(owner)}: {fault}"
+            return f"those of {named(owner)}: {fault}"
     return ""
 
 

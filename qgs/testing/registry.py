@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from inspect import cleandoc
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 from qgs.composer.slots import SLOTS
 from qgs.composer.suggest import did_you_mean
 from qgs.testing.case import Case
+from qgs.testing.wording import case_of, named
 
 Tier: TypeAlias = Literal["core", "extended"]
 """core: what every component needs to work at all; extended: what takes seconds for each case."""
@@ -39,7 +40,12 @@ class Check:
     contract: str
 
 
-CHECKS: dict[str, Check] = {}
+class _Checks(dict[str, Check]):
+    def __missing__(self, name: Any) -> Check:
+        raise KeyError(f"there is no check `{name}`; {did_you_mean(str(name), self, 'checks')}")
+
+
+CHECKS: dict[str, Check] = _Checks()
 
 
 def check(
@@ -57,9 +63,19 @@ def check(
 
 
 def checks_for(case: Case, tiers: Iterable[Tier] = TIERS) -> list[Check]:
-    """The checks that apply to the slot of `case`; raises ValueError as `tiers_given` does."""
+    """The checks that apply to the slot of `case`.
+
+    Raises TypeError for what is no case, ValueError as `tiers_given` does.
+    """
+    case_given(case)
     wanted = tiers_given(tiers)
     return [c for c in CHECKS.values() if case.slot in c.slots and c.tier in wanted]
+
+
+def case_given(given: Any) -> None:
+    """Raise TypeError for what is no case."""
+    if not isinstance(given, Case):
+        raise TypeError(f"{named(given)} is no case; give {case_of(given)}")
 
 
 def tiers_given(given: Iterable[Tier]) -> tuple[Tier, ...]:

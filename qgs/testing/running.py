@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from qgs.contracts import Expected, ExpectedError
 from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
-from qgs.testing.expected import BASICS, is_expected, reason_of
+from qgs.testing.expected import BASICS, expectation_fault, is_expected, reason_of
 from qgs.testing.faults import CannotCheck, ContractError
 from qgs.testing.places import file_of, raised
-from qgs.testing.registry import Check
+from qgs.testing.registry import CHECKS, Check, case_given
+from qgs.testing.wording import named
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
 
@@ -37,6 +38,11 @@ class Outcome:
     def ok(self) -> bool:
         """Whether nothing is to be mended."""
         return self.verdict not in ("failed", "unexpected pass")
+
+    @property
+    def leaves_unchecked(self) -> bool:
+        """Whether the component could not be built, or not be called, in this place."""
+        return self.verdict == "skipped" and self.check.name in BASICS and not self.cause
 
 
 class CaseRun:
@@ -67,12 +73,17 @@ class CaseRun:
 
 
 def run_check(check: Check, case: Case, expected: Expected | None = None) -> Outcome:
-    """Make `check` of `case`. expected: why it is known to fail; then a pass is a fault."""
+    """Make `check` of `case`. expected: why it is known to fail; then a pass is a fault.
+
+    Raises TypeError for what is no check or no case, ValueError for a check of other slots and for
+    what no check can be expected to fail with.
+    """
+    _refuse_others(check, case, expected)
     try:
         check.function(case)
     except (CannotCheck, MissingExtraError) as error:
         return Outcome(case, check, "skipped", str(error))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return _failed(check, case, error, expected)
     if expected is None:
         return Outcome(case, check, "passed")
@@ -81,7 +92,23 @@ def run_check(check: Check, case: Case, expected: Expected | None = None) -> Out
     return Outcome(case, check, "unexpected pass", f"{why}{reason_of(expected)}\n  fix: {fix}")
 
 
-def _failed(check: Check, case: Case, error: Exception, expected: Expected | None) -> Outcome:
+def _refuse_others(check: Any, case: Any, expected: Any) -> None:
+    if not isinstance(check, Check):
+        fix = CHECKS[check].name if isinstance(check, str) else "runs"
+        raise TypeError(f'{named(check)} is no check; give CHECKS["{fix}"], then the case')
+    case_given(case)
+    if case.slot not in check.slots:
+        slots = ", ".join(sorted(check.slots))
+        raise ValueError(
+            f"the check `{check.name}` applies to {slots}, and {case.label} is none of them; "
+            "checks_for(case) lists those that apply"
+        )
+    fault = "" if expected is None else expectation_fault(check.name, expected, [case])
+    if fault:
+        raise ValueError(fault)
+
+
+def _failed(check: Check, case: Case, error: BaseException, expected: Expected | None) -> Outcome:
     crashed = not isinstance(error, ContractError)
     seen = raised(error, file_of(case.component)) if crashed else error.seen
     if expected is not None and is_expected(error, expected):
@@ -93,7 +120,7 @@ def _failed(check: Check, case: Case, error: Exception, expected: Expected | Non
     return Outcome(case, check, "failed", told, crashed=crashed)
 
 
-def _otherwise(error: Exception, expected: Expected) -> str:
+def _otherwise(error: BaseException, expected: Expected) -> str:
     """What was expected instead of `error`, and what to write if `error` is meant."""
     if isinstance(expected, ExpectedError):
         kinds = expected.error if isinstance(expected.error, tuple) else (expected.error,)

@@ -32,7 +32,7 @@ def serve(threads: int) -> None:
         request = json.loads(line)
         try:
             answer = {"import": _import, "run": _run}[request["task"]](request)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             answer = {"error": raised(error, request["file"])}
         print(json.dumps(answer), file=out, flush=True)
 

@@ -8,7 +8,7 @@ from typing import Any
 from qgs.contracts import Component, ComponentConfig
 
 
-def described(thing: Any) -> str:
+def named(thing: Any) -> str:
     """`thing` as a message names it."""
     if inspect.isclass(thing):
         return f"the class {thing.__qualname__}"

@@ -132,6 +132,12 @@ BROKEN_PLUGINS = {
         "plugin = Plugin('bad', 1, (Half,))",
         "leaves count, forward abstract",
     ),
+    "device that is none": (
+        "from qgs.contracts import Plugin\nfrom qgs.renderers import TorchRenderer\n"
+        "class Odd(TorchRenderer):\n    name = 'odd'\n    devices = ('tpu',)\n"
+        "plugin = Plugin('bad', 1, (Odd,))",
+        "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda') as a tuple",
+    ),
     "no component": (
         "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, (int,))",
         "is no qgs component",

@@ -11,7 +11,9 @@ from qgs.cli import app
 from qgs.components import FreeCenters, GaussianHead, MlpFeedForward
 from qgs.composer.registry import InstalledPlugin, PluginError
 from qgs.contracts import CONTRACT_VERSION, ExpectedError, Plugin, ViewsConfig
+from qgs.contracts.extras import MissingExtraError
 from qgs.data import ChunksSource
+from qgs.renderers import TorchRenderer
 from qgs.testing import cases_of, check_plugin
 from qgs.testing.plugins import exemptions_of
 
@@ -33,6 +35,33 @@ class CannotJudge(MlpFeedForward):
     @classmethod
     def problems(cls, config, context):
         raise RuntimeError("no judgement today")
+
+
+class LeavesInForward(MlpFeedForward):
+    name = "leaves_in_forward"
+
+    def forward(self, features):
+        raise SystemExit(0)
+
+
+class LeavesWhenJudged(MlpFeedForward):
+    name = "leaves_when_judged"
+
+    @classmethod
+    def problems(cls, config, context):
+        raise SystemExit(0)
+
+
+class NeedsMore(MlpFeedForward):
+    name = "needs_more"
+
+    def __init__(self, config, dims):
+        raise MissingExtraError("needs_more needs numba: run `pip install qgs[cpu]`")
+
+
+class OnOtherDevices(TorchRenderer):
+    name = "on_other_devices"
+    devices = ("cuda",)
 
 
 def _installed(*components, **parts) -> InstalledPlugin:
@@ -140,6 +169,37 @@ def test_problems_that_raise_are_found_by_the_checks(monkeypatch) -> None:
     result = _report(monkeypatch, _installed(CannotJudge), "--core")
     assert result.exit_code == 1
     assert "no judgement today" in result.output
+
+
+@pytest.mark.parametrize("component", [LeavesInForward, LeavesWhenJudged])
+def test_a_component_that_leaves_the_process_fails(monkeypatch, component) -> None:
+    result = _report(monkeypatch, _installed(component, FreeCenters), "--core")
+    assert result.exit_code == 1
+    lines = result.output.splitlines()
+    assert any(line.startswith(f"FAILED feed_forward/{component.name}: ") for line in lines)
+    assert any(line.startswith("ok     centers/free: ") for line in lines)
+    assert "seen: SystemExit: 0 (raised under " in result.output
+    assert lines[-1].startswith("2 components, ")
+
+
+@pytest.mark.parametrize(
+    ("component", "why"),
+    [
+        (NeedsMore, "needs_more needs numba: run `pip install qgs[cpu]`"),
+        (OnOtherDevices, "runs on cuda alone, which is not here"),
+    ],
+)
+def test_what_cannot_be_built_here_is_not_checked(monkeypatch, component, why) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    result = _report(monkeypatch, _installed(FreeCenters, component), "--core")
+    assert result.exit_code == 1
+    lines = result.output.splitlines()
+    unchecked = [line for line in lines if line.startswith("not checked ")]
+    assert [line.split(":")[0] for line in unchecked] == [
+        f"not checked {component.slot}/{component.name}"
+    ]
+    assert any(line.startswith("  skipped: ") and line.endswith(f"checks: {why}") for line in lines)
+    assert lines[-1].endswith(", 1 not checked")
 
 
 @pytest.mark.slow

@@ -7,7 +7,15 @@ from contract_mutants.modules import Counts, ForgetsFloat64
 from torch import Tensor
 
 from qgs.components import FreeCenters, MlpFeedForward
-from qgs.testing import CHECKS, Case, ExpectedError, parametrize_with_checks, run_check
+from qgs.testing import (
+    CHECKS,
+    Case,
+    ContractError,
+    ExpectedError,
+    checks_for,
+    parametrize_with_checks,
+    run_check,
+)
 
 COUNTS = Case(Counts.Config())
 SINGLE = "float64_stays_float64"
@@ -87,12 +95,19 @@ def test_they_may_depend_on_the_case() -> None:
         ("config_is_frozen", ExpectedError(OSError, ""), "`config_is_frozen` needs a reason"),
         ("config_is_frozen", ExpectedError(Exception, "why"), "name the class it is of"),
         ("config_is_frozen", ExpectedError((), "why"), "name the class it is of"),
+        ("config_is_frozen", 3, "is 3; write the reason as a text"),
+        ("config_is_frozen", ["a"], "write the reason as a text"),
+        ("config_is_frozen", ExpectedError(AssertionError, "why"), "a broken contract is too"),
+        ("config_is_frozen", ExpectedError((OSError, ContractError), "why"), "contract is too"),
     ],
 )
 def test_those_that_cannot_be_are_refused(name, expected, message) -> None:
     for given in ({name: expected}, lambda case: {name: expected}):
         with pytest.raises(ValueError, match=message):
             parametrize_with_checks([COUNTS], expected_failures=given)
+    if expected is not None and name in {check.name for check in checks_for(COUNTS)}:
+        with pytest.raises(ValueError, match=message):
+            run_check(CHECKS[name], COUNTS, expected)
 
 
 @pytest.mark.parametrize("given", [["config_is_frozen"], "config_is_frozen", lambda case: None])
