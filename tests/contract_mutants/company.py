@@ -96,7 +96,7 @@ ALSO: Mapping[str, Mapping[str, str]] = {
     "places_queries_in_half": _because("its matrix is made on the CPU", "builds_on_meta"),
     **dict.fromkeys(
         ("drops_by_numpy", "drops_by_python", "drops_by_its_own_generator"),
-        _because("no two training passes agree", "batch_independence"),
+        _because("no two training passes agree", "batch_independence", "query_permutation"),
     ),
     "takes_roots_of_zero": _because("its gradient is nowhere a number", "batch_independence"),
     "learns_a_constant": _because("the norm of zeros is zero", "parameters_learn"),

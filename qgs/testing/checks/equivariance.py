@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -9,10 +10,11 @@ from torch import Tensor
 
 from qgs.contracts import CrossAttention, Encoder
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from, draws
 from qgs.testing.faults import expect
 from qgs.testing.modes import each_mode
 from qgs.testing.registry import MODULES, PER_QUERY, check
-from qgs.testing.subjects import QUERY_INPUTS, Inputs, Sizes, inputs_of, tracked_inputs
+from qgs.testing.subjects import QUERY_INPUTS, Inputs, Sizes, crowd_of, inputs_of, tracked_inputs
 from qgs.testing.trees import distance, floating, leaves, mapped, scalar
 from qgs.types import ImageMemory
 
@@ -32,9 +34,11 @@ def check_batch_independence(case: Case) -> None:
     Its gradient there is exactly zero, and other scenes beside it leave its numbers as they are.
     """
     module = case.lively()
-    for mode in each_mode(module):
-        _expect_no_gradient(module, tracked_inputs(case, inputs_of(case)), mode)
-        _expect_no_influence(module, inputs_of(case), inputs_of(case, seed=1), mode)
+    for sizes in (Sizes(), crowd_of(case)):
+        for mode in each_mode(module):
+            inputs, others = (inputs_of(case, sizes, seed) for seed in (0, 1))
+            _expect_no_gradient(module, tracked_inputs(case, inputs), mode)
+            _expect_no_influence(module, inputs, others, mode)
 
 
 def _expect_no_gradient(module: Any, inputs: Inputs, mode: str) -> None:
@@ -46,7 +50,7 @@ def _expect_no_gradient(module: Any, inputs: Inputs, mode: str) -> None:
     slopes = torch.autograd.grad(total, list(given.values()), allow_unused=True)
     for name, slope in zip(given, slopes, strict=True):
         leak = 0.0 if slope is None else slope[1:].abs().max().item()
-        expect(leak == 0, f"in {mode}, scene 0 has a gradient of {leak:.3g} in `{name}` of scene 1")
+        expect(leak == 0, f"in {mode}, scene 0 has a gradient of {leak:.3g} in `{name}` of others")
 
 
 def _expect_no_influence(module: Any, inputs: Inputs, others: Inputs, mode: str) -> None:
@@ -59,40 +63,70 @@ def _expect_no_influence(module: Any, inputs: Inputs, others: Inputs, mode: str)
 
 def _first_scene(module: Any, inputs: Inputs) -> Any:
     """What a module gives for scene 0, always from the same random state."""
-    with torch.random.fork_rng(devices=()), torch.no_grad():
-        torch.default_generator.manual_seed(0)
+    with drawn_from(0), torch.no_grad():
         return mapped(module(*inputs.values()), lambda _, x: x[:1])
 
 
-@check(PER_QUERY)
+@check(PER_QUERY | {"renderer", "losses"})
 def check_query_permutation(case: Case) -> None:
-    """Permuting the queries, with all their fields, permutes what is computed for them."""
-    module, inputs = case.lively(), inputs_of(case)
-    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    """Permuting the queries, with all their fields, permutes what is computed for them.
 
-    def permuted(tree: Any) -> Any:
-        return mapped(tree, lambda _, tensor: tensor[:, order])
-
-    moved = {n: permuted(x) if n in QUERY_INPUTS else x for n, x in inputs.items()}
-    expected, seen = permuted(module(*inputs.values())), module(*moved.values())
-    found = distance(expected, seen, RTOL, ATOL)
-    expect(not found, f"with permuted queries, {found}")
+    Renderings and losses stay as they are. In training too, unless that draws numbers.
+    """
+    module = case.lively()
+    for sizes in (Sizes(), crowd_of(case)):
+        inputs, order = inputs_of(case, sizes), _shuffled(sizes.queries)
+        counted = (*QUERY_INPUTS, "gaussians", "prediction")
+        moved = {n: _reordered(x, order) if n in counted else x for n, x in inputs.items()}
+        for mode, one, other in _compared(module, inputs, moved):
+            expected = _reordered(one, order) if case.slot in PER_QUERY else one
+            found = distance(expected, other, RTOL, ATOL)
+            expect(not found, f"in {mode}, with {sizes.queries} permuted queries, {found}")
 
 
 @check({"encoder", "cross_attention", "renderer", "losses"})
 def check_view_permutation(case: Case) -> None:
-    """Views have no order, unless the component declares `ordered_views`; then they have one."""
-    module, sizes = case.lively(), Sizes(views=3)
-    order, inputs = [2, 0, 1], inputs_of(case, sizes)
-    moved = {n: _permuted(x, order) if n in VIEW_INPUTS else x for n, x in inputs.items()}
-    expected = module(*inputs.values())
-    if case.slot in ("encoder", "renderer"):
-        expected = _permuted(expected, order)
-    found = distance(expected, module(*moved.values()), RTOL, ATOL)
-    if issubclass(case.component, Encoder | CrossAttention) and case.component.ordered_views:
-        expect(bool(found), "`ordered_views` is declared, but the order of the views is ignored")
-        return
-    expect(not found, f"with permuted views, {found}; declare `ordered_views` if that is meant")
+    """Views have no order, unless an encoder or a cross-attention declares `ordered_views`.
+
+    Then they have one. In training too, unless that draws numbers.
+    """
+    module, component = case.lively(), case.component
+    may_declare = issubclass(component, Encoder | CrossAttention)
+    ordered = may_declare and component.ordered_views
+    hint = "; declare `ordered_views` if that is meant" if may_declare else ""
+    for sizes in (Sizes(views=3), crowd_of(case)):
+        inputs, order = inputs_of(case, sizes), _shuffled(sizes.views)
+        moved = {n: _permuted(x, order) if n in VIEW_INPUTS else x for n, x in inputs.items()}
+        for mode, one, other in _compared(module, inputs, moved):
+            expected = _permuted(one, order) if case.slot in ("encoder", "renderer") else one
+            found = distance(expected, other, RTOL, ATOL)
+            seen = f"in {mode}, with {sizes.views} permuted views, {found}{hint}"
+            expect(ordered or not found, seen)
+            ignored = f"in {mode}, `ordered_views` is declared, but the order is ignored"
+            expect(bool(found) or not ordered, ignored)
+
+
+def _compared(module: Any, inputs: Inputs, moved: Inputs) -> Iterator[tuple[str, Any, Any]]:
+    """Each mode, and what comes of either inputs.
+
+    Not of training that draws numbers: those for one query or view are not those for another.
+    """
+    for mode in each_mode(module):
+        if mode == "training" and draws(module, *inputs.values()):
+            continue
+        with torch.no_grad():
+            yield mode, module(*inputs.values()), module(*moved.values())
+
+
+def _shuffled(count: int) -> list[int]:
+    """Every item in the place of another one."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0)).tolist()
+    return [order[(order.index(place) + 1) % count] for place in range(count)]
+
+
+def _reordered(tree: Any, order: list[int]) -> Any:
+    """A tree with a dimension of queries, or of all their Gaussians, behind that of scenes."""
+    return mapped(tree, lambda _, x: x.unflatten(1, (len(order), -1))[:, order].flatten(1, 2))
 
 
 def _permuted(tree: Any, order: list[int]) -> Any:

@@ -1,20 +1,21 @@
-"""Where the world's origin lies means nothing to images and losses."""
+"""Where the world's origin lies, and where its axes point, means nothing to images and losses."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from qgs.geometry.rotations import quat_to_matrix
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import check
 from qgs.testing.subjects import Inputs, inputs_of, is_place, required_fields
 from qgs.testing.trees import distance, mapped
 
-TURN = 0.7
+TURN = (0.8, 0.4, -0.2, 0.4)
+"""A unit quaternion, w x y z, about no axis of the world."""
 SHIFT = (0.4, -0.3, 0.6)
 
 
@@ -40,9 +41,7 @@ def check_loss_is_invariant(case: Case) -> None:
 
 def moved_world(case: Case, inputs: Inputs) -> Inputs:
     """The same scene, in another frame of the world."""
-    cosine, sine = math.cos(TURN), math.sin(TURN)
-    turn = torch.tensor([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-    shift = torch.tensor(SHIFT)
+    turn, shift = quat_to_matrix(torch.tensor(TURN)), torch.tensor(SHIFT)
     places = {name for name, spec in required_fields(case).items() if is_place(spec)}
 
     def visit(name: str, x: Tensor) -> Any:
@@ -62,7 +61,13 @@ def moved_world(case: Case, inputs: Inputs) -> Inputs:
 
 
 def _turned_quats(quats: Tensor) -> Tensor:
-    """Rotations (..., 4), w x y z, followed by one of TURN about y."""
+    """Rotations (..., 4), w x y z, followed by TURN: Hamilton's product."""
+    a, b, c, d = TURN
     w, x, y, z = quats.unbind(-1)
-    a, c = math.cos(TURN / 2), math.sin(TURN / 2)
-    return torch.stack([a * w - c * y, a * x + c * z, a * y + c * w, a * z - c * x], -1)
+    product = (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+    return torch.stack(product, -1)
