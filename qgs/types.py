@@ -207,6 +207,9 @@ class QueryState(_TensorContainer):
     def __getitem__(self, name: str) -> Tensor:
         return self.fields[name]
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.fields
+
     def replace(
         self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
     ) -> QueryState:

@@ -89,3 +89,9 @@ def test_images_of_a_rendering_have_one_size() -> None:
 def test_support_has_three_axes() -> None:
     with pytest.raises(ValueError, match=r"SpatialSupport\.axes"):
         SpatialSupport(torch.zeros(1, 2, 3), torch.zeros(1, 2, 3))
+
+
+def test_a_state_knows_its_fields_by_name() -> None:
+    state = QueryState(torch.zeros(2, 3, 4), {"place": torch.zeros(2, 3, 1)})
+    assert "place" in state
+    assert "elsewhere" not in state

@@ -31,7 +31,7 @@ def serve(threads: int) -> None:
     for line in sys.stdin:
         request = json.loads(line)
         try:
-            answer = {"import": _import, "run": _run}[request["task"]](request)
+            answer = {"import": _import, "build": _build, "run": _run}[request["task"]](request)
         except (Exception, SystemExit) as error:
             answer = {"error": raised(error, request["file"])}
         print(json.dumps(answer), file=out, flush=True)
@@ -43,30 +43,43 @@ def _import(request: dict[str, Any]) -> dict[str, Any]:
     return {"deeds": [deed.text for deed in _deeds if deed.is_done_by(package)]}
 
 
+def _build(request: dict[str, Any]) -> dict[str, Any]:
+    """Digests of the parameters and buffers of a new instance."""
+    from qgs.testing.trees import digests
+
+    return {"digests": digests(_case(request).build(request["seed"]).state_dict())}
+
+
 def _run(request: dict[str, Any]) -> dict[str, Any]:
     """Load weights into a new instance, run it on saved inputs, save the outputs."""
     import torch
     from safetensors.torch import load_file, save_file
 
-    from qgs.contracts import ModelDims
-    from qgs.testing.case import Case
     from qgs.testing.subjects import inputs_of
     from qgs.testing.trees import leaves, mapped
+
+    case = _case(request)
+    module = case.build(seed=99).eval()
+    module.load_state_dict(load_file(request["weights"]))
+    given = load_file(request["inputs"])
+    # Cloned, since numbers at an address of another alignment may be summed in another order.
+    inputs = mapped(inputs_of(case), lambda name, _: given[name].clone())
+    with torch.no_grad():
+        outputs = module(*inputs.values())
+    save_file({n: x.contiguous().clone() for n, x in leaves(outputs).items()}, request["outputs"])
+    return {}
+
+
+def _case(request: dict[str, Any]) -> Any:
+    from qgs.contracts import ModelDims
+    from qgs.testing.case import Case
 
     component: Any = _module(request)
     for name in request["class"].split("."):
         component = getattr(component, name)
     config = component.Config.model_validate_json(request["config"])
     size = request["image_size"]
-    case = Case(config, ModelDims(*request["dims"]), tuple(size) if size else None)
-    module = case.build(seed=99).eval()
-    module.load_state_dict(load_file(request["weights"]))
-    given = load_file(request["inputs"])
-    inputs = mapped(inputs_of(case), lambda name, _: given[name])
-    with torch.no_grad():
-        outputs = module(*inputs.values())
-    save_file({n: x.contiguous().clone() for n, x in leaves(outputs).items()}, request["outputs"])
-    return {}
+    return Case(config, ModelDims(*request["dims"]), tuple(size) if size else None)
 
 
 def _module(request: dict[str, Any]) -> ModuleType:
