@@ -19,7 +19,8 @@ MEMORY_FIELDS: Fields = {
 class Encoder(ModelComponent):
     """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
 
-    Runs once per forward pass. Raises ValueError for images it cannot divide into patches.
+    Runs once per forward pass. Raises ValueError for images it cannot divide into patches. A token
+    may see everything, and tells most of its own patch: that of its view, row and column.
 
     ordered_views: whether the order of the views has a meaning. Without one, permuting the views
     permutes the tokens.

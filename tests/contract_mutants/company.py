@@ -111,6 +111,8 @@ ALSO: Mapping[str, Mapping[str, str]] = {
         "duplicated_view_stays_finite",
         "inputs_are_not_changed",
     ),
+    "turns_its_grid": _because("it has no patches", "tokens_are_those_of_the_grid"),
+    "mixes_up_its_views": _because("whose values a view gets depends on order", "view_permutation"),
 }
 """Name of a mutant -> check -> why it fails that one too."""
 

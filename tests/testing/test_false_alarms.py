@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from contract_mutants.halves import TurnsInFull
 from contract_mutants.reads import PassesFieldsOn
+from contract_mutants.sound_encoders import SeesFar
 
 from qgs.components import ContentCrossAttention
 from qgs.contracts import ModelDims
@@ -19,6 +20,8 @@ THREE_HEADS = ModelDims(width=48, heads=3, depth=1)
         ("geometry_is_float32_under_autocast", Case(TurnsInFull.Config())),
         ("reads_within_requires", Case(TurnsInFull.Config())),
         ("reads_within_requires", Case(PassesFieldsOn.Config())),
+        ("tokens_are_those_of_the_grid", Case(SeesFar.Config())),
+        ("tokens_are_those_of_the_grid", Case(SeesFar.Config(depth=8, layer_scale=1.0))),
         ("saved_weights_run_elsewhere", Case(ContentCrossAttention.Config(), THREE_HEADS)),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 from contract_mutants import (
     broken,
     crowds,
+    encoding,
     halves,
     heads,
     import_io,
@@ -201,6 +202,12 @@ MUTANTS = [
     Mutant("batch_independence", crowds.MixesManyScenes, "scene 0 has a gradient"),
     Mutant("state_dict_keys", options.MovesItsNorm, "'norm.bias'", case={"state_dict": PINNED}),
     Mutant("state_dict_keys", options.HalvesItsMlp, "(128, 32)", case={"state_dict": PINNED}),
+    Mutant("patch_rays_are_those_of_the_grid", encoding.ForgetsItsRays, "differ by up to 0.9"),
+    Mutant("patch_rays_are_those_of_the_grid", encoding.RoundsItsRays, "of patches of 8 pixels"),
+    Mutant("patch_rays_are_those_of_the_grid", encoding.TurnsItsGrid, "`grid` is (2, 3, 2), whi"),
+    Mutant("tokens_are_those_of_the_grid", encoding.GoesByColumns, "token of `keys` at (1, 1, 1)"),
+    Mutant("tokens_are_those_of_the_grid", encoding.MixesUpItsViews, "`values` at (0, 0, 2)"),
+    Mutant("tokens_are_those_of_the_grid", encoding.FlipsTallImages, "with images of 24 x 16, a"),
 ]
 
 SLOW = {"compiles"}
