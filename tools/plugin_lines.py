@@ -87,21 +87,22 @@ def _lines(node: ast.AST) -> Iterator[int]:
     return iter(range(min([node.lineno, *decorators]), last + 1))
 
 
+def counted(path: Path) -> Counter[str]:
+    """Lines of code of a file by purpose."""
+    source = path.read_text(encoding="utf-8")
+    known = purposes(source, path.name == "__init__.py")
+    return Counter(known.get(line, "mathematics") for line in code_lines(source))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="What the lines of a plugin are for.")
     parser.add_argument("folder", type=Path, help="the plugin's src")
     folder = parser.parse_args().folder
-    paths = sorted(folder.rglob("*.py"))
-    if not paths:
+    files = {path.name: counted(path) for path in sorted(folder.rglob("*.py"))}
+    if not files:
         parser.error(f"there is no Python file under {folder}")
-    total: Counter[str] = Counter()
-    for path in paths:
-        source = path.read_text(encoding="utf-8")
-        known = purposes(source, path.name == "__init__.py")
-        counted = Counter(known.get(line, "mathematics") for line in code_lines(source))
-        print(f"{path.name:22}", ", ".join(f"{n} {kind}" for kind, n in counted.most_common()))
-        total += counted
-    print(f"{'in all':22}", ", ".join(f"{n} {kind}" for kind, n in total.most_common()))
+    for name, lines in {**files, "in all": sum(files.values(), Counter())}.items():
+        print(f"{name:22}", ", ".join(f"{n} {kind}" for kind, n in lines.most_common()))
 
 
 if __name__ == "__main__":
