@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import inspect
 import json
+import os
 import subprocess
 import sys
 from functools import cache
@@ -57,6 +58,7 @@ def _process() -> subprocess.Popen[str]:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        env={**os.environ, "PYTHONHASHSEED": "random"},
     )
     atexit.register(_stop, process)
     return process

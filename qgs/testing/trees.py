@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
+from hashlib import sha256
 from typing import Any
 
 import torch
@@ -107,6 +108,14 @@ def described(tensor: Tensor) -> str:
     """Shape and dtype in words."""
     shape = "x".join(map(str, tensor.shape)) or "scalar"
     return f"{shape} {str(tensor.dtype).removeprefix('torch.')}"
+
+
+def digests(tree: Any) -> dict[str, str]:
+    """A hash of the bits of every tensor."""
+    return {
+        name: sha256(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()).hexdigest()
+        for name, x in leaves(tree).items()
+    }
 
 
 def not_finite(tree: Any) -> list[str]:

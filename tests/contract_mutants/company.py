@@ -34,6 +34,7 @@ ALSO: Mapping[str, Mapping[str, str]] = {
         "requires_are_read",
         "saved_weights_run_elsewhere",
     ),
+    "draws_elsewhere": _because("nor does another process draw alike", "same_parameters_elsewhere"),
     "allocates_on_cpu": _because("nothing uses the parameter", "parameters_learn"),
     "adds_noise": _because(
         "no two passes agree",
@@ -48,7 +49,12 @@ ALSO: Mapping[str, Mapping[str, str]] = {
     "knows_six_queries": {
         "query_permutation": "its parameters have an order",
         "gradients_match_differences": "it is made with three queries",
+        "batch_independence": "it is made with two hundred queries too",
     },
+    "divides_by_baseline": _because(
+        "baselines are measured from the first view", "view_permutation"
+    ),
+    "loses_a_query_in_training": _because("it is made with 200 queries too", "query_permutation"),
     "forgets_float64": _because(
         "differences in float32 are too coarse", "gradients_match_differences"
     ),

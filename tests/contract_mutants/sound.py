@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from qgs.components import ContentCrossAttention, MlpFeedForward
+from qgs.contracts import ComponentConfig, Fields, FieldSpec, ModelDims, Queries
 from qgs.renderers import TorchRenderer
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Rendering
 
@@ -51,3 +53,38 @@ class LeavesItselfOut(MlpFeedForward):
     def forward(self, features: Tensor) -> Tensor:
         update = super().forward(features)
         return update * (torch.rand(()) > 0.5).to(update) if self.training else update
+
+
+class DecodesItsQueries(Queries):
+    """Codes of each query, and what all share: a layer, and the logarithm of a size."""
+
+    name: ClassVar[str] = "decodes_its_queries"
+
+    class Config(ComponentConfig):
+        count: int = 8
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.code = nn.Parameter(torch.randn(config.count, 16))
+        self.log_size = nn.Parameter(torch.zeros(()))
+        self.up = nn.Linear(16, dims.width)
+
+    @property
+    def count(self) -> int:
+        return self.code.shape[0]
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        return {"place.size": FieldSpec((1,))}
+
+    def forward(self, batch_size: int) -> QueryState:
+        size = self.log_size.exp().expand(batch_size, self.count, 1)
+        return QueryState(
+            self.up(self.code).expand(batch_size, -1, -1), {"place.size": size.clone()}
+        )
+
+    def resized(
+        self, learned: Mapping[str, Tensor], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        codes = super().resized({"code": learned["code"]}, generator)
+        return {**learned, **codes}

@@ -9,12 +9,15 @@ from typing import Any
 import pytest
 from contract_mutants import (
     broken,
+    composed,
     crowds,
+    drills,
     encoding,
     halves,
     heads,
     import_io,
     import_weights,
+    inner_options,
     io_mutants,
     learning,
     modules,
@@ -23,12 +26,16 @@ from contract_mutants import (
     orders,
     pictures,
     reads,
+    starts,
+    traces,
     training,
+    unusual,
     views,
 )
 from contract_mutants.company import ALSO, BROKEN
 from contract_mutants.packaged.components.feed_forward import DeepInside
 from contract_mutants.sound import (
+    DecodesItsQueries,
     DropsOut,
     LeavesItselfOut,
     ReadsTheFirstViewMost,
@@ -190,6 +197,11 @@ MUTANTS = [
     Mutant("camera_gradients_match_differences", learning.HoldsItsLens, "and gets none"),
     Mutant("camera_gradients_match_differences", learning.RefusesWhatItDeclares, "is refused"),
     Mutant("camera_gradients_match_differences", learning.DeclaresAGradientInSize, "names size"),
+    Mutant("head_gives_gaussians", starts.StartsWithoutATurn, "with initial parameters"),
+    Mutant("same_parameters_elsewhere", starts.DrawsInTheOrderOfASet, "another process draws"),
+    Mutant("head_gives_gaussians", drills.LongQuaternionsInTraining, "in training, with initial"),
+    Mutant("zeros_stay_finite", drills.DividesByLengthInTraining, "in training, with zeros"),
+    Mutant("sizes_vary", drills.LosesAQueryInTraining, "in training, with Sizes"),
     Mutant("rendering_is_invariant", orders.DarkensTheSky, "in a moved world, rgb"),
     Mutant("loss_is_invariant", orders.KnowsWhatIsUp, "in a moved world, spread"),
     Mutant("query_permutation", orders.WatchesTheFirstQuery, "6 permuted queries, size"),
@@ -208,6 +220,31 @@ MUTANTS = [
     Mutant("tokens_are_those_of_the_grid", encoding.GoesByColumns, "token of `keys` at (1, 1, 1)"),
     Mutant("tokens_are_those_of_the_grid", encoding.MixesUpItsViews, "`values` at (0, 0, 2)"),
     Mutant("tokens_are_those_of_the_grid", encoding.FlipsTallImages, "with images of 24 x 16, a"),
+    Mutant("unmet_requirement_fails_at_compose", composed.ViewsAField, "view size is not"),
+    Mutant("layout_makes_no_difference", composed.ViewsAField, "view size is not"),
+    Mutant("memo_is_of_the_memory_alone", composed.SharesItsProjection, "depends on a weight"),
+    Mutant("unmet_requirement_fails_at_compose", composed.SharesItsProjection, "layer 2 no grad"),
+    Mutant("memo_is_of_the_memory_alone", composed.KeepsTheFirstState, "depends on the state"),
+    Mutant("explanation_is_of_the_forward_pass", composed.ExplainsNoBias, "weights of query 0"),
+    Mutant("explanation_is_a_softmax", composed.ExplainsWithoutSoftmax, "off the softmax"),
+    Mutant("geometry_is_float32_under_autocast", composed.BiasesInHalfUntold, "by matmul is in"),
+    Mutant("geometry_is_float32_under_autocast", traces.KeepsItsRadiusInHalf, "place.radius: val"),
+    Mutant("geometry_is_float32_under_autocast", traces.PlacesInHalfInTraining, "in training"),
+    Mutant("writes_equal_provides", traces.WritesMoreInTraining, "in training it writes place.st"),
+    Mutant("float64_stays_float64", traces.FloatInTraining, "in training `output` is 2x6x32 fl"),
+    Mutant("gradients_match_differences", traces.CutsInTraining, "in training: Jacobian"),
+    Mutant("parameters_learn", traces.LearnsFromNoise, "no gradient reaches lift"),
+    Mutant("gradients_reach_inputs", traces.DetachesLaterGaussians, "reaches [0, 1], [1, 1]"),
+    Mutant("gradients_match_differences", traces.DetachesLaterGaussians, "Jacobian"),
+    Mutant("forward_keeps_no_state", traces.KeepsACallableMemo, "changes first.means"),
+    Mutant("forward_keeps_no_state", traces.KeepsAMemoInAClosure, "another one differs"),
+    Mutant("saved_weights_run_elsewhere", traces.KeepsAMemoForAll, "in a new process output"),
+    Mutant("outputs_share_no_memory", traces.ReturnsItsBuffer, "in the memory of `home`"),
+    Mutant("config_round_trip", inner_options.LosesAnOption, "is read again as"),
+    Mutant("config_round_trip", inner_options.RoundsOtherValues, "is read again as"),
+    Mutant("misspelt_option_is_refused", inner_options.LaxInside, "of Inner is accepted"),
+    Mutant("options_are_left_alone", inner_options.AppendsToAnOption, "when it is built, Config"),
+    Mutant("options_are_left_alone", inner_options.CountsInAnOption, "in a forward pass, Config"),
 ]
 
 SLOW = {"compiles"}
@@ -246,7 +283,20 @@ def test_no_other_check_fails(component: type[Component]) -> None:
 
 
 @pytest.mark.parametrize(
-    "component", [DropsOut, LeavesItselfOut, ReadsTheFirstViewMost, RefusesIntrinsics]
+    "component",
+    [
+        DecodesItsQueries,
+        DropsOut,
+        LeavesItselfOut,
+        ReadsTheFirstViewMost,
+        RefusesIntrinsics,
+        unusual.TurnsAutocastOff,
+        unusual.FusesInHalf,
+        unusual.LooksNowhere,
+        unusual.WeighsNothing,
+        unusual.Recurrent,
+        unusual.MovesItsState,
+    ],
 )
 def test_what_is_sound_passes(component: type[Component]) -> None:
     case = Case(component.Config())

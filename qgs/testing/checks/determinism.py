@@ -10,9 +10,10 @@ import torch
 
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
+from qgs.testing.other_process import ask
 from qgs.testing.registry import MODULES, PARAMETRIC, check
 from qgs.testing.subjects import inputs_of
-from qgs.testing.trees import cloned, difference
+from qgs.testing.trees import cloned, difference, digests
 
 
 @check(PARAMETRIC)
@@ -21,6 +22,17 @@ def check_same_seed_same_parameters(case: Case) -> None:
     first, second = (dict(case.build(seed=3).state_dict()) for _ in range(2))
     found = difference(first, second)
     expect(not found, f"two instances built from one seed differ: {found}")
+
+
+@check(PARAMETRIC)
+def check_same_parameters_elsewhere(case: Case) -> None:
+    """Another process builds the same parameters from the same seed, to the bit."""
+    theirs = ask("build", case, seed=3)["digests"]
+    ours = digests(case.build(seed=3).state_dict())
+    names = sorted(ours.keys() ^ theirs.keys())
+    expect(not names, f"of two processes, one has {', '.join(names)}, and the other has not")
+    other = [name for name in ours if ours[name] != theirs[name]]
+    expect(not other, f"from one seed, another process draws other {', '.join(other)}")
 
 
 @check(PARAMETRIC)

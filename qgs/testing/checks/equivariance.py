@@ -15,7 +15,7 @@ from qgs.testing.faults import expect
 from qgs.testing.modes import each_mode
 from qgs.testing.registry import MODULES, PER_QUERY, check
 from qgs.testing.subjects import QUERY_INPUTS, Inputs, Sizes, crowd_of, inputs_of, tracked_inputs
-from qgs.testing.trees import distance, floating, leaves, mapped, scalar
+from qgs.testing.trees import cloned, distance, floating, leaves, mapped, scalar
 from qgs.types import ImageMemory
 
 RTOL, ATOL = 1e-4, 1e-5
@@ -112,10 +112,11 @@ def _compared(module: Any, inputs: Inputs, moved: Inputs) -> Iterator[tuple[str,
     Not of training that draws numbers: those for one query or view are not those for another.
     """
     for mode in each_mode(module):
-        if mode == "training" and draws(module, *inputs.values()):
+        if mode == "training" and draws(module, *cloned(inputs).values()):
             continue
         with torch.no_grad():
-            yield mode, module(*inputs.values()), module(*moved.values())
+            one, other = (module(*cloned(given).values()) for given in (inputs, moved))
+        yield mode, one, other
 
 
 def _shuffled(count: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Nothing that a scene may bring makes a NaN."""
+"""Nothing that a scene may bring makes a NaN, in evaluation or in training."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import expect
+from qgs.testing.modes import each_mode
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import (
     QUERY_INPUTS,
@@ -30,7 +32,7 @@ def check_zeros_stay_finite(case: Case) -> None:
     _expect_finite(case, "zeros", _changed(case, lambda _, x: torch.zeros_like(x)))
 
 
-@check(MODULES - {"queries"})
+@check(MODULES - {"encoder", "queries"})
 def check_large_numbers_stay_finite(case: Case) -> None:
     """Inputs of some 1e4 give finite outputs and finite gradients."""
 
@@ -52,8 +54,13 @@ def check_coincident_queries_stay_finite(case: Case) -> None:
 
 @check({"cross_attention", "self_attention", "refinement", "head", "centers", "renderer", "losses"})
 def check_points_behind_cameras_stay_finite(case: Case) -> None:
-    """Points behind every camera, or in a camera's centre, give finite outputs and gradients."""
+    """Points behind every camera, or in a camera's centre, give finite outputs and gradients.
+
+    Of components that are given points: Gaussians, or fields of points that they require.
+    """
     places = {name for name, spec in required_fields(case).items() if is_place(spec)}
+    if not places and case.slot not in ("renderer", "losses"):
+        return
 
     def moved(z: float) -> Callable[[str, Tensor], Tensor]:
         def move(name: str, x: Tensor) -> Tensor:
@@ -97,17 +104,23 @@ def _changed(case: Case, change: Callable[[str, Tensor], Tensor]) -> Inputs:
 
 
 def _expect_finite(case: Case, what: str, inputs: Inputs) -> None:
-    module, given = case.lively(), tracked_inputs(case, inputs)
+    module = case.lively()
+    for mode in each_mode(module):
+        with drawn_from(0):
+            _expect_finite_pass(module, tracked_inputs(case, inputs), f"in {mode}, with {what}")
+
+
+def _expect_finite_pass(module: Any, given: Inputs, where: str) -> None:
     outputs = module(*given.values())
     broken = not_finite(outputs)
-    expect(not broken, f"with {what}, {', '.join(broken)} is not finite")
+    expect(not broken, f"{where}, {', '.join(broken)} is not finite")
     total = scalar(outputs)
     if not total.requires_grad:
         return
     total.backward()
     wrong = [n for n, x in floating(given).items() if _wrong(x.grad)]
     wrong += [n for n, p in module.named_parameters() if _wrong(p.grad)]
-    expect(not wrong, f"with {what}, the gradient of {', '.join(wrong)} is not finite")
+    expect(not wrong, f"{where}, the gradient of {', '.join(wrong)} is not finite")
 
 
 def _wrong(slope: Tensor | None) -> bool:

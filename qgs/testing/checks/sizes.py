@@ -7,9 +7,12 @@ from dataclasses import replace
 from typing import Any, TypeAlias
 
 import torch
+from torch import Tensor
 
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import ContractError, expect
+from qgs.testing.modes import each_mode
 from qgs.testing.places import file_of, raised
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import Maker, Sizes, inputs_of
@@ -59,13 +62,20 @@ def _expect_shapes(case: Case, varied: Iterable[Sizes]) -> None:
     for sizes in varied:
         if sizes.image and case.slot == "encoder" and case.problems(sizes.image):
             continue  # the component refuses these images, and says so
-        outputs = module(*inputs_of(case, sizes).values())
-        expected = expected_shapes(case, module, sizes)
-        seen = {name: tuple(x.shape) for name, x in leaves(outputs).items()}
-        for name, shape in expected.items():
-            expect(name in seen, f"with {sizes}, it gives no `{name}`")
-            fits = _fits(seen[name], shape)
-            expect(fits, f"with {sizes}, `{name}` is of shape {seen[name]}, not {shape}")
+        for mode in each_mode(module):
+            with drawn_from(0), torch.no_grad():
+                outputs = module(*inputs_of(case, sizes).values())
+            _expect_expected(leaves(outputs), expected_shapes(case, module, sizes), mode, sizes)
+
+
+def _expect_expected(
+    outputs: dict[str, Tensor], expected: dict[str, Shape], mode: str, sizes: Sizes
+) -> None:
+    for name, shape in expected.items():
+        expect(name in outputs, f"in {mode}, with {sizes}, it gives no `{name}`")
+        seen = tuple(outputs[name].shape)
+        told = f"in {mode}, with {sizes}, `{name}` is of shape {seen}, not {shape}"
+        expect(_fits(seen, shape), told)
 
 
 @check(MODULES - {"queries", "losses"})

@@ -2,41 +2,66 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 from qgs.contracts import Loss
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import CannotCheck, expect
+from qgs.testing.modes import each_mode
 from qgs.testing.registry import check
-from qgs.testing.subjects import inputs_of
-from qgs.testing.trees import described, difference, distance, mapped, not_finite, tracked
+from qgs.testing.subjects import inputs_of, tracked_inputs
+from qgs.testing.trees import (
+    described,
+    difference,
+    distance,
+    leaves,
+    mapped,
+    not_finite,
+    scalar,
+    tracked,
+)
+from qgs.types import GaussianAttributes
 
-LOGITS = (1.0, 100.0)
-"""Factors on the features that a head must turn into valid Gaussians."""
+LOGITS = (0.0, 1.0, 100.0)
+"""Factors on the features that a head which has learned must turn into valid Gaussians."""
 
 
 @check({"head"})
 def check_head_gives_gaussians(case: Case) -> None:
-    """Quaternions are unit, scales positive, opacities inside (0, 1), colours inside [0, 1]."""
-    module = case.lively()
+    """Quaternions are unit, scales positive, opacities inside (0, 1), colours inside [0, 1].
+
+    With initial parameters too, for ordinary features.
+    """
+    _expect_gaussians(case, case.build(), 1.0, "with initial parameters,")
     for factor in LOGITS:
-        state = inputs_of(case)["state"]
-        out = module(state.replace(factor * state.features))
-        length = out.quats.norm(dim=-1)
-        where = f"for features times {factor:g}"
-        expect(
-            torch.allclose(length, torch.ones_like(length), atol=1e-4),
-            f"{where} quaternions are {length.min():.4g} to {length.max():.4g} long",
-        )
-        expect(bool((out.scales > 0).all()), f"{where} a scale is {out.scales.min():.4g}")
-        low, high = out.opacities.min(), out.opacities.max()
-        inside = bool(low >= 0) and bool(high <= 1)
-        strict = inside and (factor > 1 or (bool(low > 0) and bool(high < 1)))
-        expect(strict, f"{where} opacities are {low:.4g} to {high:.4g}")
-        low, high = out.colors.min(), out.colors.max()
-        expect(bool(low >= 0) and bool(high <= 1), f"{where} colours are {low:.4g} to {high:.4g}")
+        _expect_gaussians(case, case.lively(), factor, f"for features times {factor:g}")
+
+
+def _expect_gaussians(case: Case, module: Any, factor: float, where: str) -> None:
+    state = inputs_of(case)["state"]
+    for mode in each_mode(module):
+        with drawn_from(0), torch.no_grad():
+            out = module(state.replace(factor * state.features))
+        _expect_valid(out, factor > 1, f"in {mode}, {where}")
+
+
+def _expect_valid(out: GaussianAttributes, saturated: bool, where: str) -> None:
+    """saturated: whether opacities may have been rounded to 0 or 1."""
+    length = out.quats.norm(dim=-1)
+    unit = torch.allclose(length, torch.ones_like(length), atol=1e-4)
+    expect(unit, f"{where} quaternions are {length.min():.4g} to {length.max():.4g} long")
+    expect(bool((out.scales > 0).all()), f"{where} a scale is {out.scales.min():.4g}")
+    low, high = out.opacities.min(), out.opacities.max()
+    inside = bool(low >= 0) and bool(high <= 1)
+    strict = inside and (saturated or (bool(low > 0) and bool(high < 1)))
+    expect(strict, f"{where} opacities are {low:.4g} to {high:.4g}")
+    low, high = out.colors.min(), out.colors.max()
+    expect(bool(low >= 0) and bool(high <= 1), f"{where} colours are {low:.4g} to {high:.4g}")
 
 
 @check({"queries"})
@@ -53,19 +78,31 @@ def check_queries_are_shared_by_scenes(case: Case) -> None:
 
 @check({"queries"})
 def check_queries_resize(case: Case) -> None:
-    """`resized` gives what this component loads, whatever number of queries was learned."""
+    """`resized` gives what this component loads, whatever number of queries was learned.
+
+    Checked of components whose option `count` says how many there are.
+    """
     module = case.build()
-    learned = module.state_dict().items()
-    fewer = {n: x[: max(len(x) // 2, 1)].clone() if x.ndim else x for n, x in learned}
-    resized = module.resized(fewer, torch.Generator().manual_seed(0))
-    other = case.build(seed=1)
-    try:
-        other.load_state_dict(resized)
-    except RuntimeError as error:
-        expect(False, f"`resized` gives what cannot be loaded: {error}")
-    for name, values in fewer.items():
-        kept = resized[name][: len(values)] if values.ndim else resized[name]
-        expect(torch.equal(kept, values), f"`resized` changes `{name}` of the first queries")
+    for count in (max(module.count // 2, 1), module.count + 3):
+        learned = dict(_of_count(case, count).build(seed=1).state_dict())
+        resized = module.resized(learned, torch.Generator().manual_seed(0))
+        try:
+            case.build(seed=2).load_state_dict(resized)
+        except RuntimeError as error:
+            expect(False, f"of {count} queries, `resized` gives what cannot be loaded: {error}")
+        for name, values in learned.items():
+            first = slice(min(len(values), len(resized[name]))) if values.ndim else ...
+            kept = torch.equal(resized[name][first], values[first])
+            expect(kept, f"of {count} queries, `resized` changes `{name}` of the first")
+
+
+def _of_count(case: Case, count: int) -> Case:
+    """The same component with another number of queries."""
+    options = case.config.model_dump(mode="json")
+    if "count" not in options:
+        raise CannotCheck("no option `count` says how many queries there are")
+    text = json.dumps({**options, "count": count})
+    return replace(case, config=type(case.config).model_validate_json(text), state_dict=None)
 
 
 @check({"supervision"})
@@ -103,7 +140,7 @@ def check_scenes_repeat(case: Case) -> None:
 @check({"renderer"})
 def check_no_gaussians_give_the_background(case: Case) -> None:
     """Without Gaussians the image is the background, finite, with finite gradients."""
-    module, inputs = case.lively(), inputs_of(case)
+    module, inputs = case.lively(), tracked_inputs(case, inputs_of(case))
     empty = tracked(mapped(inputs["gaussians"], lambda _, x: x[:, :0]))
     colour = torch.tensor([0.1, 0.6, 0.9]).to(inputs["cameras"].c2w)
     out = module(empty, inputs["cameras"], colour)
@@ -111,6 +148,12 @@ def check_no_gaussians_give_the_background(case: Case) -> None:
     expect(torch.allclose(out.rgb, backdrop, atol=1e-6), "the image is not the background")
     expect(not bool(out.alpha.any()), "alpha is not zero")
     expect(not not_finite(out), "the rendering is not finite")
+    total = scalar(out)
+    if total.requires_grad:
+        total.backward()
+    given = {**leaves(empty), **leaves(inputs["cameras"])}
+    broken = [n for n, x in given.items() if x.grad is not None and not x.grad.isfinite().all()]
+    expect(not broken, f"the gradient of {', '.join(broken)} is not finite")
 
 
 @check({"renderer"})
