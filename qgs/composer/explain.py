@@ -133,7 +133,7 @@ def _models_at(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[type[
     for step in loc:
         fields = [m.model_fields[str(step)] for m in models if str(step) in m.model_fields]
         if fields:
-            models = {model for field in fields for model in _models_in(field.annotation)}
+            models = {model for field in fields for model in models_in(field.annotation)}
         else:
             models = {model for model in models if _is_tagged(model, step)} or models
     return models
@@ -152,8 +152,9 @@ def _items_expected(config: type[BaseModel], loc: tuple[str | int, ...]) -> int:
     return max(len(get_args(annotation)) for annotation in annotations)
 
 
-def _models_in(annotation: Any) -> set[type[BaseModel]]:
+def models_in(annotation: Any) -> set[type[BaseModel]]:
+    """The (nested) configs that an option of this type can hold."""
     if get_origin(annotation) is None:
         is_model = isinstance(annotation, type) and issubclass(annotation, BaseModel)
         return {annotation} if is_model else set()
-    return {model for part in get_args(annotation) for model in _models_in(part)}
+    return {model for part in get_args(annotation) for model in models_in(part)}

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from contract_mutants.halves import TurnsInFull
+from contract_mutants.inner_options import LosesAnOption
 from contract_mutants.modules import Counts
 
 from qgs.components import MlpFeedForward
@@ -121,6 +122,10 @@ def test_what_a_case_can_have_is_taken() -> None:
     sized = Case(MlpFeedForward.Config(), image_size=(16, 24), state_dict=shapes)
     assert run_check(CHECKS["state_dict_keys"], sized).verdict == "passed"
     assert Case(TurnsInFull.Config(), fields={"place.center": abs}).fields
+
+
+def test_a_case_is_named_by_options_that_yaml_does_not_get() -> None:
+    assert Case(LosesAnOption.Config(shift=0.5)).label == "centers/loses_an_option(shift: 0.5)"
 
 
 @pytest.mark.parametrize(
