@@ -112,10 +112,12 @@ def described(tensor: Tensor) -> str:
 
 def digests(tree: Any) -> dict[str, str]:
     """A hash of the bits of every tensor."""
-    return {
-        name: sha256(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()).hexdigest()
-        for name, x in leaves(tree).items()
-    }
+    found = leaves(tree).items()
+    return {name: sha256(_bits(tensor)).hexdigest() for name, tensor in found}
+
+
+def _bits(tensor: Tensor) -> bytes:
+    return tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
 
 
 def not_finite(tree: Any) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
@@ -32,6 +33,16 @@ class RefusesIntrinsics(TorchRenderer):
         if cameras.intrinsics.requires_grad:
             raise ValueError("there is no gradient of intrinsics; detach them")
         return super().forward(gaussians, cameras, background)
+
+
+class Fades(TorchRenderer):
+    name: ClassVar[str] = "fades"
+
+    def forward(
+        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    ) -> Rendering:
+        faded = replace(gaussians, opacities=0.7 * gaussians.opacities)
+        return super().forward(faded, cameras, background)
 
 
 class ReadsTheFirstViewMost(ContentCrossAttention):

@@ -147,6 +147,7 @@ def check_no_gaussians_give_the_background(case: Case) -> None:
     backdrop = colour[:, None, None].expand_as(out.rgb)
     expect(torch.allclose(out.rgb, backdrop, atol=1e-6), "the image is not the background")
     expect(not bool(out.alpha.any()), "alpha is not zero")
+    expect(not bool(out.depth.any()), "depth is not zero")
     expect(not not_finite(out), "the rendering is not finite")
     total = scalar(out)
     if total.requires_grad:
