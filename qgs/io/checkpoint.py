@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 import qgs
-from qgs.composer import Recipe, resolve
+from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, shapes_of
 from qgs.io.tensors import CheckpointError, opened_tensors, write_tensors
@@ -21,7 +22,8 @@ from qgs.model import QueryGaussianModel
 FORMAT_VERSION = 1
 """Raised when the layout of the file changes."""
 
-_RECIPE, _PLUGINS, _CONTRACT = "qgs.recipe", "qgs.plugins", "qgs.contract_version"
+_RECIPE, _CONTRACT = "qgs.recipe", "qgs.contract_version"
+_PLUGINS, _DISTRIBUTIONS = "qgs.plugins", "qgs.distributions"
 _FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
 
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
@@ -61,9 +63,11 @@ def write_checkpoint(
 
     tensors: on the CPU, contiguous, named as by `unique_tensors`. tree: the resolved recipe.
     """
+    plugins = load_registry(set(resolve(tree).plugin_versions) - {"qgs"}).plugins
     metadata = {
         _RECIPE: json.dumps(tree),
-        _PLUGINS: json.dumps(dict(resolve(tree).plugin_versions)),
+        _PLUGINS: json.dumps({name: plugin.version for name, plugin in plugins.items()}),
+        _DISTRIBUTIONS: json.dumps({name: used.distribution for name, used in plugins.items()}),
         _CONTRACT: str(CONTRACT_VERSION),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
@@ -77,10 +81,10 @@ def load(
 ) -> QueryGaussianModel:
     """Rebuild the model that `save` wrote, on `device` (default: CPU), in evaluation mode.
 
-    Raises FileNotFoundError, CheckpointError, or the composer's error when a plugin is missing.
+    Raises FileNotFoundError, or CheckpointError, which names the releases that wrote the file
+    where a plugin is missing or another release of it cannot stand for it.
     """
-    metadata = _read_metadata(path)
-    model = resolve(json.loads(metadata[_RECIPE])).build_model()
+    model = load_recipe(path).build_model()
     with opened_tensors(path) as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     load_weights(model, tensors, str(path))
@@ -89,7 +93,11 @@ def load(
 
 def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """The recipe that a checkpoint carries. Raises as `load` does."""
-    return resolve(json.loads(_read_metadata(path)[_RECIPE]))
+    metadata = _read_metadata(path)
+    try:
+        return resolve(json.loads(metadata[_RECIPE]))
+    except RecipeError as error:
+        raise CheckpointError(f"{path} {_made_with(metadata)}\n{error}") from error
 
 
 def load_extra(path: str | os.PathLike[str]) -> dict[str, str]:
@@ -139,6 +147,20 @@ def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
         )
     _refuse_newer(path, metadata)
     return metadata
+
+
+def _made_with(metadata: Mapping[str, str]) -> str:
+    """The releases that wrote a checkpoint whose recipe fails here, and what to install."""
+    versions: dict[str, str] = json.loads(metadata.get(_PLUGINS, "{}"))
+    distributions = {"qgs": "qgs", **json.loads(metadata.get(_DISTRIBUTIONS, "{}"))}
+    available = {"qgs", *available_plugins()}
+    releases = {
+        name: f"{distributions.get(name) or f'the plugin `{name}`'} {version}"
+        for name, version in versions.items()
+    }
+    absent = [release for name, release in releases.items() if name not in available]
+    fix = f"install {', '.join(absent)}" if absent else "install those releases"
+    return f"was made with {', '.join(releases.values())}, and its recipe fails here; {fix}:"
 
 
 def _refuse_pickle(path: str | os.PathLike[str]) -> None:

@@ -54,9 +54,9 @@ def metadata_of(path: Path) -> dict[str, str]:
         return file.metadata()
 
 
-def rewrite(path: Path, tensors: dict[str, torch.Tensor] | None = None, **changed: str) -> None:
-    """Write the file again with other tensors or metadata."""
-    metadata = metadata_of(path) | changed
+def rewrite(path: Path, tensors: dict[str, torch.Tensor] | None = None, **changed: Any) -> None:
+    """Write the file again with other tensors or metadata; what is None there is left out."""
+    metadata = {k: v for k, v in (metadata_of(path) | changed).items() if v is not None}
     with safe_open(path, "pt") as file:
         own = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     save_file(own if tensors is None else tensors, path, metadata)
@@ -85,6 +85,61 @@ def test_recipe_and_versions_travel_along(model: QueryGaussianModel, saved: Path
     assert metadata["qgs.version"] == qgs.__version__
     assert metadata["qgs.contract_version"] == str(CONTRACT_VERSION)
     assert json.loads(metadata["qgs.plugins"]) == dict(resolve(model.recipe).plugin_versions)
+
+
+def test_the_distributions_of_plugins_travel_along(tmp_path: Path) -> None:
+    save(qgs.compose(RECIPES / "locus.yaml", SMALL), tmp_path / "a.safetensors")
+    metadata = metadata_of(tmp_path / "a.safetensors")
+    assert json.loads(metadata["qgs.distributions"]) == {"qgs": "qgs", "locus": "qgs-locus"}
+
+
+@pytest.fixture
+def old_locus(tmp_path: Path) -> Path:
+    """A checkpoint of LocusGS that says it was made with qgs-locus 0.0.7."""
+    path = tmp_path / "old.safetensors"
+    save(qgs.compose(RECIPES / "locus.yaml", SMALL), path)
+    versions = json.loads(metadata_of(path)["qgs.plugins"]) | {"locus": "0.0.7"}
+    rewrite(path, **{"qgs.plugins": json.dumps(versions)})
+    return path
+
+
+@pytest.fixture
+def orphan(old_locus: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """That checkpoint, where no plugin is installed."""
+    for module in ("qgs.composer.registry", "qgs.io.checkpoint"):
+        monkeypatch.setattr(f"{module}.available_plugins", dict)
+    return old_locus
+
+
+@pytest.mark.parametrize(
+    ("forgotten", "made_with"),
+    [
+        ((), "qgs-locus {}"),
+        (("qgs.distributions",), "the plugin `locus` {}"),
+    ],
+    ids=["now", "before distributions were kept"],
+)
+@pytest.mark.parametrize("read", [qgs.load, load_recipe])
+def test_a_missing_plugin_is_told_by_file_and_distribution(
+    read: Any, forgotten: tuple[str, ...], made_with: str, orphan: Path
+) -> None:
+    for key in forgotten:
+        rewrite(orphan, **{key: None})
+    with pytest.raises(CheckpointError) as caught:
+        read(orphan)
+    release = made_with.format("0.0.7")
+    first, *rest = str(caught.value).splitlines()
+    assert f"{orphan} was made with qgs {qgs.__version__}, {release}, and" in first
+    assert first.endswith(f"install {release}:")
+    assert any("no installed distribution offers a plugin `locus`" in line for line in rest)
+
+
+def test_another_release_of_a_plugin_is_told(old_locus: Path) -> None:
+    recipe = json.loads(metadata_of(old_locus)["qgs.recipe"])
+    recipe["model"]["decoder"]["refinement"]["type"] = "locus/gone_since"
+    rewrite(old_locus, **{"qgs.recipe": json.dumps(recipe)})
+    with pytest.raises(CheckpointError, match=r"qgs-locus 0\.0\.7, .*; install those releases:"):
+        qgs.load(old_locus)
 
 
 def test_extra_metadata_comes_back(model: QueryGaussianModel, tmp_path: Path) -> None:
