@@ -34,13 +34,12 @@ ALSO: Mapping[str, Mapping[str, str]] = {
         "requires_are_read",
         "saved_weights_run_elsewhere",
     ),
-    "draws_elsewhere": _because("nor does another process draw alike", "same_parameters_elsewhere"),
     "allocates_on_cpu": _because("nothing uses the parameter", "parameters_learn"),
     "adds_noise": _because(
         "no two passes agree",
         "forward_leaves_random_state",
         "query_permutation",
-        "gradients_match_differences",
+        "layout_makes_no_difference",
         "saved_weights_run_elsewhere",
         "state_dict_is_complete",
         "scene_alone_or_in_batch",
@@ -92,6 +91,7 @@ ALSO: Mapping[str, Mapping[str, str]] = {
         "forward_keeps_no_state": "the tuple is an attribute",
         **_because(
             "its length rounds differently each time",
+            "saved_weights_run_elsewhere",
             "training_draws_from_torch",
             "eval_repeats_bitwise",
         ),
@@ -102,9 +102,36 @@ ALSO: Mapping[str, Mapping[str, str]] = {
     "places_queries_in_half": _because("its matrix is made on the CPU", "builds_on_meta"),
     **dict.fromkeys(
         ("drops_by_numpy", "drops_by_python", "drops_by_its_own_generator"),
-        _because("no two training passes agree", "batch_independence", "query_permutation"),
+        _because(
+            "no two training passes agree",
+            "batch_independence",
+            "query_permutation",
+            "gradients_match_differences",
+            "forward_keeps_no_state",
+        ),
     ),
-    "takes_roots_of_zero": _because("its gradient is nowhere a number", "batch_independence"),
+    "takes_roots_of_zero": _because(
+        "its gradient is nowhere a number", "batch_independence", "gradients_match_differences"
+    ),
+    "draws_elsewhere": _because(
+        "no two instances are alike", "forward_keeps_no_state", "same_parameters_elsewhere"
+    ),
+    "misstates_alpha": _because("two depths are weighed by alpha", "depth_is_expected"),
+    "centres_on_the_batch": _because(
+        "the mean that it detaches moves", "gradients_match_differences"
+    ),
+    "mutates_in_training": _because(
+        "the next pass is given other numbers",
+        "gradients_match_differences",
+        "forward_keeps_no_state",
+    ),
+    "float_in_training": _because(
+        "differences in float32 are too coarse", "gradients_match_differences"
+    ),
+    **dict.fromkeys(
+        ("keeps_a_callable_memo", "keeps_a_memo_in_a_closure"),
+        _because("another process was called otherwise before", "saved_weights_run_elsewhere"),
+    ),
     "learns_a_constant": _because("the norm of zeros is zero", "parameters_learn"),
     "refuses_what_it_declares": _because(
         "gradients in what is declared are asked for there",
