@@ -1,27 +1,121 @@
-"""The page of equations: every row leads to code, every option that it names exists."""
+"""The page of equations: rows lead to code that has their options, constants are the defaults."""
 
 from __future__ import annotations
 
 import re
+from functools import cache
+from pkgutil import resolve_name
+from typing import Any
 
 import guide_reference
 import pytest
 import yaml
-from guide_pages import text_of
+from guide_pages import DOCS, text_of
 
-from qgs.composer.registry import Registry, load_registry
+from qgs.composer.registry import load_registry
+from qgs.composer.sections import RecipeSettings
 from qgs.composer.slots import SLOTS
-from qgs.contracts import Component
+from qgs.contracts import Component, ComponentConfig
 
-EQUATIONS, DIFFERENCES = text_of("equations.md").split("## Where paper and release differ")
+ROOT = DOCS.parent
+
+EQUATIONS, _, REST = text_of("equations.md").partition("## Where paper and release differ")
+DIFFERENCES, _, RELEASES = REST.partition("## Defaults that are not TokenGS's")
+
+ROWS = {
+    "Rays and frames (both papers)": [
+        "Plücker ray of a pixel",
+        "ray of a patch",
+        "as used for distances",
+        "world frame",
+        "scale of the world",
+        "mirroring",
+    ],
+    "Encoder (TokenGS)": ["images", "tokens", "block", "keys and values"],
+    "Decoder layer (TokenGS)": ["queries", "cross-attention", "self-attention", "MLP", "residual"],
+    "Anchors (LocusGS)": [
+        "anchor",
+        "support radius",
+        "distance to a ray",
+        "bias",
+        "cross-attention",
+        "self-attention",
+        "PE",
+        "refinement",
+        "means",
+        "means, ablation",
+    ],
+    "Ellipsoidal anchors (in neither paper)": [
+        "anchor",
+        "metric",
+        "bias",
+        "the same, in features",
+        "refinement",
+        "means",
+        "Gaussians in the anchor's frame",
+    ],
+    "Gaussians (both papers)": [
+        "position",
+        "free means",
+        "colour, scale, opacity, rotation",
+        "rendering",
+    ],
+    "Objective (both papers)": [
+        "photometric",
+        "visibility",
+        "visibility of anchors",
+        "over layers",
+        "weight decay",
+        "schedule",
+        "token tuning",
+        "growing queries",
+    ],
+    "Evaluation": ["PSNR", "SSIM", "LPIPS", "token dispersion"],
+}
+
+CONSTANTS = [
+    ("support radius", "radius_min", "softplus(ρ), {:g})"),
+    ("bias", "bias_min", "clamped to [{:g}, 0]"),
+    ("bias", "sigma_sq_min", "(σ₀ r)² at least {:g}"),
+    ("metric", "sigma_sq_min", "(σ₀ r)² at least {:g}"),
+    ("PE", "features", "{:g} features per axis"),
+    ("PE", "features", "T<sup>2k/{:g}</sup>"),
+    ("PE", "temperature", "T = {:.0f}"),
+    ("position", "input_limit", "t clamped to [-{0:g}, {0:g}]"),
+    ("position", "output_limit", "the result to [-{0:g}, {0:g}]"),
+    ("free means", "z_offset", "posact(δ) + (0, 0, {:g})"),
+    ("colour, scale, opacity, rotation", "scale_cap", "c = {:g}"),
+    ("colour, scale, opacity, rotation", "scale_input_limit", "t clamped to [-{0:g}, {0:g}]"),
+    ("colour, scale, opacity, rotation", "opacity_bias", "sigmoid(t - {:g})"),
+    ("rendering", "dilation", "dilation {:g} px²"),
+    ("photometric", "ssim_weight", "MSE + {:g} (1 - SSIM) / 2"),
+    ("visibility", "weight", "weight {:.1f}"),
+    ("visibility", "clamp", "at most {:g}"),
+    ("visibility of anchors", "weight", "weight {:g}"),
+]
+"""Name of a row, option, how the row's formula gives the option's default."""
 
 
-@pytest.fixture(scope="module")
-def registry() -> Registry:
-    return load_registry(guide_reference.PLUGINS)
+def tables(text: str, columns: int) -> dict[str, list[list[str]]]:
+    """Heading to the cells of the rows of its table, but for the table's head."""
+    found: dict[str, list[list[str]]] = {}
+    heading = ""
+    for line in text.splitlines():
+        heading = line.removeprefix("## ") if line.startswith("## ") else heading
+        if line.startswith("|") and "---" not in line:
+            row = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+            assert len(row) == columns
+            if row[0]:
+                found.setdefault(heading, []).append(row)
+    return found
 
 
-def components_of(registry: Registry) -> dict[str, list[type[Component]]]:
+EVERY_ROW = [row for rows in tables(EQUATIONS, 4).values() for row in rows]
+
+
+@cache
+def components() -> dict[str, list[type[Component]]]:
+    registry = load_registry(guide_reference.PLUGINS)
     found: dict[str, list[type[Component]]] = {}
     for slot in SLOTS:
         for name, component in registry.components(slot).items():
@@ -29,47 +123,120 @@ def components_of(registry: Registry) -> dict[str, list[type[Component]]]:
     return found
 
 
+def linked(cell: str) -> list[Any]:
+    """What the references to code in a cell lead to."""
+    names = re.findall(r"\]\[(qgs\w*\.[\w.]+)\]", cell)
+    return [resolve_name(name) for name in names]
+
+
+def owners(option: str, where: str) -> list[type[ComponentConfig]]:
+    """The Configs that have an `option` of a row: a named section's, or its linked classes'.
+
+    What is written at the top of a recipe has neither.
+    """
+    section, _, name = option.rpartition(".")
+    if section:
+        places = {title.removeprefix("model."): c for title, c, _ in guide_reference.SECTIONS}
+        places |= {s: components()[SLOTS[s].default][0].Config for s in SLOTS if s != "losses"}
+        return [places[section]]
+    if name in RecipeSettings.model_fields:
+        return [RecipeSettings]
+    return [
+        thing.Config
+        for thing in linked(where)
+        if isinstance(thing, type) and issubclass(thing, Component)
+        if name in thing.Config.model_fields
+    ]
+
+
+def test_no_row_is_lost() -> None:
+    found = {heading: [row[0] for row in rows] for heading, rows in tables(EQUATIONS, 4).items()}
+    assert found == ROWS
+
+
+@pytest.mark.parametrize("row", EVERY_ROW, ids=lambda row: row[0])
+def test_a_row_leads_to_code_that_has_its_options(row: list[str]) -> None:
+    name, formula, where, cell = row
+    assert formula, name
+    assert linked(where), name
+    for option in re.findall(r"`([\w.]+)`", cell):
+        configs = owners(option, where)
+        assert configs, f"no class that is linked has the option {option}"
+        assert all(option.rpartition(".")[2] in config.model_fields for config in configs)
+
+
+@pytest.mark.parametrize(("name", "option", "wording"), CONSTANTS)
+def test_constants_are_the_defaults(name: str, option: str, wording: str) -> None:
+    found = [row for row in EVERY_ROW if row[0] == name and f"`{option}`" in row[3]]
+    assert found
+    for _, formula, where, _ in found:
+        for config in owners(option, where):
+            default = config.model_fields[option].get_default()
+            shown = wording.format(-default if "- {" in wording else default)
+            assert shown in formula
+
+
+def test_powers_of_ten_are_the_defaults() -> None:
+    by_name = {row[0]: row[1] for row in EVERY_ROW}
+    attention, head = components()["locus/anchor_aware"][0], components()["qgs/gaussian_head"][0]
+    assert attention.Config().divisor_eps == 1e-6  # type: ignore[attr-defined]
+    assert "T<sup>2k/128</sup> + 10<sup>-6</sup>" in by_name["PE"]
+    assert head.Config().quat_eps == 1e-4  # type: ignore[attr-defined]
+    assert "max(its length, 10<sup>-4</sup>)" in by_name["colour, scale, opacity, rotation"]
+
+
 PAPERS = ("qgs/", "locus/")
 """Plugins whose components are those of the papers."""
 
 
-def rows(text: str, columns: int) -> list[list[str]]:
-    """Cells of all rows of all tables, but for their heads."""
-    lines = [line for line in text.splitlines() if line.startswith("|") and "---" not in line]
-    cells = [[c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
-    assert all(len(row) == columns for row in cells)
-    return [row for row in cells if row[0]]
-
-
-def test_every_equation_has_its_place_in_the_code() -> None:
-    for name, formula, where, _ in rows(EQUATIONS, 4):
-        assert formula, name
-        assert re.search(r"\]\[qgs\w*\.[\w.]+\]", where), name
-
-
-def test_options_named_beside_equations_exist(registry: Registry) -> None:
-    known = {name for _, config, _ in guide_reference.SECTIONS for name in config.model_fields}
-    for components in components_of(registry).values():
-        known |= {name for component in components for name in component.Config.model_fields}
-    cells = " ".join(row[3] for row in rows(EQUATIONS, 4))
-    named = {name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", cells)}
-    assert len(named) > 30
-    assert named <= known
-
-
-def test_options_that_are_a_papers_form_are_written_as_in_a_recipe(registry: Registry) -> None:
-    components = components_of(registry)
-    for name, paper, release, cell in rows(DIFFERENCES, 4):
+def test_options_that_are_a_papers_form_are_written_as_in_a_recipe() -> None:
+    (rows,) = tables(DIFFERENCES, 4).values()
+    without = [row for row in rows if row[3].startswith("none: ")]
+    assert [row[0] for row in without] == ["free means, in LocusGS's ablation"]
+    assert [row[0] for row in rows if row not in without] == [
+        "lower bound of r",
+        "input of PE",
+        "step of a centre",
+        "offset δ",
+    ]
+    for name, paper, release, cell in rows:
         assert paper != release, name
+        if cell.startswith("none: "):
+            continue
         option, *kinds = re.findall(r"`([^`]+)`", cell)
         ((key, value),) = yaml.safe_load(f"{{{option}}}").items()
         for kind in kinds:
-            (component,) = components[kind]
+            (component,) = components()[kind]
             chosen = getattr(component.Config(**{key: value}), key)
             assert chosen != component.Config.model_fields[key].get_default(), kind
         having = {
             kind
-            for kind, (c, *_) in components.items()
+            for kind, (c, *_) in components().items()
             if kind.startswith(PAPERS) and key in c.Config.model_fields
         }
         assert set(kinds) == having, f"{name}: all components with the option"
+
+
+def test_defaults_that_are_not_tokengss_are_those_of_its_recipe_taken_back() -> None:
+    base = yaml.safe_load((ROOT / "recipes/tokengs/base.yaml").read_text("utf-8"))
+    (rows,) = tables(RELEASES, 4).values()
+    listed = set()
+    for _, _, _, cell in rows:
+        *options, kind = re.findall(r"`([^`]+)`", cell)
+        (component,) = components()[kind]
+        (place,) = [p for p in base["model"].values() if isinstance(p, dict) and kind in p.values()]
+        for option in options:
+            ((key, value),) = yaml.safe_load(f"{{{option}}}").items()
+            value = float(value) if value is not None else None
+            written = place[key]
+            assert (float(written) if written is not None else None) == value
+            assert component.Config.model_fields[key].get_default() != value
+            listed.add((kind, key))
+    differing = {
+        (place["type"], key)
+        for place in (base["model"]["head"], base["model"]["centers"])
+        for key, value in place.items()
+        if key != "type"
+        if components()[place["type"]][0].Config.model_fields[key].get_default() != value
+    }
+    assert listed == differing

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import guide_errors
 import guide_reference
@@ -16,6 +20,7 @@ from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import load_registry
 from qgs.composer.slots import SLOTS
 from qgs.contracts import ComponentConfig, ModelDims
+from qgs.testing import Case, checks_for, run_check
 from qgs.types import QueryState
 
 
@@ -34,13 +39,32 @@ def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert names["image"].shape == (1, 2, 3, 32, 48)  # type: ignore[attr-defined]
 
 
-def test_code_of_the_five_ideas_runs() -> None:
-    names: dict = {}
-    for code in blocks("ideas.md", "python").values():
-        exec(code, names)
-    centers = names["NearCenters"](names["NearCenters"].Config(distance=2.0), ModelDims(16, 2, 1))
+@pytest.fixture
+def near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The component of the page of ideas, as a module that other processes can import too."""
+    name = "component_of_the_guide"
+    (tmp_path / f"{name}.py").write_text(blocks("ideas.md", "python")["near.py"])
+    monkeypatch.syspath_prepend(tmp_path)
+    yield import_module(name)
+    del sys.modules[name]
+
+
+def test_the_component_of_the_five_ideas_computes_its_formula(near: ModuleType) -> None:
+    centers = near.NearCenters(near.NearCenters.Config(distance=2.0), ModelDims(16, 2, 1))
     means = centers(torch.zeros(1, 8, 4, 3), QueryState(torch.zeros(1, 8, 16)))
     assert means.tolist() == [[[[0.0, 0.0, 2.0]] * 4] * 8]
+
+
+def test_the_component_of_the_five_ideas_keeps_its_contract(near: ModuleType) -> None:
+    case = Case(near.NearCenters.Config())
+    outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert [outcome.message for outcome in outcomes if outcome.verdict == "failed"] == []
+
+
+def test_the_other_code_of_the_five_ideas_runs() -> None:
+    code = blocks("ideas.md", "python")
+    assert set(code) == {"near.py", "state.py"}
+    exec(code["state.py"], {})
 
 
 def test_recipes_of_the_five_ideas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

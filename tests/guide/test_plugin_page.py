@@ -19,8 +19,9 @@ from guide_pages import blocks
 from qgs.cli.new_plugin import rendered
 from qgs.composer import RecipeError
 from qgs.composer.recipe import resolve
+from qgs.composer.registry import not_installed
 from qgs.contracts import ModelDims
-from qgs.testing import Case, checks_for, run_check
+from qgs.testing import cases_of, checks_for, run_check
 from qgs.types import QueryState
 
 PACKAGE = "qgs_sightline"
@@ -64,17 +65,17 @@ def test_components_and_their_test_are_short() -> None:
     code = blocks("plugin.md", "python")
     assert len(code["new: src/qgs_sightline/frustum.py"].splitlines()) < 50
     assert len(code["src/qgs_sightline/abstaining.py"].splitlines()) < 50
-    assert len(code["change: tests/test_components.py"].splitlines()) < 10
+    assert len(code["tests/test_components.py"].splitlines()) < 10
 
 
-def test_the_pages_test_checks_every_component(folder: Path, package: ModuleType) -> None:
+def test_the_pages_test_makes_the_checks_of_the_command(folder: Path, package: ModuleType) -> None:
     test = runpy.run_path(str(folder / "tests/test_components.py"))["test_contract"]
     (mark,) = test.pytestmark
-    checked = {(bound.check.name, bound.run.case.component) for (bound,) in _arguments(mark)}
+    checked = {(bound.check.name, bound.run.case.config) for (bound,) in _arguments(mark)}
     expected = {
-        (check.name, component)
-        for component in package.plugin.components
-        for check in checks_for(Case(component.Config()))
+        (check.name, case.config)
+        for case in cases_of(not_installed(package.plugin))
+        for check in checks_for(case)
     }
     assert checked == expected
 
@@ -83,10 +84,36 @@ def _arguments(mark: pytest.Mark) -> list[tuple]:
     return [tuple(getattr(value, "values", (value,))) for value in mark.args[1]]
 
 
-def test_the_second_component_keeps_its_contract(package: ModuleType) -> None:
-    case = Case(package.FrustumCenters.Config(far=5.0))
+@pytest.mark.parametrize("number", range(6))
+def test_components_keep_their_contracts(package: ModuleType, number: int) -> None:
+    cases = cases_of(not_installed(package.plugin))
+    assert len(cases) == 6, "one of each component, and one more of its examples"
+    case = cases[number]
     outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
-    assert [outcome.message for outcome in outcomes if outcome.verdict != "passed"] == []
+    assert [outcome.message for outcome in outcomes if outcome.verdict == "failed"] == []
+
+
+def test_the_field_starts_changes_and_places(package: ModuleType) -> None:
+    dims = ModelDims(16, 2, 1)
+    depth = package.depth
+    queries = depth.DepthQueries(depth.DepthQueries.Config(count=4), dims)
+    refinement = depth.DepthRefinement(depth.DepthRefinement.Config(), dims)
+    centers = depth.DepthCenters(depth.DepthCenters.Config(), dims)
+    state = refinement(queries(2))
+    learned = queries.log_depth + refinement.step(queries.features)
+    means = centers(torch.zeros(2, 4, 1, 3), state)
+    torch.testing.assert_close(means[1, :, 0, 2:], learned.clamp(-4, 4).exp())
+    assert not means[..., :2].any()
+
+
+def test_a_field_that_nothing_starts_is_refused_as_the_page_says(
+    folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert resolve("depth.yaml", plugins=[package.plugin])
+    needed = r"`sightline/deepen` needs sightline\.log_depth .*\n  fix: use `sightline/deep`"
+    with pytest.raises(RecipeError, match=needed):
+        resolve("depth.yaml", ["model.queries.type=qgs/latent"], plugins=[package.plugin])
 
 
 def test_the_second_component_computes_its_formula(package: ModuleType) -> None:
