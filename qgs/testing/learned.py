@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -20,6 +22,12 @@ LAYERS = {
     "group_norm",
     "multi_head_attention_forward",
     "scaled_dot_product_attention",
+    "gru",
+    "lstm",
+    "gru_cell",
+    "lstm_cell",
+    "rnn_tanh_cell",
+    "rnn_relu_cell",
 }
 """Functions of torch that are layers of a network, if anything in them is learned."""
 
@@ -36,28 +44,62 @@ class LearnedLayers(TorchFunctionMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.outputs: list[Any] = []
+        self.outputs: list[tuple[str, Any]] = []
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call `func` and keep what it gives."""
         given = func(*args, **(kwargs or {}))
         if _is_learned(func, tree_leaves((args, kwargs))):
-            self.outputs.append(tree_map(_copied, given))
+            self.outputs.append((func.__name__, tree_map(_copied, given)))
         return given
 
 
 class ReplayedLayers(TorchFunctionMode):
-    """Learned layers give `outputs`, in their order and raised to float32, while it is entered."""
+    """Learned layers give `outputs`, in their order and raised to float32, while it is entered.
 
-    def __init__(self, outputs: Iterable[Any]) -> None:
+    differs: whether other layers were called than those that gave the outputs; from the first such
+    one on, layers give what they compute.
+    """
+
+    def __init__(self, outputs: Sequence[tuple[str, Any]]) -> None:
         super().__init__()
-        self._outputs = iter(outputs)
+        self._left = deque(outputs)
+        self.differs = False
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func`, but for a layer."""
-        layer = _is_learned(func, tree_leaves((args, kwargs)))
-        given = next(self._outputs, None) if layer else None
-        return func(*args, **(kwargs or {})) if given is None else tree_map(_raised, given)
+        """Call `func`, and give what it gave before if it is a layer."""
+        given = func(*args, **(kwargs or {}))
+        if self.differs or not _is_learned(func, tree_leaves((args, kwargs))):
+            return given
+        name, before = self._left.popleft() if self._left else ("", None)
+        self.differs = name != func.__name__ or _shapes(before) != _shapes(given)
+        return given if self.differs else tree_map(_raised, before)
+
+
+class HalvedProducts(TorchFunctionMode):
+    """Keeps in `names` what multiplies float32 tensors, none of them learned, to half ones."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call `func` and note whether autocast took geometry to half precision."""
+        given = func(*args, **(kwargs or {}))
+        name = getattr(func, "__name__", "")
+        if name in PRODUCTS and given.dtype == torch.bfloat16:
+            factors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+            if all(x.dtype == torch.float32 and not _is_made_of_learned(x) for x in factors):
+                self.names.add(name)
+        return given
+
+
+def _is_made_of_learned(tensor: Tensor) -> bool:
+    return tensor.requires_grad or isinstance(tensor, nn.Parameter)
+
+
+def _shapes(value: Any) -> list[Any]:
+    return [x.shape for x in tree_leaves(value) if isinstance(x, Tensor)]
 
 
 def _copied(value: Any) -> Any:

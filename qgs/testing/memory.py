@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -29,17 +30,23 @@ def remembered(module: nn.Module) -> dict[str, str | bytes]:
     return found
 
 
+def is_torchs_own(part: nn.Module) -> bool:
+    """Whether torch defines the class of a module, and not who writes a component."""
+    return type(part).__module__.partition(".")[0] == "torch"
+
+
 def _data_of(owner: type) -> dict[str, Any]:
     """Attributes of a class that are neither methods nor Python's."""
     return {
         key: value
         for key, value in vars(owner).items()
-        if not key.startswith(("__", "_abc_")) and not callable(value) and not _describes(value)
+        if not key.startswith(("__", "_abc_")) and not _is_code(value)
     }
 
 
-def _describes(value: Any) -> bool:
-    return hasattr(value, "__get__")
+def _is_code(value: Any) -> bool:
+    """Whether it is a function, a class, or what describes an attribute, and no object called."""
+    return inspect.isroutine(value) or inspect.isclass(value) or hasattr(value, "__get__")
 
 
 def _entries(prefix: str, values: Mapping[str, Any]) -> dict[str, str | bytes]:
@@ -65,7 +72,7 @@ def _told(name: str, value: Any, inside: tuple[int, ...]) -> Iterator[tuple[str,
             yield from _told(f"{name}[{index}]", item, inside)
     elif isinstance(value, set | frozenset):
         yield name, str(sorted(map(repr, value)))
-    elif hasattr(value, "__dict__") and not callable(value):
+    elif hasattr(value, "__dict__") and not _is_code(value):
         yield name, type(value).__name__
         for key, item in vars(value).items():
             yield from _told(f"{name}.{key}", item, inside)

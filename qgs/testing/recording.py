@@ -54,8 +54,8 @@ class RecordedTensor(Tensor):
 
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Note the read; results are plain tensors."""
-        read = func not in METADATA
+        """Note the read; results are plain tensors, but for copies elsewhere or in a dtype."""
+        read = func not in METADATA and func is not Tensor.to
 
         def plain(value: Any) -> Any:
             if not isinstance(value, RecordedTensor):
@@ -65,7 +65,19 @@ class RecordedTensor(Tensor):
             with torch._C.DisableTorchFunctionSubclass():
                 return value.as_subclass(Tensor)
 
-        return func(*tree_map(plain, args), **tree_map(plain, kwargs or {}))
+        given = func(*tree_map(plain, args), **tree_map(plain, kwargs or {}))
+        moved = func is Tensor.to and isinstance(args[0], RecordedTensor)
+        return args[0].again(given) if moved else given
+
+    def again(self, moved: Tensor) -> RecordedTensor:
+        """The same numbers on another device or in another dtype, which count as this tensor's."""
+        return _noted(moved, self.read_as, self.readers)
+
+
+def _noted(tensor: Tensor, name: str, readers: set[str]) -> RecordedTensor:
+    note = tensor.as_subclass(RecordedTensor)
+    note.read_as, note.readers = name, readers
+    return note
 
 
 class RecordedFields(Mapping[str, Tensor]):
@@ -85,8 +97,17 @@ class RecordedFields(Mapping[str, Tensor]):
         """With other fields besides or instead."""
         return RecordedFields({**self._held, **fields}, self._absent, self._reads)
 
+    def to(self, *args: Any, **kwargs: Any) -> RecordedFields:
+        """With every field moved; none of them is looked at."""
+        moved = {name: tensor.to(*args, **kwargs) for name, tensor in self._held.items()}
+        return RecordedFields(
+            moved, lambda name: self._absent(name).to(*args, **kwargs), self._reads
+        )
+
     def __getitem__(self, name: str) -> Tensor:
         """The field, held or made up; `get` and `in` come here too."""
+        if not isinstance(name, str):
+            raise KeyError(name)
         if sys._getframe(1).f_code not in PASSING_ON:
             self._reads.asked.add(name)
         return self._held[name] if name in self._held else self._absent(name)
@@ -130,6 +151,10 @@ class RecordedState(QueryState):
         kept = self.features if features is None else features
         return RecordedState(kept, self.fields.changed(fields or {}))
 
+    def to(self, *args: Any, **kwargs: Any) -> RecordedState:
+        """As of any state."""
+        return RecordedState(self.features.to(*args, **kwargs), self.fields.to(*args, **kwargs))
+
 
 def recorded(inputs: dict[str, Any], absent: Callable[[str], Tensor]) -> tuple[Any, Reads]:
     """A copy of the inputs of a component, and what was looked at in it so far.
@@ -139,9 +164,7 @@ def recorded(inputs: dict[str, Any], absent: Callable[[str], Tensor]) -> tuple[A
     reads = Reads()
 
     def wrap(name: str, tensor: Tensor) -> Tensor:
-        note = tensor.detach().clone().as_subclass(RecordedTensor)
-        note.read_as, note.readers = name, reads.numbers
-        return note
+        return _noted(tensor.detach().clone(), name, reads.numbers)
 
     def watched(value: Any) -> Any:
         if isinstance(value, QueryState):

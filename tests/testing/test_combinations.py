@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import product
+import random
+from itertools import combinations, product
 from typing import Any
 
 import pytest
@@ -13,11 +14,14 @@ from qgs.contracts import Component, ComponentConfig, FieldSpec
 from qgs.testing import Case
 from qgs.testing.checks.composing import run_training_step
 from qgs.testing.plugins import cases_of
+from qgs.testing.subjects import Sizes
 
 SLOTS = ("queries", "cross_attention", "self_attention", "refinement", "centers", "supervision")
 LAYER = SLOTS[1:4]
 REGISTRY = load_registry(["locus"])
 DEPTH = 2
+SIZES = (Sizes(), Sizes(batch=1, views=3, image=(24, 16)))
+"""Of the views that every combination runs with."""
 
 Choice = tuple[str, type[Component], ComponentConfig]
 
@@ -42,6 +46,28 @@ PLAIN = {
     for slot, choices in CHOICES.items()
 }
 """The same, every component with its default options."""
+
+
+def _pairwise() -> list[tuple[Choice, ...]]:
+    """Combinations in which every two choices of two slots meet, few by greedy choice."""
+    counts = [range(len(choices)) for choices in CHOICES.values()]
+    combined = list(product(*counts))
+    random.Random(0).shuffle(combined)
+    left = {pair for combination in combined for pair in _pairs(combination)}
+    taken: list[tuple[int, ...]] = []
+    for gain in range(len(_pairs(combined[0])), 0, -1):
+        for combination in combined:
+            if len(_pairs(combination) & left) >= gain:
+                left -= _pairs(combination)
+                taken.append(combination)
+    return [
+        tuple(choices[index] for choices, index in zip(CHOICES.values(), combination, strict=True))
+        for combination in taken
+    ]
+
+
+def _pairs(combination: tuple[int, ...]) -> frozenset[tuple[tuple[int, int], ...]]:
+    return frozenset(combinations(enumerate(combination), 2))
 
 
 def _names(parts: tuple[Choice, ...]) -> str:
@@ -110,7 +136,9 @@ def test_a_combination_runs_or_is_refused(parts: tuple[Choice, ...]) -> None:
     chosen = dict(zip(SLOTS, parts, strict=True))
     unmet = _unmet(chosen)
     if not unmet:
-        run_training_step(resolve(_recipe(chosen)), Case(chosen["queries"][2]))
+        recipe = resolve(_recipe(chosen))
+        for sizes in SIZES:
+            run_training_step(recipe, Case(chosen["queries"][2]), sizes)
         return
     with pytest.raises(RecipeError) as refusal:
         resolve(_recipe(chosen))
@@ -118,6 +146,11 @@ def test_a_combination_runs_or_is_refused(parts: tuple[Choice, ...]) -> None:
     for kind, fields in unmet.items():
         assert f"`{kind}`" in told
         assert all(field in told for field in fields)
+
+
+@pytest.mark.parametrize("parts", _pairwise(), ids=_names)
+def test_every_two_options_run_together_or_are_refused(parts: tuple[Choice, ...]) -> None:
+    test_a_combination_runs_or_is_refused(parts)
 
 
 @pytest.mark.slow

@@ -21,7 +21,13 @@ class Keeper(nn.Module):
         vars(self.part)["_kept"] = kept
 
 
+class Callable(SimpleNamespace):
+    def __call__(self) -> None:
+        self.calls += 1
+
+
 KEPT = {
+    "what an object counts that is called": (Callable(calls=0), lambda kept: kept()),
     "a list that grows": ([], lambda kept: kept.append(0)),
     "a number in a nested list": ({"a": [[1]]}, lambda kept: kept["a"][0].__setitem__(0, 2)),
     "a queue of constant length": (deque([1, 2], maxlen=2), lambda kept: kept.append(3)),

@@ -10,6 +10,7 @@ from torch import nn
 from qgs.testing.audit import watched
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
+from qgs.testing.memory import is_torchs_own
 from qgs.testing.other_process import ask
 from qgs.testing.places import package_of
 from qgs.testing.registry import ALL_SLOTS, PARAMETRIC, check
@@ -30,16 +31,14 @@ def check_builds_on_meta(case: Case) -> None:
 
 @check(PARAMETRIC)
 def check_registers_its_parameters(case: Case) -> None:
-    """Every tensor that a component keeps is a parameter or a buffer, so that it moves along."""
+    """Every tensor that a component keeps is a parameter or a buffer, so that it moves along.
+
+    Torch's own layers may list their parameters a second time, as its recurrent ones do.
+    """
     module = case.build()
     for name, part in module.named_modules():
         kept = [key for key, value in vars(part).items() if isinstance(value, torch.Tensor)]
-        hidden = [
-            key
-            for key, value in vars(part).items()
-            if isinstance(value, list | tuple)
-            and any(isinstance(item, torch.Tensor | nn.Module) for item in value)
-        ]
+        hidden = [] if is_torchs_own(part) else _lists_of_tensors(part)
         where = f"{name or 'the component'} keeps {', '.join(kept + hidden)}"
         expect(not kept + hidden, f"{where} outside of its parameters, buffers and modules")
 
@@ -59,6 +58,16 @@ def check_import_does_no_io(case: Case) -> None:
     """Importing the package touches no file but code, opens no connection, starts no process."""
     deeds = ask("import", case)["deeds"]
     expect(not deeds, f"while {case.component.__module__} is imported: {_listed(deeds)}")
+
+
+def _lists_of_tensors(part: nn.Module) -> list[str]:
+    """Names of the lists and tuples that a module keeps tensors or modules in."""
+    return [
+        key
+        for key, value in vars(part).items()
+        if isinstance(value, list | tuple)
+        and any(isinstance(item, torch.Tensor | nn.Module) for item in value)
+    ]
 
 
 def _listed(deeds: list[str]) -> str:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import expect
 from qgs.testing.memory import remembered
 from qgs.testing.modes import each_mode
@@ -34,11 +37,14 @@ def check_inputs_are_not_changed(case: Case) -> None:
 
 @check(MODULES - {"queries"})
 def check_outputs_share_no_memory(case: Case) -> None:
-    """What a component computes lies in memory of its own: not in its inputs' or parameters'."""
+    """What a component computes lies in memory of its own: not in that of its inputs or weights.
+
+    Buffers are weights here.
+    """
     module, inputs = case.lively(), inputs_of(case)
     outputs = leaves(module(*inputs.values()))
     taken = {x.untyped_storage().data_ptr(): n for n, x in leaves(inputs).items() if x.numel()}
-    taken |= {p.untyped_storage().data_ptr(): n for n, p in module.named_parameters()}
+    taken |= {x.untyped_storage().data_ptr(): n for n, x in _tensors(module).items()}
     provided = {f"fields.{name}" for name in case.component.provides(case.config)}
     for name, tensor in outputs.items():
         if case.slot == "refinement" and name not in provided:
@@ -51,8 +57,9 @@ def check_outputs_share_no_memory(case: Case) -> None:
 def check_forward_keeps_no_state(case: Case) -> None:
     """A forward pass leaves no trace: in no parameter, buffer or attribute, a private one or not.
 
-    In training as in evaluation. What is to be computed once for all layers belongs into
-    `ImageMemory.once`, what depends on sizes alone into a function of them.
+    In training as in evaluation; the next pass gives what it gives as the first one. What is to be
+    computed once for all layers belongs into `ImageMemory.once`, what depends on sizes alone into a
+    function of them.
     """
     module = case.lively()
     for mode in each_mode(module):
@@ -63,12 +70,32 @@ def check_forward_keeps_no_state(case: Case) -> None:
         now = remembered(module)
         changed = sorted(n for n in kept.keys() | now.keys() if kept.get(n) != now.get(n))
         expect(not changed, f"a forward pass in {mode} changes {', '.join(changed)}")
+        _expect_first_equals_later(case, module, mode)
+
+
+def _expect_first_equals_later(case: Case, module: Any, mode: str) -> None:
+    """What an instance gives that was called before is what a new one gives."""
+    inputs = inputs_of(case, seed=1)
+    fresh = case.lively().train(mode == "training")
+    outputs = []
+    for instance in (fresh, module):
+        with drawn_from(0), torch.no_grad():
+            outputs.append(instance(*inputs.values()))
+    found = difference(*outputs)
+    expect(not found, f"after a forward pass in {mode} another one differs: {found}")
 
 
 @check({"refinement", "queries"})
 def check_writes_equal_provides(case: Case) -> None:
     """The fields that are written are those in `provides`, in the shape and dtype given there."""
-    module, inputs = case.lively(), inputs_of(case)
+    module = case.lively()
+    for mode in each_mode(module):
+        with drawn_from(0):
+            _expect_declared(case, module, mode)
+
+
+def _expect_declared(case: Case, module: Any, mode: str) -> None:
+    inputs = inputs_of(case)
     before: dict[str, Tensor] = {}
     if case.slot == "refinement":
         state = inputs["state"]
@@ -79,16 +106,17 @@ def check_writes_equal_provides(case: Case) -> None:
     expect(isinstance(output, QueryState), f"it gives a {type(output).__name__}")
     provided = case.component.provides(case.config)
     written = {n for n, x in output.fields.items() if n not in before or not _same(x, before[n])}
-    expect(written <= set(provided), f"it writes {_names(written - set(provided))} besides")
-    expect(set(provided) <= written, f"it does not write {_names(set(provided) - written)}")
+    beyond, left_out = written - set(provided), set(provided) - written
+    expect(not beyond, f"in {mode} it writes {_names(beyond)} besides")
+    expect(not left_out, f"in {mode} it does not write {_names(left_out)}")
     lost = set(before) - set(output.fields)
-    expect(not lost, f"it loses {_names(lost)}")
+    expect(not lost, f"in {mode} it loses {_names(lost)}")
     if case.slot == "refinement":
         passed = _same(output.features, inputs["state"].features)
-        expect(passed, "it changes the features, which a refinement passes on")
+        expect(passed, f"in {mode} it changes the features, which a refinement passes on")
     for name, spec in provided.items():
         kept = output[name].dtype == spec.dtype
-        expect(kept, f"`{name}` is {described(output[name])}, declared as {spec}")
+        expect(kept, f"in {mode} `{name}` is {described(output[name])}, declared as {spec}")
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
