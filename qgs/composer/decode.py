@@ -94,7 +94,7 @@ def _decode_place(place: Place, registry: Registry, problems: Problems) -> Chose
         config = decode_config(component.Config, node.without("type"), place.source, problems)
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
-        problems.add(origin, ".".join(place.source), failure.reason, failure.fix)
+        problems.add(origin, ".".join(place.source), failure.reason, failure.fix, error)
         return None
     return None if config is None else Chosen(place, name, component, config, installed)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from qgs.composer.nodes import Origin
 
@@ -14,6 +14,7 @@ class RecipeProblem:
 
     file: as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python mapping.
     line: 1-based, 0 where there is none. path: dotted path in the recipe, "" for the whole of it.
+    cause: what a plugin's code raised, None where nothing was.
     """
 
     file: str
@@ -21,6 +22,7 @@ class RecipeProblem:
     path: str
     reason: str
     fix: str
+    cause: Exception | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
         place = f"{Origin(self.file, self.line)}: {self.path or 'recipe'}"
@@ -49,9 +51,11 @@ class Problems:
         self.add(origin, path, reason, fix)
         self._stopped = True
 
-    def add(self, origin: Origin, path: str, reason: str, fix: str) -> None:
+    def add(
+        self, origin: Origin, path: str, reason: str, fix: str, cause: Exception | None = None
+    ) -> None:
         """Note a mistake and go on."""
-        self._found.append(RecipeProblem(origin.file, origin.line, path, reason, fix))
+        self._found.append(RecipeProblem(origin.file, origin.line, path, reason, fix, cause))
 
     def raise_if_stopped(self) -> None:
         """Raise RecipeError if part of the recipe could not be read."""
@@ -59,6 +63,11 @@ class Problems:
             self.raise_any()
 
     def raise_any(self) -> None:
-        """Raise RecipeError if anything was found."""
-        if self._found:
-            raise RecipeError(self._found)
+        """Raise RecipeError if anything was found, from what plugins raised if they did."""
+        if not self._found:
+            return
+        error = RecipeError(self._found)
+        causes = [problem.cause for problem in error.problems if problem.cause]
+        if not causes:
+            raise error
+        raise error from causes[0] if len(causes) == 1 else ExceptionGroup("of plugins", causes)

@@ -142,7 +142,7 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
     try:
         found = check_declarations(chosen, context)
     except PluginError as error:
-        problems.add(chosen.place.origin, chosen.written_at, error.reason, error.fix)
+        problems.add(chosen.place.origin, chosen.written_at, error.reason, error.fix, error)
         return False
     for problem in found:
         steps = problem.option.split(".") if problem.option else []

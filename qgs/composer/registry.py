@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 
 import qgs
 from qgs.composer.builtin import BUILTIN
+from qgs.composer.code_places import file_of, package_named, package_of, place_in
 from qgs.composer.soundness import plugin_fault
 from qgs.contracts import ENTRY_POINT_GROUP, Component, ComponentConfig, Plugin
 
@@ -23,11 +25,15 @@ class PluginError(ValueError):
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A plugin that is loaded and sound, and the distribution it came with."""
+    """A plugin that is loaded and sound, and the distribution it came with.
+
+    editable: whether its user is its author, who installed it from its source tree.
+    """
 
     plugin: Plugin
     distribution: str
     version: str
+    editable: bool = False
 
     @property
     def released_as(self) -> str:
@@ -66,13 +72,19 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
         return None
 
 
-def component_fault(installed: InstalledPlugin, fault: str) -> PluginError:
-    """A component of `installed` breaks its contract; `fault` says which one, and how."""
+def component_fault(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
+    """A component of `installed` breaks its contract; `fault` says which one, and how.
+
+    place: FILE:LINE in its code, "" for none.
+    """
     release = installed.released_as
     origin = f" of {release}" if release else ""
+    at = f" (at {place})" if place else ""
+    own = installed.editable or not release
+    fix = f"mend {place or 'it'}" if own else f"update {release}"
     return PluginError(
-        f"the plugin `{installed.plugin.name}`{origin} fails: {fault}",
-        f"{f'update {release}' if release else 'mend it'}, or choose another component",
+        f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}",
+        f"{fix}, or choose another component",
     )
 
 
@@ -80,9 +92,10 @@ def component_failure(
     kind: str, what: str, error: Exception, installed: InstalledPlugin
 ) -> PluginError:
     """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
-    return component_fault(
-        installed, f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
-    )
+    files = filter(None, map(file_of, installed.plugin.components))
+    roots = {package_of(file) for file in files} - {package_of(qgs.__file__)}
+    fault = f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
+    return component_fault(installed, fault, place_in(error, roots))
 
 
 def builtin() -> InstalledPlugin:
@@ -154,33 +167,42 @@ def _load(entry: EntryPoint) -> InstalledPlugin:
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:
+        place = place_in(error, package_named(entry.module))
         raise PluginError(
             f"the plugin `{entry.name}` of {distribution} cannot be imported from "
-            f"`{entry.value}`: {type(error).__name__}: {error}",
-            _import_fix(entry, error),
+            f"`{entry.value}`: {type(error).__name__}: {error}{f' (at {place})' if place else ''}",
+            _import_fix(entry, error, place),
         ) from error
     fault = plugin_fault(plugin, entry.name)
     if fault:
         reason = f"the plugin `{entry.name}` of {distribution} {fault.reason}"
-        raise PluginError(reason, fault.fix or _update(entry))
+        raise PluginError(reason, fault.fix or _repair(entry))
     assert entry.dist is not None
-    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version)
+    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, _is_editable(entry.dist))
 
 
-def _import_fix(entry: EntryPoint, error: BaseException) -> str:
+def _import_fix(entry: EntryPoint, error: BaseException, place: str) -> str:
     release = _release(entry)
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
-    own = entry.value.partition(":")[0].strip()
-    if missing == own:
+    if missing == entry.module:
         return f"install {release} again, its files are gone; or do without the plugin"
     package = (missing or "").partition(".")[0]
-    if package and package not in ("qgs", own.partition(".")[0]):
+    if package and package not in ("qgs", entry.module.partition(".")[0]):
         return f"install `{package}`, which {release} needs, or do without the plugin"
-    return _update(entry)
+    return _repair(entry, place)
 
 
-def _update(entry: EntryPoint) -> str:
+def _repair(entry: EntryPoint, place: str = "") -> str:
+    """place: FILE:LINE of what is wrong, "" where only the entry point leads there."""
+    if entry.dist and _is_editable(entry.dist):
+        return f"mend {place or f'`{entry.value}`'}, or do without the plugin"
     return f"update {_release(entry)}, or do without the plugin"
+
+
+def _is_editable(distribution: Distribution) -> bool:
+    """Whether it was installed with `pip install -e`: the record of its origin (PEP 610)."""
+    origin = json.loads(distribution.read_text("direct_url.json") or "{}")
+    return bool(origin.get("dir_info", {}).get("editable"))
 
 
 def _release(entry: EntryPoint) -> str:

@@ -200,5 +200,5 @@ def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()
             plugins[item.value] = at_hand.get(item.value) or load_plugin(item.value)
         except PluginError as error:
             unusable.add(item.value)
-            problems.add(item.origin, path, error.reason, error.fix)
+            problems.add(item.origin, path, error.reason, error.fix, error)
     return Registry(plugins, frozenset(unusable))

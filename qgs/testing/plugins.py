@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from qgs.composer.code_places import file_of
 from qgs.composer.registry import (
     InstalledPlugin,
     PluginError,
@@ -15,7 +16,7 @@ from qgs.composer.registry import (
 from qgs.contracts import Component, ComponentConfig, Expected, ModelDims, Plugin
 from qgs.testing.case import Case
 from qgs.testing.expected import expectation_fault
-from qgs.testing.places import file_of, raised
+from qgs.testing.places import raised
 from qgs.testing.registry import TIERS, Tier, checks_for, tiers_given
 from qgs.testing.running import CaseRun, Outcome
 from qgs.testing.wording import named, options_of

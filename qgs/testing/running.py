@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
+from qgs.composer.code_places import file_of
 from qgs.contracts import Expected, ExpectedError
 from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.expected import BASICS, expectation_fault, is_expected, reason_of
 from qgs.testing.faults import CannotCheck, ContractError
-from qgs.testing.places import file_of, raised
+from qgs.testing.places import raised
 from qgs.testing.registry import CHECKS, Check, case_given
 from qgs.testing.wording import named
 

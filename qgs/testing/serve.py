@@ -10,8 +10,9 @@ import sys
 from types import ModuleType
 from typing import Any
 
+from qgs.composer.code_places import package_of
 from qgs.testing.audit import Deed, watched
-from qgs.testing.places import package_of, raised
+from qgs.testing.places import raised
 
 _deeds: list[Deed] = []
 """What was done by all that was imported so far."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -72,9 +73,14 @@ Install = Callable[..., None]
 
 @pytest.fixture
 def install(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Install:
-    """Make a distribution importable: install(distribution, plugin name, module source)."""
+    """Make a distribution importable: install(distribution, plugin name, module source).
 
-    def install(distribution: str, plugin: str, source: str, version: str = "1.2") -> None:
+    editable: as `pip install -e` leaves it.
+    """
+
+    def install(
+        distribution: str, plugin: str, source: str, version: str = "1.2", editable: bool = False
+    ) -> None:
         folder = tmp_path_factory.mktemp("site")
         module = f"_test_{distribution.replace('-', '_')}"
         (folder / f"{module}.py").write_text(dedent(source))
@@ -84,6 +90,9 @@ def install(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
             f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
         )
         (info / "entry_points.txt").write_text(f"[qgs.plugins]\n{plugin} = {module}:plugin\n")
+        if editable:
+            record = {"url": folder.as_uri(), "dir_info": {"editable": True}}
+            (info / "direct_url.json").write_text(json.dumps(record))
         monkeypatch.syspath_prepend(folder)
         monkeypatch.delitem(sys.modules, module, raising=False)
 

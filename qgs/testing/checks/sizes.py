@@ -9,11 +9,12 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from qgs.composer.code_places import file_of
 from qgs.testing.case import Case
 from qgs.testing.chance import drawn_from
 from qgs.testing.faults import ContractError, expect
 from qgs.testing.modes import each_mode
-from qgs.testing.places import file_of, raised
+from qgs.testing.places import raised
 from qgs.testing.registry import MODULES, check
 from qgs.testing.subjects import Maker, Sizes, inputs_of
 from qgs.testing.trees import distance, leaves, mapped
