@@ -2,7 +2,8 @@
 
 A block of text on that page is what its recipe, or its Python code, raises. A Python block with a
 distribution as its title is the module of a plugin that is installed meanwhile: "qgs-NAME VERSION",
-or "DISTRIBUTION VERSION as NAME".
+or "DISTRIBUTION VERSION as NAME". One with the title "without NAME" runs where the package, or the
+plugin, of that name is missing; it may load `model.safetensors`, whose recipe names `locus`.
 
 `python tools/guide_errors.py` brings the page up to date; a test tells when it is not.
 """
@@ -13,11 +14,16 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, redirect_stderr
+from importlib.metadata import EntryPoint, entry_points
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+from guide_reference import PLUGINS
 
 import qgs
+from qgs.contracts.extras import MissingExtraError
 from qgs.io.atomic import write_text
 
 PAGE = Path(__file__).parents[1] / "docs/errors.md"
@@ -25,18 +31,36 @@ BLOCK = re.compile(
     r'^```(yaml|python|text)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE
 )
 
+SMALL = {
+    "recipe": 1,
+    "plugins": ["locus"],
+    "model": {"width": 32, "heads": 2, "queries": {"type": "locus/anchored", "count": 4}},
+}
+"""Recipe of the checkpoint that code of the page may load."""
+
 
 def updated(page: str) -> str:
     """`page` with every block of text replaced by the message that belongs there."""
-    with TemporaryDirectory() as folder, chdir(folder), _restored_path():
+    with (
+        TemporaryDirectory() as folder,
+        chdir(folder),
+        _restored_path(),
+        _only_plugins(Path(folder)),
+    ):
+        qgs.save(qgs.compose(SMALL), "model.safetensors")
         message = ""
 
         def replaced(block: re.Match[str]) -> str:
             nonlocal message
             kind, title, text = block.groups()
             if kind == "text":
-                return f"```text\n{message}\n```"
-            if kind == "python" and title:
+                site = rf"{re.escape(folder)}/\w+/"
+                return f"```text\n{re.sub(site, 'site-packages/', message)}\n```"
+            missing = (title or "").partition("without ")[2]
+            if kind == "python" and missing:
+                with _without(missing, Path(folder)):
+                    message = _message(kind, "example", text)
+            elif kind == "python" and title:
                 _install(title, text, Path(folder))
             else:
                 message = _message(kind, title or "recipe.yaml", text)
@@ -53,7 +77,7 @@ def _message(kind: str, name: str, text: str) -> str:
             qgs.compose(name, device="meta")
         else:
             exec(compile(text, name, "exec"), {})  # the guide's own code
-    except ValueError as error:
+    except (ValueError, MissingExtraError) as error:
         return str(error)
     raise RuntimeError(f"this raises nothing, so the page is wrong:\n{text}")
 
@@ -72,6 +96,25 @@ def _install(distribution: str, source: str, folder: Path) -> None:
     entry = f"[qgs.plugins]\n{plugin or name.removeprefix('qgs-')} = {module}:plugin\n"
     (info / "entry_points.txt").write_text(entry, encoding="utf-8")
     sys.path.insert(0, str(site))
+
+
+@contextmanager
+def _without(name: str, folder: Path) -> Iterator[None]:
+    """The package or the plugin `name` is not installed meanwhile."""
+    with patch.dict(sys.modules, {name: None}), _only_plugins(folder, but=name):
+        yield
+
+
+@contextmanager
+def _only_plugins(folder: Path, but: str = "") -> Iterator[None]:
+    """Of all plugins there are those of the repository and those in `folder`, not the one `but`."""
+
+    def found(group: str) -> list[EntryPoint]:
+        there = [entry for entry in entry_points(group=group) if entry.name != but]
+        return [e for e in there if e.name in PLUGINS or (folder / e.module).is_dir()]
+
+    with patch("qgs.composer.registry.entry_points", found):
+        yield
 
 
 @contextmanager

@@ -29,6 +29,54 @@ def test_messages_are_those_that_are_raised() -> None:
     assert guide_errors.updated(page) == page, "run `python tools/guide_errors.py`"
 
 
+MESSAGES = (
+    "there is no key `",
+    "there is no option `",
+    "must be an integer, got",
+    "there is no component `",
+    "belongs in the slot `",
+    "names no plugin",
+    "is an import path",
+    "is already given at",
+    "matches no place",
+    "which nothing before it provides",
+    "reads anchor.raw_radius as",
+    "has no effect",
+    "do not divide",
+    "which this recipe does not use",
+    "no installed distribution offers a plugin `",
+    "its recipe fails here; install",
+    "cannot be imported from",
+    "No module named 'a_package_that_is_missing'",
+    "has no attribute 'plugin'",
+    "was written for contract version",
+    "calls itself `",
+    "several distributions offer a plugin `",
+    "registers `latent` twice",
+    "which leaves forward abstract",
+    "whose Config is no ComponentConfig",
+    "fails: `__init__` of `",
+    "says that it provides",
+    "needs numba, which is not installed",
+    "must have shape (",
+    "must be floating-point numbers in [0, 1]",
+)
+"""Of every kind of message that the page is to show, a part of its own."""
+
+
+@pytest.mark.parametrize("part", MESSAGES)
+def test_the_page_of_errors_shows_every_kind_of_message(part: str) -> None:
+    assert any(part in text for text in blocks("errors.md", "text").values())
+
+
+def test_every_message_can_be_linked_to() -> None:
+    sections = re.split(r"^###? ", text_of("errors.md"), flags=re.MULTILINE)[1:]
+    headings = [section.partition("\n")[0] for section in sections]
+    assert len(set(headings)) == len(headings)
+    for section in sections:
+        assert section.count("```text") <= 2, "one kind of message below a heading"
+
+
 def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(blocks("index.md", "yaml")["mine.yaml"])
