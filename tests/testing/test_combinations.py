@@ -14,11 +14,14 @@ from qgs.contracts import Component, ComponentConfig, FieldSpec
 from qgs.testing import Case
 from qgs.testing.checks.composing import run_training_step
 from qgs.testing.plugins import cases_of
+from qgs.testing.subjects import Sizes
 
 SLOTS = ("queries", "cross_attention", "self_attention", "refinement", "centers", "supervision")
 LAYER = SLOTS[1:4]
 REGISTRY = load_registry(["locus"])
 DEPTH = 2
+SIZES = (Sizes(), Sizes(batch=1, views=3, image=(24, 16)))
+"""Of the views that every combination runs with."""
 
 Choice = tuple[str, type[Component], ComponentConfig]
 
@@ -133,7 +136,9 @@ def test_a_combination_runs_or_is_refused(parts: tuple[Choice, ...]) -> None:
     chosen = dict(zip(SLOTS, parts, strict=True))
     unmet = _unmet(chosen)
     if not unmet:
-        run_training_step(resolve(_recipe(chosen)), Case(chosen["queries"][2]))
+        recipe = resolve(_recipe(chosen))
+        for sizes in SIZES:
+            run_training_step(recipe, Case(chosen["queries"][2]), sizes)
         return
     with pytest.raises(RecipeError) as refusal:
         resolve(_recipe(chosen))
