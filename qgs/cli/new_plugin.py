@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+import unicodedata
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution, entry_points
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 TEMPLATE_SUFFIX = ".jinja"
 NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 LONGEST_NAME = 40
+RESERVED = {"con", "prn", "aux", "nul"} | {f"{d}{i}" for d in ("com", "lpt") for i in range(1, 10)}
 
 
 def register(app: typer.Typer) -> None:
@@ -33,10 +36,10 @@ def new_plugin(
 ) -> None:
     """Write a plugin to start from: one component, its contract tests, a recipe that uses it."""
     check_name(name)
-    folder = out or Path(distribution_of(name))
+    folder = (out or Path(distribution_of(name))).expanduser()
     write_plugin(name, folder)
     typer.echo(f"wrote {folder}; next:")
-    typer.echo(f"  cd {folder}")
+    typer.echo(f"  cd {shlex.quote(str(folder))}")
     typer.echo("  pip install -e '.[test]'")
     typer.echo("  python -m pytest")
     typer.echo("  qgs compose recipe.yaml")
@@ -55,7 +58,8 @@ def package_of(name: str) -> str:
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
     if not NAME.fullmatch(name):
-        near = re.sub(r"[^a-z0-9]+", "-", name.lower()).lstrip("-0123456789").rstrip("-")
+        letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+        near = re.sub(r"[^a-z0-9]+", "-", letters.lower()).lstrip("-0123456789").rstrip("-")
         meant = f"; did you mean `{near}`?" if NAME.fullmatch(near) else ""
         raise ValueError(
             f"`{name}` is no name of a plugin: lower-case letters and digits, beginning with a "
@@ -69,6 +73,11 @@ def check_name(name: str) -> None:
         raise ValueError(
             f"`{name}` begins like the framework's own name; the distribution is called "
             "qgs-NAME anyway, so leave `qgs` out"
+        )
+    if name in RESERVED:
+        raise ValueError(
+            f"`{name}` is the name of a device on Windows, where no file can have it; choose "
+            f"another, such as `{name}-things`"
         )
     read = _read_in_a_recipe(name)
     if read != name:
@@ -110,15 +119,26 @@ def _refuse_taken(name: str) -> None:
 def write_plugin(name: str, folder: Path) -> None:
     """Write the distribution of the plugin `name` into the new `folder`, whole or not at all.
 
-    Raises FileExistsError if there is something at `folder`, whatever it is.
+    Raises FileExistsError if there is something at `folder`, whatever it is, and OSError if no
+    folder can be made there.
     """
     from qgs.io.atomic import new_folder
 
-    with new_folder(folder) as fresh:
-        for path, text in rendered(name):
-            target = fresh / path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(text, encoding="utf-8")
+    if folder.exists() or folder.is_symlink():
+        raise FileExistsError(
+            f"{folder} exists and is never overwritten; choose another folder with `--out FOLDER`"
+        )
+    try:
+        with new_folder(folder) as fresh:
+            for path, text in rendered(name):
+                target = fresh / path
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OSError(
+            f"cannot write {folder}: {error.strerror or error}; choose another folder with "
+            "`--out FOLDER`"
+        ) from error
 
 
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:

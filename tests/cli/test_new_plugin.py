@@ -35,11 +35,13 @@ def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
     folder = tmp_path / "qgs-far-sighted"
     written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert written == {
+        ".gitignore",
         "README.md",
         "pyproject.toml",
         "recipe.yaml",
         "src/qgs_far_sighted/__init__.py",
         "src/qgs_far_sighted/abstaining.py",
+        "src/qgs_far_sighted/py.typed",
         "tests/test_components.py",
     }
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
@@ -101,7 +103,12 @@ def test_a_distribution_that_is_installed_is_not_replaced(
         ("2fast", "did you mean `fast`"),
         ("a--b", "did you mean `a-b`"),
         ("", "is no name of a plugin"),
-        ("é", "is no name of a plugin"),
+        ("é", "did you mean `e`"),
+        ("été", "did you mean `ete`"),
+        ("日本", "is no name of a plugin"),
+        ("con", "the name of a device on Windows"),
+        ("nul", "choose another, such as `nul-things`"),
+        ("com1", "the name of a device on Windows"),
         ("a" * 41, "has 41 characters"),
         ("qgs", "leave `qgs` out"),
         ("qgs-more", "leave `qgs` out"),
@@ -132,8 +139,46 @@ def test_nothing_is_overwritten(kind: str, tmp_path: Path) -> None:
     before = sorted(map(str, tmp_path.rglob("*")))
     result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "mine"])
     assert isinstance(result.exception, FileExistsError)
-    assert "never overwritten" in str(result.exception)
+    assert "never overwritten; choose another folder with `--out FOLDER`" in str(result.exception)
     assert sorted(map(str, tmp_path.rglob("*"))) == before
+
+
+def test_a_place_that_cannot_be_written_is_told_by_the_users_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", "./.qgs-wide.4m63mcr7")
+
+    monkeypatch.setattr("tempfile.mkdtemp", refuse)
+    result = CliRunner().invoke(app, ["new-plugin", "wide"])
+    told = "cannot write qgs-wide: Permission denied; choose another folder with `--out FOLDER`"
+    assert str(result.exception) == told
+
+
+def test_a_file_in_the_way_of_the_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "file/wide"])
+    assert isinstance(result.exception, OSError)
+    assert str(result.exception).startswith("cannot write file/wide: ")
+
+
+def test_home_is_expanded_and_blanks_are_quoted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "my home"))
+    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "~/wide"])
+    assert (tmp_path / "my home/wide/pyproject.toml").is_file()
+    assert f"  cd '{tmp_path}/my home/wide'\n" in result.output
+
+
+def test_an_sdist_holds_no_training(tmp_path: Path) -> None:
+    CliRunner().invoke(app, ["new-plugin", "wide"])
+    folder = tmp_path / "qgs-wide"
+    project = tomllib.loads((folder / "pyproject.toml").read_text())
+    included = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    there = {f"/{path.name}" for path in folder.iterdir()} - {"/.gitignore", "/pyproject.toml"}
+    assert there <= set(included), "hatchling adds the other two"
+    assert not {"/run", "/run/checkpoint.safetensors"} & set(included)
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
