@@ -90,4 +90,8 @@ def _total(outcomes: list[Outcome]) -> str:
         counts["not checked"] = len(unchecked)
     components = len({outcome.case.component for outcome in outcomes})
     told = ", ".join(f"{count} {what}" for what, count in counts.items())
-    return f"{components} components, {len(outcomes)} checks, {told}"
+    return f"{_count(components, 'component')}, {_count(len(outcomes), 'check')}, {told}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -45,8 +45,11 @@ def plugin_fault(plugin: object, name: str) -> Fault | None:
 
 
 def _faults(plugin: Plugin, name: str) -> Iterator[Fault]:
-    if plugin.contract_version != CONTRACT_VERSION:
-        yield _other_contracts(plugin.contract_version)
+    version: object = plugin.contract_version
+    if type(version) is not int:
+        yield Fault(f"must give `contract_version` as a whole number, not {version!r}")
+    elif version != CONTRACT_VERSION:
+        yield _other_contracts(version)
     if plugin.name != name:
         yield Fault(f"calls itself `{plugin.name}`; the two names must be one")
     for attribute in ("components", "layouts", "examples"):
@@ -55,6 +58,8 @@ def _faults(plugin: Plugin, name: str) -> Iterator[Fault]:
             comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
             yield Fault(f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}")
             return
+    if not plugin.components and not plugin.layouts:
+        yield Fault("is empty: it lists neither `components` nor `layouts`")
     if not isinstance(plugin.exemptions, Mapping):
         yield Fault(f"must give `exemptions` as a mapping, not {plugin.exemptions!r}")
     yield from _component_faults(plugin.components)
@@ -63,9 +68,9 @@ def _faults(plugin: Plugin, name: str) -> Iterator[Fault]:
             yield Fault(f"lists {layout!r}, which is no WeightLayout")
 
 
-def _other_contracts(version: object) -> Fault:
+def _other_contracts(version: int) -> Fault:
     reason = f"was written for contract version {version}; this qgs has version {CONTRACT_VERSION}"
-    newer = isinstance(version, int) and version > CONTRACT_VERSION
+    newer = version > CONTRACT_VERSION
     return Fault(reason, "update qgs, or do without the plugin" if newer else "")
 
 

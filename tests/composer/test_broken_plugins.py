@@ -117,6 +117,18 @@ BROKEN_PLUGINS = {
         "from qgs.contracts import Plugin\nplugin = Plugin('bad', 0, ())",
         "contract version 0",
     ),
+    "contract version that is a text": (
+        "from qgs.contracts import Plugin\nplugin = Plugin('bad', '1', ())",
+        "must give `contract_version` as a whole number, not '1'",
+    ),
+    "contract version that is a truth": (
+        "from qgs.contracts import Plugin\nplugin = Plugin('bad', True, ())",
+        "must give `contract_version` as a whole number, not True",
+    ),
+    "nothing in it": (
+        "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, ())",
+        "is empty: it lists neither `components` nor `layouts`",
+    ),
     "other name": (
         "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 1, ())",
         "calls itself `qgs`",
@@ -161,6 +173,16 @@ def test_broken_plugin_is_reported_by_distribution(name, write, install):
     assert reason in problem.reason
     assert "qgs-bad 0.7" in problem.fix
     resolve(write("recipe: 1\n", "other.yaml"))
+
+
+def test_a_plugin_may_offer_layouts_alone(write, install):
+    source = """
+    from qgs.components import TOKENGS
+    from qgs.contracts import Plugin
+    plugin = Plugin("layouts", 1, (), layouts=(TOKENGS,))
+    """
+    install("qgs-layouts", "layouts", source)
+    assert resolve(write("recipe: 1\nplugins: [layouts]\n")).plugin_versions["layouts"] == "1.2"
 
 
 def test_fix_of_a_missing_dependency_is_to_install_it(write, install):

@@ -169,6 +169,7 @@ def test_problems_that_raise_are_found_by_the_checks(monkeypatch) -> None:
     result = _report(monkeypatch, _installed(CannotJudge), "--core")
     assert result.exit_code == 1
     assert "no judgement today" in result.output
+    assert result.output.splitlines()[-1].startswith("1 component, ")
 
 
 @pytest.mark.parametrize("component", [LeavesInForward, LeavesWhenJudged])
