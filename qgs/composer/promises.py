@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from torch import nn
 
 from qgs.composer.decode import Chosen
-from qgs.composer.registry import InstalledPlugin, component_fault
+from qgs.composer.registry import InstalledPlugin, component_error
 from qgs.contracts import (
     MEMORY_FIELDS,
     Component,
     Encoder,
     Fields,
-    FieldSpec,
     Queries,
     Refinement,
     Renderer,
@@ -28,7 +27,7 @@ def refuse_unkeepable(chosen: Chosen, provided: Fields) -> None:
     writable = _writable(chosen.component)
     beyond = [] if writable is None else [name for name in provided if name not in writable]
     if beyond:
-        raise component_fault(
+        raise component_error(
             chosen.installed,
             f"`{chosen.type}` says that it provides {', '.join(beyond)}, which a component of the "
             f"slot `{chosen.component.slot}` has no way to write",
@@ -73,7 +72,7 @@ class _Promise:
             if name not in state.fields:
                 raise self._broken(f"{says} the state that it returns has {found}")
             shape = tuple(state.fields[name].shape[2:])
-            if not _fits(shape, spec):
+            if not fits(shape, spec.shape):
                 raise self._broken(f"{says} it returns one of trailing shape {shape}")
         for given in arguments:
             lost = [n for n in getattr(given, "fields", ()) if n not in state.fields]
@@ -84,11 +83,12 @@ class _Promise:
                 )
 
     def _broken(self, what: str) -> Exception:
-        return component_fault(self.installed, f"`{self.type}` {what}")
+        return component_error(self.installed, f"`{self.type}` {what}")
 
 
-def _fits(shape: tuple[int, ...], spec: FieldSpec) -> bool:
-    return len(shape) == len(spec.shape) and all(
+def fits(shape: tuple[int, ...], wanted: Sequence[int | str | None]) -> bool:
+    """Whether `shape` has the sizes that are `wanted`; one that is no number may be any."""
+    return len(shape) == len(wanted) and all(
         not isinstance(size, int) or size == given
-        for size, given in zip(spec.shape, shape, strict=True)
+        for size, given in zip(wanted, shape, strict=True)
     )

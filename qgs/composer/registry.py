@@ -72,7 +72,7 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
         return None
 
 
-def component_fault(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
+def component_error(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
     """A component of `installed` breaks its contract; `fault` says which one, and how.
 
     place: FILE:LINE in its code, "" for none.
@@ -95,7 +95,7 @@ def component_failure(
     files = filter(None, map(file_of, installed.plugin.components))
     roots = {package_of(file) for file in files} - {package_of(qgs.__file__)}
     fault = f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
-    return component_fault(installed, fault, place_in(error, roots))
+    return component_error(installed, fault, place_in(error, roots))
 
 
 def builtin() -> InstalledPlugin:

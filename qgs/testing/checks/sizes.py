@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from qgs.composer.code_places import file_of
+from qgs.composer.promises import fits
 from qgs.testing.case import Case
 from qgs.testing.chance import drawn_from
 from qgs.testing.faults import ContractError, expect
@@ -76,7 +77,7 @@ def _expect_expected(
         expect(name in outputs, f"in {mode}, with {sizes}, it gives no `{name}`")
         seen = tuple(outputs[name].shape)
         told = f"in {mode}, with {sizes}, `{name}` is of shape {seen}, not {shape}"
-        expect(_fits(seen, shape), told)
+        expect(fits(seen, shape), told)
 
 
 @check(MODULES - {"queries", "losses"})
@@ -125,9 +126,3 @@ def _provided(case: Case, sizes: Sizes) -> dict[str, Shape]:
     maker = Maker(case, sizes, torch.Generator())
     provided = case.component.provides(case.config)
     return {f"fields.{n}": tuple(maker.field(n, s).shape) for n, s in provided.items()}
-
-
-def _fits(seen: tuple[int, ...], wanted: Shape) -> bool:
-    return len(seen) == len(wanted) and all(
-        size in (None, given) for given, size in zip(seen, wanted, strict=True)
-    )
