@@ -69,6 +69,6 @@ def test_a_broken_plugin_beside_it_harms_nobody(fresh: FreshEnvironment, plugin:
 def test_locus_passes_the_check_of_the_command_line(
     fresh: FreshEnvironment, tmp_path: Path
 ) -> None:
-    report = fresh.run("qgs check-plugin locus", tmp_path)
+    report = fresh.run("qgs check-plugin locus", tmp_path, timeout=180)
     assert "cross_attention/ray_biased" in report
     assert " 0 failed" in report
