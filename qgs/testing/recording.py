@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from qgs.geometry import precision
 from qgs.testing.trees import mapped
 from qgs.types import LayerPrediction, QueryState
 
@@ -29,7 +30,15 @@ METADATA = {
 } | {Tensor.size, Tensor.dim, Tensor.numel, Tensor.__len__, Tensor.is_floating_point}
 """What can be asked of a tensor without reading a number of it."""
 
-PASSING_ON = {QueryState.__post_init__.__code__, QueryState.replace.__code__}
+PASSING_ON = {
+    function.__code__
+    for function in (
+        QueryState.__post_init__,
+        QueryState.replace,
+        precision._raised,
+        precision._device_of,
+    )
+}
 """Code that goes through all fields for the component, which sees none of them."""
 
 
