@@ -45,12 +45,18 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
 
     The gradient of a query's update in the value of a token is the weight, times what all tokens
     share, times what all queries share where values are rescaled. So from one query to the next,
-    the lengths of these gradients change as the weights do, but for a factor.
+    the lengths of these gradients change as the weights do, but for a factor. Where no geometry is
+    told, queries of equal features look at the same.
     """
     module, inputs = case.lively(), inputs_of(case)
     told = _explained(module, inputs)
     if told is None or "memory.values" not in case.component.requires(case.config):
         return
+    if told.geometry is None:
+        state = inputs["state"]
+        alike = state.features[:, :1].expand_as(state.features).contiguous()
+        inputs["state"] = state.replace(alike)
+        told = _explained(module, inputs) or told
     followed = mapped(inputs, lambda n, x: x.requires_grad_() if n == "memory.values" else x)
     update = module(*followed.values())
     values = followed["memory"].values
