@@ -72,6 +72,7 @@ ALSO: Mapping[str, Mapping[str, str]] = {
         **_because(
             "no other instance has the same names",
             "same_seed_same_parameters",
+            "same_parameters_elsewhere",
             "saved_weights_run_elsewhere",
             "state_dict_is_complete",
         ),
@@ -110,8 +111,16 @@ ALSO: Mapping[str, Mapping[str, str]] = {
             "forward_keeps_no_state",
         ),
     ),
+    "batch_normed": _because("one query of one scene has no statistics", "sizes_vary"),
+    "numbers_gaussians": _because("it fades what depth is weighted by", "depth_is_expected"),
+    "dims_later_views": _because("it dims depth", "depth_is_expected"),
     "takes_roots_of_zero": _because(
-        "its gradient is nowhere a number", "batch_independence", "gradients_match_differences"
+        "its gradient is nowhere a number",
+        "batch_independence",
+        "gradients_match_differences",
+        "zeros_stay_finite",
+        "large_numbers_stay_finite",
+        "coincident_queries_stay_finite",
     ),
     "draws_elsewhere": _because(
         "no two instances are alike", "forward_keeps_no_state", "same_parameters_elsewhere"
@@ -135,6 +144,7 @@ ALSO: Mapping[str, Mapping[str, str]] = {
     "learns_a_constant": _because("the norm of zeros is zero", "parameters_learn"),
     "refuses_what_it_declares": _because(
         "gradients in what is declared are asked for there",
+        "no_gaussians_give_the_background",
         "gradients_reach_inputs",
         "batch_independence",
         "zeros_stay_finite",
