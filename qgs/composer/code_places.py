@@ -1,12 +1,14 @@
-"""Where in a plugin's own code an error was raised."""
+"""Places in a plugin's own code: where an error was raised, where a function is."""
 
 from __future__ import annotations
 
+import inspect
 import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 
 def file_of(component: type) -> str | None:
@@ -35,6 +37,12 @@ def lies_in(file: str, root: Path) -> bool:
     """Whether `file` is `root` or below it."""
     path = Path(file).resolve()
     return path == root or root in path.parents
+
+
+def place_of(function: Callable[..., Any]) -> str:
+    """FILE:LINE where a function starts; "" for one that is not written in Python."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    return f"{code.co_filename}:{code.co_firstlineno}" if code else ""
 
 
 def place_in(error: BaseException, roots: Iterable[Path]) -> str:

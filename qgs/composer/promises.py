@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import nn
 
+from qgs.composer.code_places import place_of
 from qgs.composer.decode import Chosen
 from qgs.composer.registry import InstalledPlugin, component_error
 from qgs.contracts import (
@@ -41,7 +42,8 @@ def hold_to_promise(module: nn.Module, chosen: Chosen) -> None:
     """
     if issubclass(chosen.component, Queries | Refinement):
         provided = dict(chosen.component.provides(chosen.config))
-        module.register_forward_hook(_Promise(chosen.type, chosen.installed, provided))
+        place = place_of(chosen.component.forward)
+        module.register_forward_hook(_Promise(chosen.type, chosen.installed, provided, place))
 
 
 def _writable(component: type[Component]) -> Collection[str] | None:
@@ -62,6 +64,7 @@ class _Promise:
     type: str
     installed: InstalledPlugin
     provided: Fields
+    place: str
 
     def __call__(self, module: nn.Module, arguments: Any, state: Any) -> None:
         if not isinstance(state, QueryState):
@@ -83,7 +86,7 @@ class _Promise:
                 )
 
     def _broken(self, what: str) -> Exception:
-        return component_error(self.installed, f"`{self.type}` {what}")
+        return component_error(self.installed, f"`{self.type}` {what}", self.place)
 
 
 def fits(shape: tuple[int, ...], wanted: Sequence[int | str | None]) -> bool:

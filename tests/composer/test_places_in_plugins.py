@@ -7,10 +7,13 @@ import traceback
 from pathlib import Path
 
 import pytest
+import torch
 
-from qgs.composer import RecipeError, compose
+from qgs.composer import PluginError, RecipeError, compose
+from qgs.composer.build import build
 from qgs.composer.recipe import resolve
 from qgs.composer.registry import load_plugin
+from qgs.types import QueryState
 
 AT_IMPORT = {
     "error": ("import math\n\nTABLE = {}\nTABLE['x']\n", 4, "KeyError: 'x'"),
@@ -108,6 +111,29 @@ def test_the_tracebacks_of_several_plugins_are_all_shown(write, install):
     shown = "".join(traceback.format_exception(caught.value))
     assert "_test_qgs_first.py" in shown
     assert "_test_qgs_second.py" in shown
+
+
+def test_a_broken_promise_is_placed_at_its_forward(write, install):
+    source = """
+    from qgs.contracts import Plugin, Refinement
+    from qgs.geometry.precision import full_precision
+
+    class Empty(Refinement):
+        name = "empty"
+
+        @full_precision
+        def forward(self, state):  # line 9, its decorator 8
+            return None
+
+    plugin = Plugin("faulty", 1, (Empty,))
+    """
+    install("qgs-faulty", "faulty", source, editable=True)
+    chosen = "{decoder: {refinement: {type: faulty/empty}}}"
+    recipe = resolve(write(f"recipe: 1\nplugins: [faulty]\nmodel: {chosen}\n"))
+    refine = build(recipe.parts["model", "decoder", "layers", "0", "refinement"], recipe.dims)
+    with pytest.raises(PluginError, match="returns NoneType, not a QueryState") as caught:
+        refine(QueryState(torch.zeros(1, 2, recipe.dims.width)))
+    assert caught.value.fix == f"mend {file_of_the_plugin()}:8, or choose another component"
 
 
 def test_an_installed_plugin_knows_whether_it_is_editable(install):
