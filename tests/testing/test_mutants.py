@@ -14,6 +14,7 @@ from contract_mutants import (
     depths,
     drills,
     encoding,
+    graphs,
     halves,
     heads,
     import_io,
@@ -203,6 +204,9 @@ MUTANTS = [
     Mutant("head_gives_gaussians", drills.LongQuaternionsInTraining, "in training, with initial"),
     Mutant("zeros_stay_finite", drills.DividesByLengthInTraining, "in training, with zeros"),
     Mutant("sizes_vary", drills.LosesAQueryInTraining, "in training, with Sizes"),
+    Mutant("compiles", graphs.CutsItsGradientCompiled, "features has a gradient"),
+    Mutant("compiles", graphs.LoopsOverQueries, "4 more graphs are compiled"),
+    Mutant("compiles", graphs.LoopsOverViews, "4 more graphs are compiled"),
     Mutant("depth_is_expected", depths.LosesDepth, "depth is off by"),
     Mutant("depth_is_expected", depths.SquashesDepth, "depth is off by"),
     Mutant("render_gradients_match_differences", depths.DetachesDepth, "`gaussians.means`"),
@@ -258,7 +262,7 @@ MUTANTS = [
     Mutant("options_are_left_alone", inner_options.AppendsToAnOption, "when it is built, Config"),
 ]
 
-SLOW = {"compiles"}
+SLOW = {graphs.LoopsOverQueries, graphs.LoopsOverViews}
 
 
 def test_every_check_has_a_mutant() -> None:
@@ -268,7 +272,7 @@ def test_every_check_has_a_mutant() -> None:
 
 @pytest.mark.parametrize(
     "mutant",
-    [pytest.param(m, marks=[pytest.mark.slow] if m.check in SLOW else []) for m in MUTANTS],
+    [pytest.param(m, marks=[pytest.mark.slow] if m.component in SLOW else []) for m in MUTANTS],
     ids=str,
 )
 def test_the_mutant_is_caught(mutant: Mutant) -> None:

@@ -9,33 +9,66 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import PARAMETRIC, check
-from qgs.testing.subjects import Sizes, inputs_of
-from qgs.testing.trees import distance
+from qgs.testing.subjects import Inputs, Sizes, inputs_of, tracked_inputs
+from qgs.testing.trees import distance, floating, scalar
 
-WARM_UP = (Sizes(batch=2, queries=6), Sizes(batch=3, queries=8))
-LATER = (Sizes(batch=4, queries=9), Sizes(batch=2, queries=6), Sizes(batch=5, queries=11))
+WARM_UP = (Sizes(batch=2, queries=6), Sizes(batch=3, queries=8, views=3, gaussians=3))
+LATER = (
+    Sizes(batch=4, queries=9, views=4, gaussians=4),
+    Sizes(batch=5, queries=11, views=5, gaussians=5),
+    Sizes(batch=6, queries=10, views=6, gaussians=6),
+    Sizes(batch=7, queries=13, views=7, gaussians=7),
+)
+"""Sizes none of which was seen before, nor any number in them."""
 SLACK = 2
 """More graphs that the later sizes may take together, where one of them is special."""
 
 
 @check(PARAMETRIC, tier="extended")
 def check_compiles(case: Case) -> None:
-    """Traced by torch.compile, a component is close to eager, and new sizes need no new graphs."""
+    """Traced by torch.compile, a component is close to eager, and new sizes need no new graphs.
+
+    So are its gradients.
+    """
     module = case.lively()
     graphs, seen = [0], []
-    with _fresh_compiler(), torch.no_grad():
+    with _fresh_compiler():
         compiled = torch.compile(module, backend=_counting(graphs))
         for sizes in (*WARM_UP, *LATER):
-            inputs = inputs_of(case, sizes)
-            found = distance(module(*inputs.values()), compiled(*inputs.values()), 1e-3, 1e-4)
+            ours, theirs = (tracked_inputs(case, inputs_of(case, sizes)) for _ in range(2))
+            eager, outputs = module(*ours.values()), compiled(*theirs.values())
+            found = distance(eager, outputs, 1e-3, 1e-4)
             expect(not found, f"compiled, with {sizes}, {found}")
             seen.append(graphs[0])
+        _expect_close(_slopes(module, ours, eager), _slopes(module, theirs, outputs))
     more = seen[-1] - seen[len(WARM_UP) - 1]
-    expect(more <= SLACK, f"{more} more graphs are compiled after {len(WARM_UP)} sizes were seen")
+    told = f"{more} more graphs are compiled for {len(LATER)} new sizes after {len(WARM_UP)}"
+    expect(more <= SLACK, told)
+
+
+def _slopes(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
+    """Gradients in the inputs and in the parameters, but for those of zeros."""
+    given = floating(inputs) | {f"parameter {n}": p for n, p in module.named_parameters()}
+    given = {name: x for name, x in given.items() if x.requires_grad}
+    total = scalar(outputs)
+    if not total.requires_grad:
+        return {}
+    slopes = torch.autograd.grad(total, list(given.values()), allow_unused=True)
+    return {n: x for n, x in zip(given, slopes, strict=True) if x is not None and bool(x.any())}
+
+
+def _expect_close(eager: dict[str, Tensor], compiled: dict[str, Tensor]) -> None:
+    odd = sorted(eager.keys() ^ compiled.keys())
+    expect(not odd, f"compiled or not decides whether {', '.join(odd)} has a gradient")
+    for name, slope in eager.items():
+        off = (compiled[name] - slope).abs().max().item()
+        close = off <= 1e-3 * slope.abs().max().item() + 1e-6
+        expect(close, f"compiled, the gradient of `{name}` is off by up to {off:.3g}")
 
 
 def _counting(graphs: list[int]) -> Any:

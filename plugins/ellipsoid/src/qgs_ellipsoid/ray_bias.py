@@ -102,6 +102,7 @@ def anchor_features(center: Tensor, rotation: Tensor, sigma_sq: Tensor) -> tuple
     return torch.stack(numerator, -1), torch.stack(_quadratic(metric), -1)
 
 
+@torch.compiler.disable  # a loop over blocks would be unrolled anew for every size
 @full_precision
 def ellipsoid_bias(
     center: Tensor,

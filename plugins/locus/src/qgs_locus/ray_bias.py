@@ -50,6 +50,7 @@ def center_features(center: Tensor) -> Tensor:
     return torch.stack([*products, -2 * x, -2 * y, -2 * z, torch.ones_like(x)], -1)
 
 
+@torch.compiler.disable  # a loop over blocks would be unrolled anew for every size
 @full_precision
 def ray_bias(
     center: Tensor, sigma_sq: Tensor | float, features: Tensor, bias_min: float, gamma: Tensor
