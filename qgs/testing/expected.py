@@ -9,14 +9,11 @@ from qgs.composer.suggest import did_you_mean
 from qgs.contracts import Expected, ExpectedError
 from qgs.testing.case import Case
 from qgs.testing.faults import ContractError
-from qgs.testing.registry import CHECKS
+from qgs.testing.registry import BASICS, CHECKS
 from qgs.testing.wording import named
 
 ExpectedFailures: TypeAlias = Mapping[str, Expected] | Callable[[Case], Mapping[str, Expected]]
 """Check -> why it fails, for all cases, or as a function of the case."""
-
-BASICS = ("builds", "runs")
-"""Checks that nobody may be exempt from: without them the others mean nothing."""
 
 
 def expected_of(

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.faults import CannotCheck, ElsewhereError
 
@@ -45,6 +46,8 @@ def ask(task: str, case: Case, **details: Any) -> dict[str, Any]:
         _process.cache_clear()
         raise ElsewhereError("the other process died")
     answer = json.loads(line)
+    if "missing" in answer:
+        raise MissingExtraError(answer["missing"])
     if "error" in answer:
         raise ElsewhereError(f"in another process: {answer['error']}")
     return answer

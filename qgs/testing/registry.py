@@ -16,6 +16,12 @@ Tier: TypeAlias = Literal["core", "extended"]
 """core: what every component needs to work at all; extended: what takes seconds for each case."""
 TIERS: tuple[Tier, ...] = get_args(Tier)
 
+BASICS = ("builds", "runs")
+"""Checks that nobody may be exempt from: without them the others mean nothing."""
+
+LIKELY_CAUSES = ("forward_keeps_no_state", "eval_repeats_bitwise")
+"""Checks without which many others cannot but fail: these compare one forward pass with another."""
+
 ALL_SLOTS = frozenset(SLOTS)
 MODULES = ALL_SLOTS - {"supervision", "data"}
 """Slots whose components have a forward pass."""
@@ -69,7 +75,14 @@ def checks_for(case: Case, tiers: Iterable[Tier] = TIERS) -> list[Check]:
     """
     case_given(case)
     wanted = tiers_given(tiers)
-    return [c for c in CHECKS.values() if case.slot in c.slots and c.tier in wanted]
+    found = [c for c in CHECKS.values() if case.slot in c.slots and c.tier in wanted]
+    return sorted(found, key=_rank)
+
+
+def _rank(check: Check) -> int:
+    """Causes come before what they cause."""
+    first = (*BASICS, *LIKELY_CAUSES)
+    return first.index(check.name) if check.name in first else len(first)
 
 
 def case_given(given: Any) -> None:

@@ -10,10 +10,10 @@ from qgs.composer.code_places import file_of
 from qgs.contracts import Expected, ExpectedError
 from qgs.contracts.extras import MissingExtraError
 from qgs.testing.case import Case
-from qgs.testing.expected import BASICS, expectation_fault, is_expected, reason_of
+from qgs.testing.expected import expectation_fault, is_expected, reason_of
 from qgs.testing.faults import CannotCheck, ContractError
 from qgs.testing.places import raised
-from qgs.testing.registry import CHECKS, Check, case_given
+from qgs.testing.registry import BASICS, CHECKS, LIKELY_CAUSES, Check, case_given
 from qgs.testing.wording import named
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
@@ -51,25 +51,34 @@ class CaseRun:
 
     After `builds` or `runs` failed, a check that ends with an error is skipped and refers to it:
     a component that cannot be built or called ends all of them. One that sees the contract broken
-    fails, and one that can be made passes.
+    fails, and one that can be made passes. After one of LIKELY_CAUSES failed, the failures of
+    others name it.
     """
 
     def __init__(self, case: Case, expected: Mapping[str, Expected] | None = None) -> None:
         self.case = case
         self.expected = expected or {}
         self.cause = ""
+        self.likely: set[str] = set()
 
     def make(self, check: Check) -> Outcome:
         """Make the next check."""
         outcome = run_check(check, self.case, self.expected.get(check.name))
         if outcome.verdict != "failed":
             self.cause = "" if check.name == self.cause else self.cause
+            self.likely.discard(check.name)
             return outcome
         if self.cause and outcome.crashed and check.name != self.cause:
             why = f"ends with an error as `{self.cause}` does: see that check"
             return replace(outcome, verdict="skipped", message=why, cause=self.cause)
         if check.name in BASICS:
             self.cause = check.name
+        elif check.name in LIKELY_CAUSES:
+            self.likely.add(check.name)
+        elif self.likely:
+            causes = " and ".join(f"`{name}`" for name in LIKELY_CAUSES if name in self.likely)
+            told = f"{outcome.message}\n  likely cause: that of {causes}; mend this first"
+            return replace(outcome, message=told)
         return outcome
 
 

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from qgs.composer.code_places import package_of
+from qgs.contracts.extras import MissingExtraError
 from qgs.testing.audit import Deed, watched
 from qgs.testing.places import raised
 
@@ -33,6 +34,8 @@ def serve(threads: int) -> None:
         request = json.loads(line)
         try:
             answer = {"import": _import, "build": _build, "run": _run}[request["task"]](request)
+        except MissingExtraError as error:
+            answer = {"missing": str(error)}
         except (Exception, SystemExit) as error:
             answer = {"error": raised(error, request["file"])}
         print(json.dumps(answer), file=out, flush=True)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from contract_mutants import broken
 from contract_mutants.broken import CannotBeBuilt, CannotBeCalled, CannotBeCalledElsewhere
+from contract_mutants.modules import AddsNoise
 from pydantic import ConfigDict
 from torch import Tensor
 
@@ -118,6 +119,16 @@ def test_what_is_seen_to_break_the_contract_is_told_besides() -> None:
         "runs",
         "config_is_frozen",
     }
+
+
+def test_a_likely_cause_is_told_first_and_named_by_the_others() -> None:
+    run = CaseRun(Case(AddsNoise.Config()))
+    outcomes = [run.make(check) for check in checks_for(run.case, ["core"])]
+    failed = [outcome for outcome in outcomes if not outcome.ok]
+    assert failed[0].check.name == "eval_repeats_bitwise"
+    assert len(failed) > 3
+    told = "likely cause: that of `eval_repeats_bitwise`; mend this first"
+    assert [told in outcome.message for outcome in failed] == [False] + [True] * (len(failed) - 1)
 
 
 def test_a_check_alone_tells_its_own_error() -> None:
