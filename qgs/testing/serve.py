@@ -10,10 +10,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from qgs.composer.code_places import package_of
-from qgs.contracts.extras import MissingExtraError
 from qgs.testing.audit import Deed, watched
-from qgs.testing.places import raised
 
 _deeds: list[Deed] = []
 """What was done by all that was imported so far."""
@@ -28,6 +25,10 @@ def serve(threads: int) -> None:
 
     torch.set_num_threads(threads)
     pydantic.create_model("First")  # now it looks for its plugins, and not for who is watched
+    with watched() as deeds:  # the built-in components come along
+        from qgs.contracts.extras import MissingExtraError
+        from qgs.testing.places import raised
+    _deeds.extend(deeds)
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what components print must not pass for an answer
     for line in sys.stdin:
@@ -42,6 +43,8 @@ def serve(threads: int) -> None:
 
 
 def _import(request: dict[str, Any]) -> dict[str, Any]:
+    from qgs.composer.code_places import package_of
+
     _module(request)
     package = package_of(request["file"])
     return {"deeds": [deed.text for deed in _deeds if deed.is_done_by(package)]}
