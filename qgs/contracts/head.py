@@ -15,7 +15,7 @@ class Head(ModelComponent):
     """QueryState -> GaussianAttributes of K Gaussians per query (shapes there).
 
     Scales are positive, quaternions unit (w x y z), opacities in (0, 1), colours in [0, 1];
-    `offsets` stay raw.
+    `offsets` stay raw. With initial parameters too, for features other than zero.
     """
 
     slot: ClassVar[str] = "head"
