@@ -12,7 +12,7 @@ of d. LocusGS's isotropic bias takes 10. Both products run in float64, block by 
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -102,7 +102,6 @@ def anchor_features(center: Tensor, rotation: Tensor, sigma_sq: Tensor) -> tuple
     return torch.stack(numerator, -1), torch.stack(_quadratic(metric), -1)
 
 
-@torch.compiler.disable  # a loop over blocks would be unrolled anew for every size
 @full_precision
 def ellipsoid_bias(
     center: Tensor,
@@ -120,7 +119,7 @@ def ellipsoid_bias(
     numerator, denominator = anchor_features(center, rotation, sigma_sq)
     scaled = numerator * (-0.5 * gamma)
     lower = bias_min * gamma
-    return cast(Tensor, _ClampedRatio.apply(scaled, denominator, features, lower, center.dtype))
+    return _clamped_ratio(scaled, denominator, features, lower, center.dtype)
 
 
 class _ClampedRatio(torch.autograd.Function):
@@ -159,6 +158,10 @@ class _ClampedRatio(torch.autograd.Function):
                 parts[2][:, :NUMERATOR] += above[:, rows].mT @ fall
                 parts[2][:, NUMERATOR:] += below[:, rows].mT @ rise
         return (*parts, gradient.masked_fill(~at_lower, 0).sum().to(lower), None)
+
+
+_clamped_ratio: Any = torch.compiler.disable(_ClampedRatio.apply)
+"""Kept out of compiled graphs, where its loop would be unrolled anew for every size."""
 
 
 def _blocks(pairs: Tensor) -> list[slice]:

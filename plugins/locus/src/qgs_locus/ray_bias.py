@@ -9,7 +9,7 @@ units away with a small bandwidth is off by more than the released code's own ro
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,7 +50,6 @@ def center_features(center: Tensor) -> Tensor:
     return torch.stack([*products, -2 * x, -2 * y, -2 * z, torch.ones_like(x)], -1)
 
 
-@torch.compiler.disable  # a loop over blocks would be unrolled anew for every size
 @full_precision
 def ray_bias(
     center: Tensor, sigma_sq: Tensor | float, features: Tensor, bias_min: float, gamma: Tensor
@@ -61,7 +60,7 @@ def ray_bias(
     all layers share; gamma 0-d, positive: folded into the centre's features and into the clamp.
     """
     scaled = center_features(center) * (-0.5 * gamma / sigma_sq)
-    return cast(Tensor, _ClampedProduct.apply(scaled, features, bias_min * gamma, center.dtype))
+    return _clamped_product(scaled, features, bias_min * gamma, center.dtype)
 
 
 class _ClampedProduct(torch.autograd.Function):
@@ -96,6 +95,10 @@ class _ClampedProduct(torch.autograd.Function):
             gradient.masked_fill(~at_lower, 0).sum() if needs_lower else None,
             None,
         )
+
+
+_clamped_product: Any = torch.compiler.disable(_ClampedProduct.apply)
+"""Kept out of compiled graphs, where its loop would be unrolled anew for every size."""
 
 
 @full_precision
