@@ -29,6 +29,7 @@ from qgs.testing.arguments import (
     refuse_other_shapes,
     refuse_other_size,
 )
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import CannotCheck
 from qgs.testing.wording import case_of, named
 
@@ -124,8 +125,7 @@ class Case:
 
     def build(self, seed: int = 0) -> Any:
         """A new instance with initial parameters drawn from `seed`, as the composer draws them."""
-        with torch.random.fork_rng(devices=()):
-            torch.default_generator.manual_seed(seed)
+        with drawn_from(seed):
             built = self.construct()
         return built.to(self.device) if isinstance(built, nn.Module) else built
 

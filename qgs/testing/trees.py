@@ -76,6 +76,15 @@ def scalar(tree: Any) -> Tensor:
     return total
 
 
+def slopes(total: Tensor, tree: Any) -> dict[str, Tensor]:
+    """The gradient of `total` in every tensor of `tree` that it has one in, by dotted name."""
+    if not total.requires_grad:
+        return {}
+    given = {name: tensor for name, tensor in floating(tree).items() if tensor.requires_grad}
+    found = torch.autograd.grad(total, list(given.values()), allow_unused=True)
+    return {n: slope for n, slope in zip(given, found, strict=True) if slope is not None}
+
+
 def difference(one: Any, other: Any) -> str:
     """The first tensor in which two trees differ by a bit; "" for equal ones."""
     ours, theirs = leaves(one), leaves(other)

@@ -6,6 +6,8 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
+from contract_mutants.modules import PLACE
+from contract_mutants.traces import Steps
 from torch import Tensor, nn
 
 from qgs.components import ContentCrossAttention, FreeCenters, GaussianHead, LatentQueries
@@ -14,14 +16,11 @@ from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,
     Fields,
-    FieldSpec,
     Loss,
     ModelDims,
-    Refinement,
 )
 from qgs.types import GaussianAttributes, ImageMemory, LayerPrediction, QueryState, Rendering, Views
 
-PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
 TURN = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
 
 
@@ -33,28 +32,14 @@ class MatmulThenFloat(FreeCenters):
         return (means @ TURN.to(means)).to(means)
 
 
-class TurnsInHalf(Refinement):
+class TurnsInHalf(Steps):
     name: ClassVar[str] = "turns_in_half"
-
-    def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
-        super().__init__(config, dims)
-        self.step = nn.Linear(dims.width, 3)
-
-    @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        return PLACE
-
-    @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        return PLACE
 
     def turned(self, step: Tensor, center: Tensor) -> Tensor:
         return (step.to(center) @ TURN.to(center)).to(center)
 
-    def forward(self, state: QueryState) -> QueryState:
-        center = state["place.center"]
-        moved = center + self.turned(self.step(state.features), center)
-        return state.replace(fields={"place.center": moved})
+    def moved(self, center: Tensor, step: Tensor) -> dict[str, Tensor]:
+        return super().moved(center, self.turned(step, center))
 
 
 class LinearThenFloat(TurnsInHalf):

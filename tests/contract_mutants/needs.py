@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from contract_mutants.modules import PLACE
 from torch import Tensor
 
 from qgs.components import ContentSelfAttention
-from qgs.contracts import ComponentConfig, Fields, FieldSpec
+from qgs.contracts import ComponentConfig, Fields
 from qgs.types import QueryState
-
-PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
 
 
 class NeedsTwoSaysOne(ContentSelfAttention):

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
+from contract_mutants.learning import RefusesWhatItDeclares
 from torch import Tensor, nn
 
 from qgs.components import ContentCrossAttention, MlpFeedForward
@@ -23,16 +24,9 @@ class DropsOut(MlpFeedForward):
         return F.dropout(super().forward(features), 0.2, self.training)
 
 
-class RefusesIntrinsics(TorchRenderer):
+class RefusesIntrinsics(RefusesWhatItDeclares):
     name: ClassVar[str] = "refuses_intrinsics"
     camera_gradients = ("c2w",)
-
-    def forward(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
-    ) -> Rendering:
-        if cameras.intrinsics.requires_grad:
-            raise ValueError("there is no gradient of intrinsics; detach them")
-        return super().forward(gaussians, cameras, background)
 
 
 class Fades(TorchRenderer):

@@ -7,12 +7,12 @@ import inspect
 import torch
 from torch import nn
 
+from qgs.composer.code_places import package_of
 from qgs.testing.audit import watched
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.memory import is_torchs_own
 from qgs.testing.other_process import ask
-from qgs.testing.places import package_of
 from qgs.testing.registry import ALL_SLOTS, PARAMETRIC, check
 
 SHOWN = 5

@@ -15,7 +15,7 @@ from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import PARAMETRIC, check
 from qgs.testing.subjects import Inputs, Sizes, inputs_of, tracked_inputs
-from qgs.testing.trees import distance, floating, scalar
+from qgs.testing.trees import distance, floating, scalar, slopes
 
 WARM_UP = (Sizes(batch=2, queries=6), Sizes(batch=3, queries=8, views=3, gaussians=3))
 LATER = (
@@ -54,12 +54,7 @@ def check_compiles(case: Case) -> None:
 def _slopes(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
     """Gradients in the inputs and in the parameters, but for those of zeros."""
     given = floating(inputs) | {f"parameter {n}": p for n, p in module.named_parameters()}
-    given = {name: x for name, x in given.items() if x.requires_grad}
-    total = scalar(outputs)
-    if not total.requires_grad:
-        return {}
-    slopes = torch.autograd.grad(total, list(given.values()), allow_unused=True)
-    return {n: x for n, x in zip(given, slopes, strict=True) if x is not None and bool(x.any())}
+    return {name: x for name, x in slopes(scalar(outputs), given).items() if bool(x.any())}
 
 
 def _expect_close(eager: dict[str, Tensor], compiled: dict[str, Tensor]) -> None:

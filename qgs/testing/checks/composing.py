@@ -10,6 +10,7 @@ from torch import nn
 from qgs.components import LatentQueries
 from qgs.composer import RecipeError
 from qgs.composer.recipe import Recipe, resolve
+from qgs.composer.slots import LAYER_SLOTS
 from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Fields, Plugin
 from qgs.model import QueryGaussianModel
 from qgs.testing.case import Case
@@ -107,7 +108,7 @@ def _recipe_with(case: Case) -> dict[str, Any]:
         "decoder": decoder,
     }
     losses = {"photometric": {"type": "qgs/photometric"}}
-    if slot in ("cross_attention", "self_attention", "feed_forward", "refinement"):
+    if slot in LAYER_SLOTS:
         decoder[slot] = chosen
     elif slot == "losses":
         losses["case"] = chosen

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import check
 from qgs.testing.subjects import Inputs, inputs_of, required_fields, tracked_inputs
-from qgs.testing.trees import difference, floating, scalar
+from qgs.testing.trees import difference, floating, scalar, slopes
 
 DRAWS = 8
 """Inputs that are tried: some hinge of a component may be shut for one of them."""
@@ -127,12 +126,7 @@ def _without_gradient(case: Case, reached: dict[str, Tensor]) -> str:
 
 def _reached(total: Tensor, inputs: Inputs) -> dict[str, Tensor]:
     """Of the inputs in which `total` has a gradient that is not zero: which items have one."""
-    if not total.requires_grad:
-        return {}
-    given = {name: x for name, x in floating(inputs).items() if x.requires_grad}
-    slopes = torch.autograd.grad(total, list(given.values()), allow_unused=True)
-    found = zip(given, slopes, strict=True)
-    return {n: _items(n, s != 0) for n, s in found if s is not None and bool(s.any())}
+    return {n: _items(n, s != 0) for n, s in slopes(total, inputs).items() if bool(s.any())}
 
 
 def _items(name: str, holds: Tensor) -> Tensor:

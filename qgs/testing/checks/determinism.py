@@ -9,6 +9,7 @@ import numpy
 import torch
 
 from qgs.testing.case import Case
+from qgs.testing.chance import drawn_from
 from qgs.testing.faults import expect
 from qgs.testing.other_process import ask
 from qgs.testing.registry import MODULES, PARAMETRIC, check
@@ -73,8 +74,7 @@ def check_training_draws_from_torch(case: Case) -> None:
 
 def _training_pass(case: Case, module: Any, seed: int) -> tuple[Any, torch.Tensor]:
     """Outputs, and torch's random state after them, of a forward pass from `seed`."""
-    with torch.random.fork_rng(devices=()):
-        torch.default_generator.manual_seed(seed)
+    with drawn_from(seed):
         outputs = cloned(module(*inputs_of(case).values()))
         return outputs, torch.get_rng_state()
 

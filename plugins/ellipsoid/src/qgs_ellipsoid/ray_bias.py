@@ -19,6 +19,7 @@ from torch import Tensor
 
 from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import normalised_rays
+from qgs_ellipsoid.rotations import unit
 
 NUMERATOR = 20
 """Features of the numerator; those of the denominator follow."""
@@ -56,14 +57,10 @@ def _cofactors(matrix: Tensor) -> Tensor:
     return torch.linalg.cross(matrix.roll(-1, -1), matrix.roll(-2, -1), dim=-2)
 
 
+UPWARD = (0.0, 0.0, 1.0)
+"""Stands for the direction of a ray that has none."""
+
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-
-
-def _unit(directions: Tensor) -> Tensor:
-    """Directions of length 1; the z axis for those of length 0."""
-    length = directions.norm(dim=-1, keepdim=True)
-    upward = directions.new_tensor([0.0, 0.0, 1.0])
-    return torch.where(length > 0, directions / torch.where(length > 0, length, 1), upward)
 
 
 @full_precision
@@ -79,7 +76,7 @@ def ray_features(patch_rays: Tensor, direction_eps: float = 1e-6) -> Tensor:
     trace_free = [mixed[..., i, i] - mixed[..., 2, 2] for i in (0, 1)]
     trace_free += [mixed[..., i, j] for i, j in OFF_DIAGONAL]
     numerator = [*_products(moments), *trace_free, *_products(directions)]
-    return torch.stack([*numerator, *_products(_unit(directions))], -2)
+    return torch.stack([*numerator, *_products(unit(directions, UPWARD))], -2)
 
 
 @full_precision
@@ -190,6 +187,6 @@ def ellipsoid_bias_direct(
     around = moments[:, None] - torch.linalg.cross(center[:, :, None], directions[:, None], dim=-1)
     whitening = (rotation / sigma_sq.sqrt()[..., None, :]).mT
     moment = torch.einsum("bnij,bnmj->bnmi", _cofactors(whitening), around)
-    along = torch.einsum("bnij,bmj->bnmi", whitening, _unit(directions))
+    along = torch.einsum("bnij,bmj->bnmi", whitening, unit(directions, UPWARD))
     distance_sq = moment.square().sum(-1) / along.square().sum(-1)
     return gamma * (-0.5 * distance_sq).clamp(bias_min, 0)

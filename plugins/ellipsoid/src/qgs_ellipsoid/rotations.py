@@ -8,13 +8,19 @@ from torch import Tensor
 
 from qgs.geometry.precision import full_precision
 
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def unit(v: Tensor, otherwise: tuple[float, ...]) -> Tensor:
+    """Vectors (..., C) of length 1; `otherwise` for those of length 0."""
+    length = v.norm(dim=-1, keepdim=True)
+    return torch.where(length > 0, v / torch.where(length > 0, length, 1), v.new_tensor(otherwise))
+
 
 @full_precision
 def unit_quats(quats: Tensor) -> Tensor:
     """Quaternions (..., 4) of length 1; the identity for those of length 0."""
-    length = quats.norm(dim=-1, keepdim=True)
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    return torch.where(length > 0, quats / torch.where(length > 0, length, 1), identity)
+    return unit(quats, IDENTITY)
 
 
 @full_precision
