@@ -1,4 +1,4 @@
-"""A fresh virtual environment with qgs and qgs-locus from their wheels.
+"""A fresh virtual environment with qgs and query-gaussians-locus from their wheels.
 
 Installing torch again for every test would take minutes. All packages of the present environment
 but qgs and its plugins are lent through a folder of links, so that qgs can only come from its
@@ -48,7 +48,7 @@ class FreshEnvironment:
 
 
 def make_fresh_environment(folder: Path) -> FreshEnvironment:
-    """Build the wheels of qgs and qgs-locus and install them into a new environment."""
+    """Build the wheels of qgs and query-gaussians-locus and install them into a new environment."""
     wheels = folder / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
     subprocess.run([*build, str(ROOT), str(ROOT / "plugins/locus")], check=True)

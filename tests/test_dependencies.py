@@ -22,6 +22,8 @@ ROOT = Path(__file__).parents[1]
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "griffe": "mkdocstrings",
+    "qgs": "query-gaussians",
+    **{f"qgs_{name}": f"query-gaussians-{name}" for name in ("locus", "ellipsoid")},
     "mpl_toolkits": "matplotlib",
     "pydantic_core": "pydantic",
     "skimage": "scikit-image",
@@ -43,7 +45,7 @@ AHEAD = {"a new plugin": {"pydantic"}}
 MADE_UP = {"placed-package"}
 """Packages that a test writes for itself."""
 
-FIRST_TO_BE_IMPORTED = ("qgs", "qgs.cli", "qgs.composer.builtin", "qgs.engine", "qgs.testing")
+FIRST_TO_BE_IMPORTED = ("qgs", "qgs.cli", "qgs.composer.registry", "qgs.engine", "qgs.testing")
 
 
 @dataclass(frozen=True)
@@ -122,10 +124,10 @@ def plugin(name: str) -> Source:
     return source(folder / "pyproject.toml", folder / "src" / f"qgs_{name}")
 
 
+PLUGINS = ("locus", "ellipsoid", "rooms", "datatools")
 SOURCES = {
-    "qgs": source(ROOT / "pyproject.toml", ROOT / "qgs"),
-    "qgs-locus": plugin("locus"),
-    "qgs-ellipsoid": plugin("ellipsoid"),
+    "query-gaussians": source(ROOT / "pyproject.toml", ROOT / "qgs"),
+    **{f"query-gaussians-{name}": plugin(name) for name in PLUGINS},
     "a new plugin": template("src"),
 }
 
@@ -165,7 +167,7 @@ def test_an_extra_is_imported_where_it_is_used_alone(name: str) -> None:
     }
     while more := {module for module in modules if at_once[module] & needy} - needy:
         needy |= more
-    if name == "qgs":
+    if name == "query-gaussians":
         assert "qgs.renderers.jit" in needy
         assert not needy & {m for m in modules if m.startswith("qgs.cli")}
         assert not needy & set(FIRST_TO_BE_IMPORTED)
@@ -183,7 +185,7 @@ def test_the_tests_of_a_new_plugin_require_what_they_import() -> None:
 def test_the_tests_of_qgs_require_what_they_import() -> None:
     folders = [ROOT / "tests", ROOT / "tools", *ROOT.glob("plugins/*/tests")]
     tests = source(ROOT / "pyproject.toml", *folders)
-    ours = {Path(path).stem for path in tests.files} | {"qgs", "qgs-locus", "qgs-ellipsoid"}
+    ours = {Path(path).stem for path in tests.files} | {"qgs", *(f"qgs-{name}" for name in PLUGINS)}
     ours |= {part for path in tests.files for part in Path(path).parts}
     ours = {name.replace("_", "-") for name in ours}
     used = {found for module in tests.files for found in tests.third_party(module)}

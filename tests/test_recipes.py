@@ -14,7 +14,14 @@ from qgs.composer import resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
-FILES = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
+OVERLAYS = ("dl3dv_2views", "dl3dv_4views", "dl3dv_6views")
+"""Laid over recipes with data; they say nothing of its type."""
+
+FILES = sorted(
+    path.relative_to(RECIPES).as_posix()
+    for path in RECIPES.rglob("*.yaml")
+    if path.stem not in OVERLAYS
+)
 EXPERIMENTS = ("re10k", "re10k_4096", "dl3dv", *(f"dl3dv_4096_{n}views" for n in (2, 4, 6)))
 PAIRS = ["tiny/{}.yaml", *(f"{{}}/{name}.yaml" for name in EXPERIMENTS)]
 ABLATIONS = {

@@ -25,15 +25,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from PIL import Image
+from qgs_datatools.packing import chunk_entry
 from upath import UPath
 
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data import ChunksSource
 from qgs.data.chunks.source import ChunksConfig
-from qgs.data.encoded import EncodedFrame, EncodedScene
+from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from qgs.data.stream import SampleStream
-from qgs.io.packing.records import chunk_entry
-from qgs.io.urls import opened_replacing, write_bytes
+from qgs.io.files import opened_replacing, write_bytes
 
 CHUNKS, SCENES, FRAMES = 24, 8, 16
 ROUNDS, IMAGES, GROWTH = 5, 160, 1.05

@@ -22,11 +22,10 @@ import torch
 from bench_data import chunks_at
 
 from qgs.composer import Recipe, resolve
-from qgs.data.loader import training_batches
-from qgs.engine.gradients import Gradients
-from qgs.engine.objective import Objective
+from qgs.data.stream import training_batches
+from qgs.engine.distributed import make_accelerator
+from qgs.engine.objective import Gradients, Objective
 from qgs.engine.optimizer import make_optimizer
-from qgs.engine.processes import make_accelerator
 
 TINY = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 ROUNDS, STEPS, BATCHES = 3, 3, 60

@@ -52,7 +52,7 @@ fingerprint() {
     {
         echo "$root"
         "$1/bin/python" --version
-        cat "$root"/{pyproject.toml,constraints.txt,plugins/{locus,ellipsoid}/pyproject.toml}
+        cat "$root"/{pyproject.toml,constraints.txt,plugins/*/pyproject.toml}
     } | sha256sum | cut -d' ' -f1
 }
 
@@ -61,12 +61,15 @@ install() {
     "$environment/bin/python" -m pip --version >/dev/null 2>&1 ||
         die "the virtual environment $environment has no pip." \
             "Add it with: $environment/bin/python -m ensurepip"
-    echo "qgs: installing qgs[$extras] and the plugins into $environment" >&2
+    echo "qgs: installing query-gaussians[$extras] and the plugins into $environment" >&2
+    local plugin plugins=()
+    for plugin in "$root"/plugins/*/; do
+        plugins+=(--editable "$plugin")
+    done
     # Modules are compiled when first imported: most of them never are.
     "$environment/bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
         --constraint "$root/constraints.txt" \
-        --editable "$root[$extras]" --editable "$root/plugins/locus" \
-        --editable "$root/plugins/ellipsoid" ||
+        --editable "$root[$extras]" "${plugins[@]}" ||
         die "the installation failed (see above); run the command again to retry."
     echo "qgs: installed in $((SECONDS - started)) s" >&2
 }

@@ -23,8 +23,8 @@ from unittest.mock import patch
 from guide_reference import PLUGINS
 
 import qgs
-from qgs.contracts.extras import MissingExtraError
-from qgs.io.atomic import write_text
+from qgs.contracts.component import MissingExtraError
+from qgs.io.files import write_text
 
 PAGE = Path(__file__).parents[1] / "docs/errors.md"
 BLOCK = re.compile(

@@ -23,8 +23,8 @@ from rich.console import Console
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.engine import RunFolder, train
-from qgs.engine.state import read_state
-from qgs.io.atomic import is_leftover
+from qgs.engine.checkpoint import read_state
+from qgs.io.files import is_leftover
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 

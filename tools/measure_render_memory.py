@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 
 from qgs.composer import resolve
-from qgs.data.loader import training_batches
+from qgs.data.stream import training_batches
 from qgs.engine.objective import Objective
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"

@@ -1,27 +1,127 @@
-"""A scene from photos to files: Gaussians, renders beside truth, depth, an orbit, cameras."""
+"""Which frames of a photo folder are reconstructed from, and which are compared with."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.analysis.orbit import orbit
-from qgs.analysis.pictures.figures import figure_picture, grid_figure
-from qgs.analysis.pictures.images import finer
 from qgs.data.sampling import Sample
-from qgs.io.atomic import replacing_entries, write_text
-from qgs.io.drawing import Picture, depth_picture, depth_range, rgb_picture, side_by_side
-from qgs.io.pictures import write_gif, write_png
+from qgs.drawing.figures import figure_picture, grid_figure
+from qgs.drawing.images import (
+    Picture,
+    depth_picture,
+    depth_range,
+    finer,
+    rgb_picture,
+    side_by_side,
+    write_gif,
+    write_png,
+)
+from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
 from qgs.metrics import mean_colour, nearest_input, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering
+
+
+def choose_frames(
+    total: int,
+    inputs: int,
+    span: int,
+    frames: Sequence[int] | None = None,
+    compare: Sequence[int] | None = None,
+    novel: int = 6,
+    held_out: Sequence[int] = (),
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Input frames and novel frames, from 0 to total - 1.
+
+    frames: the inputs; None spreads `inputs` of them over `span` frames in the middle of all, both
+    ends included, or over all when there are fewer. compare: the novel ones; None takes at most
+    `novel`, evenly spread over the frames between the inputs. held_out: frames that the model was
+    not trained on, of a folder that it was trained on; the inputs are then chosen from the others,
+    and compared are those between the inputs, where there are any.
+    Raises ValueError for frames that do not exist, come twice, or are both input and novel.
+    """
+    usable = [frame for frame in range(total) if frame not in held_out]
+    chosen = _middle(usable, inputs, max(span, inputs)) if frames is None else tuple(frames)
+    if compare is None:
+        between = [f for f in range(min(chosen), max(chosen) + 1) if f not in chosen]
+        between = [f for f in between if f in held_out] or between
+        compare = _evenly(between, min(novel, len(between)))
+    _check([*chosen, *compare], total)
+    return chosen, tuple(compare)
+
+
+def _middle(frames: Sequence[int], count: int, span: int) -> tuple[int, ...]:
+    if count > len(frames):
+        raise ValueError(f"{count} input views were asked for, but there are {len(frames)} photos")
+    span = min(span, len(frames))
+    first = (len(frames) - span) // 2
+    return _evenly(frames[first : first + span], count)
+
+
+def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
+    """`count` of `frames`, the first and the last among them; one alone is the middle one."""
+    last = len(frames) - 1
+    places = np.linspace(0, last, count).round() if count > 1 else np.full(count, last // 2)
+    return tuple(frames[int(place)] for place in places)
+
+
+def _check(frames: Sequence[int], total: int) -> None:
+    missing = [frame for frame in frames if not 0 <= frame < total]
+    if missing:
+        raise ValueError(f"frames {missing} do not exist; the photos are 0..{total - 1}")
+    twice = sorted({frame for frame in frames if list(frames).count(frame) > 1})
+    if twice:
+        raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
+
+
+def orbit(inputs: Cameras, depth: float, frames: int, sway: float = 0.12) -> Cameras:
+    """A loop (1, frames) that runs past the input cameras (1, V), there and back.
+
+    The base path is the input poses under a Gaussian kernel, so it has no corners. Around it the
+    camera sways by `sway` times `depth`, and looks at what lies `depth` world units ahead.
+    """
+    angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
+    poses = _smoothed(inputs.c2w[0], (1 - angles.cos()) / 2)
+    right, down, forward, centre = poses[:, :3].unbind(-1)
+    focus = centre + depth * forward
+    reach = sway * depth
+    eye = centre + reach * angles.sin()[:, None] * right
+    eye = eye - reach / 2 * angles.cos()[:, None] * down
+    c2w = look_at(eye, focus - eye, down)
+    intrinsics = inputs.intrinsics[:, :1].expand(1, frames, 4)
+    return Cameras(c2w[None], intrinsics, inputs.size)
+
+
+def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
+    """OpenCV poses c2w (..., 4, 4) at eye (..., 3), looking along `forward`, upright by `down`."""
+    forward = F.normalize(forward, dim=-1)
+    down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
+    right = torch.linalg.cross(down, forward)
+    top = torch.stack([right, down, forward, eye], -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], -2)
+
+
+def _smoothed(c2w_V44: Tensor, times_T: Tensor) -> Tensor:
+    """Poses (T, 4, 4) at times from 0, the first input, to 1, the last."""
+    count = c2w_V44.shape[0]
+    steps = times_T[:, None] * (count - 1) - torch.arange(count, device=times_T.device)
+    weights_TV = torch.softmax(-0.5 * (steps / 0.6) ** 2, -1)
+    mean = torch.einsum("tv,vij->tij", weights_TV, c2w_V44)
+    _, down, forward, centre = mean[:, :3].unbind(-1)
+    return look_at(centre, forward, down)
+
 
 ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
@@ -169,7 +269,7 @@ def _write_orbit(model: QueryGaussianModel, reconstruction: Reconstruction, file
 def orbit_path(
     inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
 ) -> Cameras:
-    """The loop of `qgs.analysis.orbit` about the middle of the rendered depths."""
+    """The loop of `qgs.analysis.reconstruction` about the middle of the rendered depths."""
     near, far = depth_range(depths)
     return finer(orbit(inputs, (near + far) / 2, frames), side)
 

@@ -10,7 +10,6 @@ import typer
 from qgs.cli import (
     bench,
     check_plugin,
-    data,
     demo,
     evaluate,
     inspect,
@@ -19,16 +18,18 @@ from qgs.cli import (
     train,
     weights,
 )
+from qgs.cli.plugin_commands import CommandGroup
 
 app = typer.Typer(
     name="qgs",
+    cls=CommandGroup,
     help="Query-based feed-forward 3D Gaussian splatting from composable, checked components.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
-_RECIPES = (inspect, train, evaluate, reconstruct, weights, data, bench, demo)
+_RECIPES = (inspect, train, evaluate, reconstruct, weights, bench, demo)
 _PLUGINS = (new_plugin, check_plugin)
 for _group in (*_RECIPES, *_PLUGINS):
     _group.register(app)
@@ -60,6 +61,6 @@ def _notes(error: Exception) -> list[str]:
 def _is_a_users_mistake(error: Exception) -> bool:
     if not isinstance(error, RuntimeError):
         return True
-    from qgs.contracts.extras import MissingExtraError
+    from qgs.contracts.component import MissingExtraError
 
     return isinstance(error, MissingExtraError)

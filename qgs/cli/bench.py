@@ -56,8 +56,8 @@ def bench(
     from qgs.composer import resolve
     from qgs.engine.bench import Measures, Subject, workload_of
     from qgs.engine.bench import bench as measure
-    from qgs.engine.bench.report import refuse_other_file
-    from qgs.engine.device import choose_device
+    from qgs.engine.bench.run import refuse_other_file
+    from qgs.engine.distributed import choose_device
 
     if json is not None:
         refuse_other_file(json)

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from qgs.engine.bench import Report, Spread
-from qgs.engine.bench.tasks import Operation
+from qgs.engine.bench.work import Operation
 
 MEBIBYTE = 2**20
 CALLED = {

@@ -45,10 +45,16 @@ def demo(
     from rich.console import Console
 
     from qgs.analysis.report import report_html
-    from qgs.cli.contest import StoppedError, compete, resolve_fairly, table_of
-    from qgs.cli.contest_report import report_of, write_examples
+    from qgs.cli.contest import (
+        StoppedError,
+        compete,
+        report_of,
+        resolve_fairly,
+        table_of,
+        write_examples,
+    )
     from qgs.engine import TrainingError
-    from qgs.io.atomic import write_text
+    from qgs.io.files import write_text
 
     console = Console()
     resolved = resolve_fairly(files, seconds, seed)

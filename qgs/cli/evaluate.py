@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from qgs.composer import Recipe
-    from qgs.engine.scores import Evaluation
+    from qgs.engine.results import Evaluation
     from qgs.model import QueryGaussianModel
 
 
@@ -80,7 +80,7 @@ def evaluate(
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
     from qgs.composer import resolve
-    from qgs.engine.device import choose_device
+    from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.io.checkpoint import load, load_extra, load_recipe
 
@@ -148,7 +148,7 @@ def compare_results(
     out: folder for comparison.json and comparison.md; None writes nothing.
     """
     from qgs.engine.comparison import Comparisons
-    from qgs.engine.stored import read_results
+    from qgs.engine.results import read_results
 
     results = [read_results(run) for run in runs]
     comparisons = Comparisons.of(results, across_protocols)

@@ -49,7 +49,7 @@ def compose(
 
     from qgs.cli.tables import parameter_table
     from qgs.composer import resolve
-    from qgs.composer.show import annotated
+    from qgs.composer.recipe import annotated
 
     resolved = resolve(recipe, overrides or ())
     typer.echo(annotated(resolved))

@@ -92,7 +92,7 @@ def _read_in_a_recipe(name: str) -> object:
     """What a YAML 1.2 reader takes `name` for when it stands without quotes."""
     import yaml
 
-    from qgs.composer.yaml12 import Yaml12Loader, scalar_value
+    from qgs.composer.yaml_text import Yaml12Loader, scalar_value
 
     node = yaml.compose(f"[{name}]", Loader=Yaml12Loader).value[0]
     return scalar_value(node.tag, node.value)
@@ -122,7 +122,7 @@ def write_plugin(name: str, folder: Path) -> None:
     Raises FileExistsError if there is something at `folder`, whatever it is, and OSError if no
     folder can be made there.
     """
-    from qgs.io.atomic import new_folder
+    from qgs.io.files import new_folder
 
     if folder.exists() or folder.is_symlink():
         raise FileExistsError(

@@ -10,11 +10,11 @@ from rich.table import Table
 from torch import nn
 
 from qgs.composer import Recipe
+from qgs.composer.errors import did_you_mean
+from qgs.composer.recipe import flat
 from qgs.composer.registry import InstalledPlugin, default_config, load_sound_plugins
-from qgs.composer.show import flat
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
-from qgs.composer.suggest import did_you_mean
-from qgs.composer.yaml12 import dump
+from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, Fields
 
 

@@ -1,17 +1,18 @@
 """The default components: TokenGS, one file per slot."""
 
 from qgs.components.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
-from qgs.components.centers import FreeCenters
-from qgs.components.cross_attention import ContentCrossAttention
+from qgs.components.centers import FreeCenters, posact
+from qgs.components.decoder import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    MlpFeedForward,
+    NoRefinement,
+)
 from qgs.components.encoder import MultiViewViT
-from qgs.components.feed_forward import MlpFeedForward
 from qgs.components.head import GaussianHead
-from qgs.components.layout import TOKENGS
-from qgs.components.position import posact
 from qgs.components.queries import LatentQueries
-from qgs.components.refinement import NoRefinement
-from qgs.components.self_attention import ContentSelfAttention
 from qgs.components.supervision import LayerSupervision
+from qgs.components.weights import TOKENGS
 from qgs.contracts import Component
 
 COMPONENTS: tuple[type[Component], ...] = (

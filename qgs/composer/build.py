@@ -7,14 +7,13 @@ from typing import Any
 
 import torch
 
-from qgs.composer.builtin import BUILTIN
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import RecipeError, RecipeProblem
-from qgs.composer.nodes import Path
-from qgs.composer.promises import hold_to_promise
-from qgs.composer.registry import component_failure
+from qgs.composer.flow import hold_to_promise
+from qgs.composer.nodes import KeyPath
+from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Component, ModelComponent, ModelDims, Refinement, SceneSource
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
 
 
@@ -55,7 +54,7 @@ def _constructed(chosen: Chosen, *arguments: Any) -> Any:
 
 
 def build_model(
-    parts: Mapping[Path, Chosen],
+    parts: Mapping[KeyPath, Chosen],
     dims: ModelDims,
     layer_scale: float,
     seed: int,
@@ -75,7 +74,7 @@ def build_model(
 
 
 def _assemble(
-    parts: Mapping[Path, Chosen], dims: ModelDims, layer_scale: float, tree: Mapping[str, Any]
+    parts: Mapping[KeyPath, Chosen], dims: ModelDims, layer_scale: float, tree: Mapping[str, Any]
 ) -> QueryGaussianModel:
     def at(*path: str) -> Any:
         return build(parts["model", *path], dims)

@@ -1,17 +1,124 @@
-"""A recipe file, or a mapping, with everything it extends."""
+"""A recipe file with everything it extends, and `--set` overrides laid over it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qgs.composer.errors import Problems
-from qgs.composer.loader import load_mapping
-from qgs.composer.merge import merge
-from qgs.composer.nodes import ListNode, MapNode, Node, Origin, ScalarNode, from_plain, is_null
-from qgs.composer.suggest import nearest
+from qgs.composer.errors import Problems, nearest
+from qgs.composer.nodes import (
+    KeyPath,
+    ListNode,
+    MapNode,
+    Node,
+    Origin,
+    ScalarNode,
+    from_plain,
+    is_null,
+)
+from qgs.composer.slots import type_at
+from qgs.composer.yaml_text import load_mapping, load_text
+
+TAGS = ("type", "kind")
+"""Keys that say what a mapping is; a node with another tag keeps nothing of the old one."""
+
+
+def merge(base: Node, over: Node, path: KeyPath = ()) -> Node:
+    """`over` laid over `base`, both at `path`.
+
+    `null` replaces what it lies over: in place of an option it is a value, in place of a component
+    or a section it leaves the default, in place of a swap it drops the swap.
+    """
+    if not (isinstance(base, MapNode) and isinstance(over, MapNode)):
+        return over
+    if _replaces(base, over, path):
+        return over
+    items, keys = dict(base.items), dict(base.keys)
+    for key, node in over.items.items():
+        below = (*path, key)
+        if path == ("swap",) and is_null(node) and not is_null(base.items.get(key)):
+            del items[key], keys[key]
+            continue
+        if below == ("plugins",):
+            node = _united(items.get(key), node)
+        items[key] = merge(items[key], node, below) if key in items else node
+        keys[key] = over.keys[key]
+    return MapNode(over.origin, items, keys)
+
+
+def _united(base: Node | None, over: Node) -> Node:
+    """The items of `base` and those that `over` adds, so that an overlay names its own plugins."""
+    if not (isinstance(base, ListNode) and isinstance(over, ListNode)):
+        return over
+    known = [item.value for item in base.items if isinstance(item, ScalarNode)]
+    added = (i for i in over.items if not (isinstance(i, ScalarNode) and i.value in known))
+    return ListNode(over.origin, (*base.items, *added))
+
+
+def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
+    if len(path) == 2 and path[0] == "swap":
+        return True
+    for tag in TAGS:
+        if tag in over.items:
+            before = type_at(base, path) if tag == "type" else _scalar(base, tag)
+            after = type_at(over, path) if tag == "type" else _scalar(over, tag)
+            if before is not None and before != after:
+                return True
+    return False
+
+
+def _scalar(node: MapNode, key: str) -> object:
+    value = node.items.get(key)
+    return value.value if isinstance(value, ScalarNode) else None
+
+
+def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
+    """`tree` with every override laid over it in order; the n-th has the origin `--set #n`."""
+    if isinstance(overrides, str):
+        problems.stop(
+            Origin("overrides"),
+            "",
+            f"overrides are a list of strings, got the string {overrides!r}",
+            f"write `overrides=[{overrides!r}]`",
+        )
+        return tree
+    for number, text in enumerate(overrides, start=1):
+        over = _read_override(text, Origin(f"--set #{number}"), problems)
+        if over is not None:
+            merged = merge(tree, over)
+            assert isinstance(merged, MapNode)
+            tree = merged
+    return tree
+
+
+def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode | None:
+    name, equals, value = text.partition("=")
+    path = name.strip().split(".")
+    if not equals or not all(path):
+        problems.add(
+            origin,
+            name.strip(),
+            f"{text!r} is no override",
+            "write `path.to.option=value`, such as `model.queries.count=128`",
+        )
+        return None
+    if path[0] == "extends" or (path[0] == "swap" and len(path) > 1):
+        fix = "write a recipe that extends both, or set single options"
+        if path[0] == "swap":
+            fix = "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`"
+        problems.add(origin, name.strip(), f"an override cannot set `{name.strip()}`", fix)
+        return None
+    node = load_text(value, origin.file, problems, line=0, path=tuple(path))
+    return None if node is None else _nest(path, node, origin)
+
+
+def _nest(path: list[str], node: Node, origin: Origin) -> MapNode:
+    for key in reversed(path):
+        node = MapNode(origin, {key: node}, {key: origin})
+    assert isinstance(node, MapNode)
+    return node
 
 
 def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:

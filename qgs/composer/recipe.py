@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from qgs.composer.build import build_model, build_plain
-from qgs.composer.declared import check_declarations
 from qgs.composer.decode import Chosen, decode_places
 from qgs.composer.errors import Problems
-from qgs.composer.files import read_recipe
-from qgs.composer.flow import check_flow, decoded_layers, execution_order
-from qgs.composer.nodes import MapNode, Origin, Path, from_plain, locate
-from qgs.composer.overrides import apply_overrides
-from qgs.composer.places import expand
+from qgs.composer.files import apply_overrides, read_recipe
+from qgs.composer.flow import check_declarations, check_flow, decoded_layers, execution_order
+from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, from_plain, locate
+from qgs.composer.places import apply_swaps, expand
 from qgs.composer.registry import PluginError, Registry
-from qgs.composer.resolved import Resolution
 from qgs.composer.sections import Settings, check_tree, decode_settings, load_plugins
-from qgs.composer.slots import DEFAULT_LOSSES
-from qgs.composer.swap import apply_swaps
+from qgs.composer.slots import DEFAULT_LOSSES, LAYER_SLOTS, MODEL_SLOTS
+from qgs.composer.yaml_text import dump
 from qgs.contracts import (
+    ComponentConfig,
     EvaluationConfig,
     Loss,
     ModelDims,
@@ -35,6 +33,116 @@ from qgs.contracts import (
     ViewsConfig,
 )
 from qgs.model import QueryGaussianModel
+
+
+class Resolution:
+    """Builds the resolved tree and its provenance side by side.
+
+    tree: plain values, composing it again gives the same tree. provenance: dotted path of each
+    value to `FILE:LINE`, `--set #n`, or the default that set it.
+    """
+
+    def __init__(
+        self,
+        source: MapNode,
+        settings: Settings,
+        registry: Registry,
+        parts: Mapping[KeyPath, Chosen],
+    ) -> None:
+        self.source = source
+        self.parts = parts
+        self.tree: dict[str, Any] = {}
+        self.provenance: dict[str, str] = {}
+        self._put_settings((), settings.recipe)
+        names = [name for name in registry.plugins if name != "qgs"]
+        self._put(("plugins",), names, self._written(("plugins",)))
+        self._put_settings(("model",), settings.model)
+        for name in MODEL_SLOTS[:2]:
+            self._put_component(("model", name))
+        self._put_settings(("model", "decoder"), settings.decoder)
+        self._put_decoder(settings.decoder.depth)
+        for name in MODEL_SLOTS[2:]:
+            self._put_component(("model", name))
+        self._put_losses()
+        if ("data",) in parts:
+            self._put_component(("data",))
+        self._put_settings(("views",), settings.views)
+        self._put_settings(("training",), settings.training)
+        self._put_settings(("evaluation",), settings.evaluation)
+
+    def _put_settings(self, path: KeyPath, config: ComponentConfig) -> None:
+        for name, value in config.model_dump(mode="json").items():
+            self._put((*path, name), value, self._written((*path, name)))
+
+    def _put_component(self, path: KeyPath, chosen: Chosen | None = None) -> None:
+        chosen = chosen or self.parts[path]
+        node = chosen.place.node
+        items = node if isinstance(node, MapNode) else MapNode(chosen.place.origin)
+        kind = items.keys.get("type")
+        self._put((*path, "type"), chosen.type, str(kind) if kind else "default of the slot")
+        for name, value in chosen.config.model_dump(mode="json").items():
+            self._put_option((*path, name), value, items.items.get(name), items, chosen.type)
+
+    def _put_option(
+        self, path: KeyPath, value: Any, node: Node | None, parent: MapNode, owner: str
+    ) -> None:
+        """Put an option, going into mappings that are written in part."""
+        if isinstance(value, dict) and value and isinstance(node, MapNode):
+            for name, item in value.items():
+                self._put_option((*path, name), item, node.items.get(name), node, owner)
+            return
+        origin = parent.keys.get(path[-1])
+        self._put(path, value, str(origin) if origin else f"default of {owner}")
+
+    def _put_decoder(self, depth: int) -> None:
+        """The template, then every layer that differs; a template that no layer uses gives way."""
+        overrides: list[tuple[int, str]] = []
+        for name in LAYER_SLOTS:
+            template = self.parts["model", "decoder", name]
+            layers = [
+                self.parts["model", "decoder", "layers", str(index), name] for index in range(depth)
+            ]
+            if all(_same(layer, layers[0]) for layer in layers):
+                template = layers[0]
+            self._put_component(("model", "decoder", name), template)
+            overrides += [(i, name) for i, layer in enumerate(layers) if not _same(layer, template)]
+        for index, name in sorted(overrides, key=lambda pair: pair[0]):
+            self._put_component(("model", "decoder", "layers", str(index), name))
+
+    def _put_losses(self) -> None:
+        self.tree["losses"] = {}
+        for path in self.parts:
+            if path[0] == "losses":
+                self._put_component(path)
+
+    def _put(self, path: KeyPath, value: Any, origin: str) -> None:
+        node = self.tree
+        for key in path[:-1]:
+            node = node.setdefault(key, {})
+        node[path[-1]] = value
+        if isinstance(value, dict) and value:
+            for below in _paths_below(value, path):
+                self.provenance[".".join(below)] = origin
+        else:
+            self.provenance[".".join(path)] = origin
+
+    def _written(self, path: KeyPath) -> str:
+        node = self.source
+        for step in path[:-1]:
+            node = node.child_map(step)
+        return str(node.keys[path[-1]]) if path[-1] in node.items else "default"
+
+
+def _same(a: Chosen, b: Chosen) -> bool:
+    return a.type == b.type and a.config == b.config
+
+
+def _paths_below(value: Mapping[str, Any], path: KeyPath) -> list[KeyPath]:
+    found: list[KeyPath] = []
+    for key, item in value.items():
+        below = (*path, key)
+        found += _paths_below(item, below) if isinstance(item, dict) and item else [below]
+    return found
 
 
 @dataclass(frozen=True)
@@ -49,7 +157,7 @@ class Recipe:
 
     tree: Mapping[str, Any]
     provenance: Mapping[str, str]
-    parts: Mapping[Path, Chosen]
+    parts: Mapping[KeyPath, Chosen]
     dims: ModelDims
     layer_scale: float
     seed: int
@@ -82,7 +190,7 @@ class Recipe:
 
 
 def resolve(
-    recipe: str | FilePath | Mapping[str, Any],
+    recipe: str | Path | Mapping[str, Any],
     overrides: Sequence[str] = (),
     plugins: Sequence[Plugin] = (),
 ) -> Recipe:
@@ -118,7 +226,10 @@ def _with_default_losses(tree: MapNode) -> MapNode:
 
 
 def _check_components(
-    parts: Mapping[Path, Chosen | None], settings: Settings, registry: Registry, problems: Problems
+    parts: Mapping[KeyPath, Chosen | None],
+    settings: Settings,
+    registry: Registry,
+    problems: Problems,
 ) -> None:
     """Check components against the rest of the recipe, as far as that could be decoded."""
     if not settings.sizes_known:
@@ -159,7 +270,7 @@ def _finish(
     tree: MapNode,
     settings: Settings,
     registry: Registry,
-    parts: Mapping[Path, Chosen | None],
+    parts: Mapping[KeyPath, Chosen | None],
 ) -> Recipe:
     chosen = {path: part for path, part in parts.items() if part is not None}
     resolution = Resolution(tree, settings, registry, chosen)
@@ -177,3 +288,40 @@ def _finish(
         evaluation=settings.evaluation,
         plugin_versions={name: plugin.version for name, plugin in registry.plugins.items()},
     )
+
+
+def annotated(recipe: Recipe) -> str:
+    """The resolved recipe in YAML; comments, aligned at the right, say what set each value."""
+    lines = list(_lines(recipe.tree, (), recipe.provenance))
+    width = max(len(text) for text, _ in lines)
+    return "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)
+
+
+def flat(tree: Mapping[str, Any], path: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Dotted path to value, mappings opened."""
+    values: dict[str, Any] = {}
+    for key, value in tree.items():
+        below = (*path, key)
+        if isinstance(value, Mapping) and value:
+            values |= flat(value, below)
+        else:
+            values[".".join(below)] = value
+    return values
+
+
+def _lines(
+    tree: Mapping[str, Any], path: tuple[str, ...], provenance: Mapping[str, str]
+) -> Iterator[tuple[str, str]]:
+    indent = "  " * len(path)
+    for key, value in tree.items():
+        below = (*path, key)
+        word = _word(key)
+        if isinstance(value, Mapping) and value:
+            yield f"{indent}{word}:", ""
+            yield from _lines(value, below, provenance)
+        else:
+            yield f"{indent}{word}: {_word(value)}", provenance[".".join(below)]
+
+
+def _word(value: Any) -> str:
+    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")

@@ -9,11 +9,10 @@ from typing import Literal
 from pydantic import Field
 
 from qgs.composer.decode import ConfigT, decode_config
-from qgs.composer.errors import Problems
-from qgs.composer.nodes import ListNode, MapNode, Origin, Path, ScalarNode, is_null, kind_of
+from qgs.composer.errors import Problems, did_you_mean
+from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, ScalarNode, is_null, kind_of
 from qgs.composer.registry import PluginError, Registry, builtin, load_plugin, not_installed
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS
-from qgs.composer.suggest import did_you_mean
 from qgs.contracts import ComponentConfig, EvaluationConfig, Plugin, TrainingConfig, ViewsConfig
 
 
@@ -43,7 +42,7 @@ class RecipeSettings(ComponentConfig):
     init_from: str | None = None
 
 
-_SETTINGS: dict[Path, type[ComponentConfig]] = {
+_SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
     (): RecipeSettings,
     ("model",): ModelSettings,
     ("model", "decoder"): DecoderSettings,
@@ -52,14 +51,14 @@ _SETTINGS: dict[Path, type[ComponentConfig]] = {
 
 TOP_SECTIONS = ("plugins", "swap", "model", "losses", "data", "views", "training", "evaluation")
 
-_CHILDREN: dict[Path, tuple[str, ...]] = {
+_CHILDREN: dict[KeyPath, tuple[str, ...]] = {
     (): TOP_SECTIONS,
     ("model",): (*MODEL_SLOTS, "decoder"),
     ("model", "decoder"): (*LAYER_SLOTS, "layers"),
 }
 """Keys of a section that are no settings of its own."""
 
-_MAPPINGS: tuple[Path, ...] = (
+_MAPPINGS: tuple[KeyPath, ...] = (
     ("model",),
     ("model", "decoder"),
     ("model", "decoder", "layers"),
@@ -95,7 +94,7 @@ def check_tree(tree: MapNode, problems: Problems) -> MapNode:
     return tree
 
 
-def _without_misfit(tree: MapNode, path: Path, above: Path, problems: Problems) -> MapNode:
+def _without_misfit(tree: MapNode, path: KeyPath, above: KeyPath, problems: Problems) -> MapNode:
     name, rest = path[0], path[1:]
     node = tree.items.get(name)
     if node is None or is_null(node):
@@ -126,7 +125,7 @@ def _report_unknown(tree: MapNode, problems: Problems) -> None:
             )
 
 
-def _fix_key(key: str, path: Path, known: set[str]) -> str:
+def _fix_key(key: str, path: KeyPath, known: set[str]) -> str:
     for home, children in _CHILDREN.items():
         if home != path and key in {*children, *_SETTINGS[home].model_fields}:
             return f"did you mean `{'.'.join((*home, key))}`?"
@@ -136,7 +135,7 @@ def _fix_key(key: str, path: Path, known: set[str]) -> str:
 def decode_settings(tree: MapNode, problems: Problems) -> Settings:
     """All settings of a checked tree; defaults where nothing is written."""
 
-    def read(path: Path, config: type[ConfigT]) -> ConfigT | None:
+    def read(path: KeyPath, config: type[ConfigT]) -> ConfigT | None:
         node = tree
         for step in path:
             node = node.child_map(step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from qgs.composer.nodes import MapNode, Node, Path, ScalarNode, is_null
+from qgs.composer.nodes import KeyPath, MapNode, Node, ScalarNode, is_null
 from qgs.contracts import (
     Centers,
     Component,
@@ -50,7 +50,7 @@ SLOTS = {
         Slot(Supervision, "qgs/layers"),
         Slot(Renderer, "qgs/auto"),
         Slot(Loss, None),
-        Slot(SceneSource, "qgs/rooms"),
+        Slot(SceneSource, None),
     )
 }
 
@@ -61,7 +61,7 @@ DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibilit
 """What a recipe without `losses` is trained with."""
 
 
-def slot_at(path: Path) -> Slot | None:
+def slot_at(path: KeyPath) -> Slot | None:
     """The slot at a place of a recipe; None where no component belongs."""
     match path:
         case ("model", name) if name in MODEL_SLOTS:
@@ -77,7 +77,7 @@ def slot_at(path: Path) -> Slot | None:
     return None
 
 
-def type_at(node: Node | None, path: Path) -> Any:
+def type_at(node: Node | None, path: KeyPath) -> Any:
     """The `type` of the component written as `node` at `path`: its own, or the slot's default.
 
     `type: null` leaves the default, as `null` does in place of a component.

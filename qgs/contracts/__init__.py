@@ -1,7 +1,5 @@
 """The contracts: one abstract class per slot, and what all components share."""
 
-from qgs.contracts.attention import AttentionWeights
-from qgs.contracts.centers import Centers
 from qgs.contracts.component import (
     Component,
     ComponentConfig,
@@ -15,13 +13,17 @@ from qgs.contracts.component import (
     component_of,
     without_effect,
 )
-from qgs.contracts.cross_attention import CrossAttention
 from qgs.contracts.data import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.contracts.decoder import (
+    AttentionWeights,
+    CrossAttention,
+    FeedForward,
+    Refinement,
+    SelfAttention,
+)
 from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
-from qgs.contracts.feed_forward import FeedForward
-from qgs.contracts.head import Head
-from qgs.contracts.layout import LayoutError, Rename, Unused, WeightLayout
-from qgs.contracts.loss import Loss
+from qgs.contracts.head import Centers, Head
+from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.plugin import (
     CONTRACT_VERSION,
     ENTRY_POINT_GROUP,
@@ -30,11 +32,9 @@ from qgs.contracts.plugin import (
     Plugin,
 )
 from qgs.contracts.queries import Queries
-from qgs.contracts.refinement import Refinement
 from qgs.contracts.renderer import Renderer, RendererConfig
-from qgs.contracts.self_attention import SelfAttention
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
-from qgs.contracts.supervision import Supervision
+from qgs.contracts.weights import LayoutError, Rename, Unused, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",

@@ -173,3 +173,7 @@ class ModelComponent(Component, torch.nn.Module):
         By default to all but 1-d parameters (biases, norms, LayerScale), as in the LocusGS release.
         """
         return parameter.ndim != 1
+
+
+class MissingExtraError(RuntimeError):
+    """An optional package is needed; the message names it and the command that installs it."""

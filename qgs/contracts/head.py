@@ -1,4 +1,4 @@
-"""Slot `head`: query features to Gaussian attributes."""
+"""Slots `head` and `centers`: from query features to Gaussians."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from qgs.contracts.component import ModelComponent
 from qgs.types import GaussianAttributes, QueryState
@@ -32,3 +33,18 @@ class Head(ModelComponent):
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
         """No weight decay on a head (TokenGS release)."""
         return False
+
+
+class Centers(ModelComponent):
+    """(raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
+
+    The state is the one after the refinement of the decoded layer. Means are finite for finite
+    offsets. Raises KeyError for a field the state lacks, which the composer rules out through
+    `requires`.
+    """
+
+    slot: ClassVar[str] = "centers"
+
+    @abstractmethod
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """World-frame means."""

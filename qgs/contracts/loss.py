@@ -1,8 +1,9 @@
-"""Slot `losses`: what training minimises."""
+"""Slots `losses` and `supervision`: what training minimises, and at which layers."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar, Literal, TypeAlias
 
 import torch
@@ -40,3 +41,16 @@ class Loss(Component, torch.nn.Module):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
         """The terms of this loss, each multiplied by its weight and averaged over scenes."""
+
+
+class Supervision(Component):
+    """The supervised decoder layers and their weights."""
+
+    slot: ClassVar[str] = "supervision"
+
+    def __init__(self, config: ComponentConfig) -> None:
+        self.config = config
+
+    @abstractmethod
+    def weights(self) -> Mapping[int, float]:
+        """Layer number (1 is the first, ascending) to weight; the weights sum to 1."""

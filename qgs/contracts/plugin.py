@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from qgs.contracts.component import Component, ComponentConfig
-from qgs.contracts.layout import WeightLayout
+from qgs.contracts.weights import WeightLayout
 
 CONTRACT_VERSION = 1
 """Raised when a contract changes so that components written for the old one no longer fit."""

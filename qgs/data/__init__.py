@@ -3,16 +3,8 @@
 from qgs.contracts import Component
 from qgs.data.chunks import ChunksSource
 from qgs.data.dl3dv import Dl3dvSource
-from qgs.data.photos import PhotosSource, read_photos
-from qgs.data.rooms import RoomsSource
+from qgs.data.photos.source import PhotosSource, read_photos
 
-COMPONENTS: tuple[type[Component], ...] = (ChunksSource, Dl3dvSource, PhotosSource, RoomsSource)
+COMPONENTS: tuple[type[Component], ...] = (ChunksSource, Dl3dvSource, PhotosSource)
 
-__all__ = [
-    "COMPONENTS",
-    "ChunksSource",
-    "Dl3dvSource",
-    "PhotosSource",
-    "RoomsSource",
-    "read_photos",
-]
+__all__ = ["COMPONENTS", "ChunksSource", "Dl3dvSource", "PhotosSource", "read_photos"]

@@ -1,8 +1,16 @@
-"""Paths that are folders of this machine or fsspec URLs."""
+"""Local paths, fsspec URLs, and zip archives read in place as folders."""
 
 from __future__ import annotations
 
+import io
+import zipfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from threading import Lock
+from typing import IO
 
 from upath import UPath
 
@@ -57,3 +65,139 @@ def stays_inside(name: str) -> bool:
     """Whether a relative name, of either kind of slash, leads nowhere above where it starts."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
+
+
+_OPEN = 8  # archives kept open by a process
+
+
+class Archive:
+    """An open zip file. Raises ValueError for a file that is none, or that leads outside itself.
+
+    files: to each path, with slashes and without `./`, the name under which the archive has it.
+    """
+
+    def __init__(self, path: UPath) -> None:
+        try:
+            self._zip = zipfile.ZipFile(str(path) if is_local(path) else path.open("rb"))
+        except (zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(
+                f"{path} is no zip archive or is cut off ({error}): download it again"
+            ) from error
+        self.files: dict[str, str] = {}
+        self.folders: dict[str, set[str]] = {"": set()}
+        for name in self._zip.namelist():
+            parts = PurePosixPath(name.replace("\\", "/")).parts
+            if not parts:
+                continue
+            if not stays_inside(name):
+                raise ValueError(
+                    f"{path} holds the name {name!r}, which leads outside the archive: it is not "
+                    "read. Get the archive from its publisher again"
+                )
+            self._add(name, parts)
+
+    def _add(self, name: str, parts: tuple[str, ...]) -> None:
+        for depth, part in enumerate(parts):
+            self.folders.setdefault("/".join(parts[:depth]), set()).add(part)
+        if name.endswith(("/", "\\")):
+            self.folders.setdefault("/".join(parts), set())
+        else:
+            self.files["/".join(parts)] = name
+
+    def read(self, member: str) -> bytes:
+        """The bytes of a file. Raises OSError for one that is absent or damaged."""
+        try:
+            return self._zip.read(self.files[member])
+        except KeyError as error:
+            raise FileNotFoundError(f"the archive has no file {member}") from error
+        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+            raise OSError(f"the archive is damaged there: {error}") from error
+
+
+class _Pool:
+    """The archives that this process read last; those that fall out close with their last use."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._open: OrderedDict[str, Archive] = OrderedDict()
+        self._lock = Lock()
+
+    def archive(self, path: UPath) -> Archive:
+        name = str(path)
+        with self._lock:
+            if name not in self._open:
+                while len(self._open) >= self._limit:
+                    self._open.popitem(last=False)
+                self._open[name] = Archive(path)
+            self._open.move_to_end(name)
+            return self._open[name]
+
+
+_pool = _Pool(_OPEN)
+
+
+@dataclass(frozen=True)
+class ArchivePath:
+    """A file or folder inside a zip archive, with the part of pathlib's interface readers use.
+
+    archive: the zip file. member: name inside it, "" for its top. Nothing stays open in a copy made
+    by pickling: processes open archives by name.
+    """
+
+    archive: UPath
+    member: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.archive}/{self.member}" if self.member else str(self.archive)
+
+    def __truediv__(self, name: str) -> ArchivePath:
+        return ArchivePath(self.archive, str(PurePosixPath(self.member, name)))
+
+    @property
+    def name(self) -> str:
+        """Last part of the path."""
+        return PurePosixPath(self.member).name or self.archive.name
+
+    @property
+    def suffix(self) -> str:
+        """The name's suffix, such as .png."""
+        return PurePosixPath(self.name).suffix
+
+    @property
+    def parent(self) -> ArchivePath:
+        """The folder that holds it; the top holds itself."""
+        folder = str(PurePosixPath(self.member).parent)
+        return ArchivePath(self.archive, "" if folder == "." else folder)
+
+    @property
+    def _archive(self) -> Archive:
+        return _pool.archive(self.archive)
+
+    def is_file(self) -> bool:
+        """Whether it is a file of the archive."""
+        return self.member in self._archive.files
+
+    def is_dir(self) -> bool:
+        """Whether it is a folder of the archive."""
+        return self.member in self._archive.folders
+
+    def iterdir(self) -> Iterator[ArchivePath]:
+        """What the folder holds, by name. Raises FileNotFoundError when it is no folder."""
+        names = self._archive.folders.get(self.member)
+        if names is None:
+            raise FileNotFoundError(f"{self} is no folder of the archive")
+        return (self / name for name in sorted(names))
+
+    def read_bytes(self) -> bytes:
+        """The file's bytes. Raises OSError for one that is absent or damaged."""
+        return self._archive.read(self.member)
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        """The file's text."""
+        return self.read_bytes().decode(encoding)
+
+    def open(self, mode: str = "rb") -> IO[bytes]:
+        """The file, open for reading bytes."""
+        if mode != "rb":
+            raise ValueError(f"files of archives open with mode 'rb', not {mode!r}")
+        return io.BytesIO(self.read_bytes())

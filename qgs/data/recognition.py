@@ -6,8 +6,8 @@ import re
 
 from upath import UPath
 
-from qgs.data.chunks.listing import INDEX, SUFFIX
-from qgs.data.readers import formats_of
+from qgs.data.chunks.files import INDEX, SUFFIX
+from qgs.data.photos.formats import formats_of
 
 _HASH = re.compile(r"[0-9a-f]{64}")
 _BENCHMARK = ("gaussian_splat", "nerfstudio")

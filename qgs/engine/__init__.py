@@ -6,10 +6,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from qgs.engine.collapse import CollapseError, NonFiniteError, TrainingError
     from qgs.engine.evaluation import Evaluation, evaluate
     from qgs.engine.folder import RunFolder
-    from qgs.engine.trainer import TrainingResult, train
+    from qgs.engine.guard import CollapseError, NonFiniteError, TrainingError
+    from qgs.engine.training import TrainingResult, train
 
 __all__ = [
     "CollapseError",
@@ -23,14 +23,14 @@ __all__ = [
 ]
 
 _MODULES = {
-    "CollapseError": "qgs.engine.collapse",
+    "CollapseError": "qgs.engine.guard",
     "Evaluation": "qgs.engine.evaluation",
-    "NonFiniteError": "qgs.engine.collapse",
+    "NonFiniteError": "qgs.engine.guard",
     "RunFolder": "qgs.engine.folder",
-    "TrainingError": "qgs.engine.collapse",
-    "TrainingResult": "qgs.engine.trainer",
+    "TrainingError": "qgs.engine.guard",
+    "TrainingResult": "qgs.engine.training",
     "evaluate": "qgs.engine.evaluation",
-    "train": "qgs.engine.trainer",
+    "train": "qgs.engine.training",
 }
 
 

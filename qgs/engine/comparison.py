@@ -14,9 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from qgs.engine.results import listed, markdown_table
-from qgs.engine.stored import StoredResults
-from qgs.io.atomic import write_text
+from qgs.engine.results import StoredResults, listed, markdown_table
+from qgs.io.files import write_text
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95

@@ -16,16 +16,9 @@ from qgs.contracts import SceneSource
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, told
 from qgs.data.sampling import Frames, Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
-from qgs.engine.scores import TUNING, Evaluation, SceneScore, column
+from qgs.engine.results import TUNING, Evaluation, SceneScore, column
 from qgs.engine.tuning import Tuning, tune, tuning_loss
-from qgs.metrics import (
-    gaussians_used,
-    mean_colour,
-    nearest_input,
-    psnr,
-    ssim,
-    token_dispersion,
-)
+from qgs.metrics import gaussians_used, mean_colour, nearest_input, psnr, ssim, token_dispersion
 from qgs.metrics.dispersion import median
 from qgs.metrics.lpips import LpipsUnavailableError, load_lpips
 from qgs.model import QueryGaussianModel

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TextIO
 
 from qgs.composer import Recipe
-from qgs.composer.show import annotated
-from qgs.io.atomic import is_leftover, write_text
-from qgs.io.records import read_records
+from qgs.composer.recipe import annotated
+from qgs.io.files import is_leftover, read_records, write_text
 
 
 class RunFolder:

@@ -2,20 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 import torch
+from accelerate import Accelerator
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from qgs.contracts import Loss
-from qgs.engine.collapse import measure
-from qgs.engine.leaves import Leaves
+from qgs.contracts import Loss, TrainingConfig
+from qgs.data.sampling import Batch
+from qgs.engine.distributed import average_gradients, unsynchronised, whole
+from qgs.engine.guard import measure
 from qgs.metrics import psnr
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Gaussians, LayerPrediction, Rendering, Views
+from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
+
+
+class Leaves:
+    """Detached copies of what a layer predicts, which sum up the gradients of several losses.
+
+    A loss frees its graph as soon as it is added, so memory does not grow with their number;
+    `attach` then leads the sums into the network, which needs one backward pass for all of them.
+    """
+
+    def __init__(self, layer: LayerPrediction, parameters: Mapping[str, Tensor]) -> None:
+        """parameters: of the losses, by name: what they have gradients for besides the layer."""
+        self._sources = {name: p for name, p in parameters.items() if p.requires_grad}
+        self._leaves = dict(self._sources)
+        self._gradients: dict[str, Tensor] = {}
+        gaussians = {f.name: getattr(layer.gaussians, f.name) for f in fields(layer.gaussians)}
+        self.layer = LayerPrediction(
+            Gaussians(**{name: self._cut(name, source) for name, source in gaussians.items()}),
+            QueryState(
+                self._cut("features", layer.state.features),
+                {name: self._cut(name, source) for name, source in layer.state.fields.items()},
+            ),
+        )
+
+    def add(self, loss: Tensor) -> None:
+        """Add the gradients of a 0-d loss of `layer`, if it has any, and free its graph."""
+        if not loss.requires_grad:
+            return
+        with torch.autocast(loss.device.type, enabled=False):
+            leaves = list(self._leaves.values())
+            found = torch.autograd.grad(loss, leaves, allow_unused=True)
+        for name, gradient in zip(self._leaves, found, strict=True):
+            if gradient is not None:
+                before = self._gradients.get(name)
+                self._gradients[name] = gradient if before is None else before + gradient
+
+    @property
+    def gradients(self) -> Mapping[str, Tensor]:
+        """The sums so far, of the Gaussians and of the state, without those that no loss reads."""
+        return self._gradients
+
+    def attach(self, value: Tensor) -> Tensor:
+        """The 0-d `value`, with the summed gradients for its own."""
+        sources = [self._sources[name] for name in self._gradients]
+        return _KnownGradients.apply(value, tuple(self._gradients.values()), *sources)
+
+    def _cut(self, name: str, source: Tensor) -> Tensor:
+        if not source.requires_grad:
+            return source
+        self._sources[name] = source
+        self._leaves[name] = source.detach().requires_grad_()
+        return self._leaves[name]
+
+
+class _KnownGradients(torch.autograd.Function):
+    """value, gradients, sources -> value, whose gradients with respect to the sources are known."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, gradients: tuple[Tensor, ...], *sources: Tensor) -> Tensor:
+        ctx.save_for_backward(*gradients)
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, *(slopes[0] * gradient for gradient in ctx.saved_tensors)
+
 
 Observer: TypeAlias = Callable[[str, Any], None]
 """Told the name and the value of what is computed, in order; values are containers of tensors."""
@@ -23,7 +91,7 @@ Observer: TypeAlias = Callable[[str, Any], None]
 
 @dataclass(frozen=True)
 class Signs:
-    """What renderings of several views look like, 0-d: mean PSNR, `qgs.engine.collapse.measure`."""
+    """What renderings of several views look like, 0-d: mean PSNR, `qgs.engine.guard.measure`."""
 
     psnr: Tensor
     alpha: Tensor
@@ -184,3 +252,47 @@ def _sum(terms: Mapping[str, Tensor]) -> Tensor:
 def _accumulate(sums: dict[str, Tensor], terms: Mapping[str, Tensor]) -> None:
     for name, term in terms.items():
         sums[name] = sums.get(name, 0) + term.detach()
+
+
+class Gradients:
+    """Runs batches forward and backward through an objective that `Accelerator.prepare` wrapped."""
+
+    def __init__(
+        self, accelerator: Accelerator, objective: nn.Module, config: TrainingConfig
+    ) -> None:
+        self.accelerator = accelerator
+        self.objective = objective
+        self.config = config
+
+    def compute(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
+        """Gradients of the mean over `batches`, clipped; what was measured, as 0-d tensors.
+
+        Only the last batch exchanges gradients between processes. "gradient" is the norm before
+        clipping, over all processes; the rest is of this one.
+        """
+        sums: dict[str, Tensor] = {}
+        for batch in batches:
+            last = batch is batches[-1]
+            with nullcontext() if last else unsynchronised(self.accelerator, self.objective):
+                for name, value in self._backward(batch, len(batches)).items():
+                    sums[name] = sums.get(name, 0) + value / len(batches)
+        average_gradients(self.accelerator, self.objective)
+        norm = self.accelerator.clip_grad_norm_(self.objective.parameters(), self.config.clip)
+        sums["gradient"] = whole(torch.as_tensor(norm)).to(self.accelerator.device)
+        return sums
+
+    def _backward(self, batch: Batch, count: int) -> dict[str, Tensor]:
+        device = self.accelerator.device
+        inputs, targets = batch.inputs.to(device), batch.targets.to(device)
+        bf16 = self.config.precision == "bf16"
+        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+            outcome: Outcome = self.objective(inputs, targets)
+        self.accelerator.backward(outcome.total / count)
+        signs = outcome.signs
+        return {
+            "loss": outcome.total.detach(),
+            **outcome.terms,
+            "psnr": signs.psnr,
+            "alpha": signs.alpha,
+            "deviation": signs.deviation,
+        }

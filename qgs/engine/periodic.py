@@ -17,18 +17,22 @@ from torch.distributed.tensor import DTensor
 from qgs.composer import Recipe
 from qgs.data.evaluation import EvaluationPlan
 from qgs.data.sampling import Sample
-from qgs.engine.ema import MovingAverage
+from qgs.drawing.images import (
+    Picture,
+    depth_picture,
+    depth_range,
+    rgb_picture,
+    side_by_side,
+    write_png,
+)
+from qgs.engine.checkpoint import RandomStates
+from qgs.engine.distributed import StopRequest, mean
 from qgs.engine.evaluation import evaluate
-from qgs.engine.interrupt import StopRequest
-from qgs.engine.processes import mean
+from qgs.engine.optimizer import MovingAverage
 from qgs.engine.protocol import index_of
-from qgs.engine.scores import METRICS
-from qgs.engine.seeds import RandomStates
-from qgs.engine.trackers import Trackers
-from qgs.io.atomic import write_text
-from qgs.io.drawing import Picture, depth_picture, depth_range, rgb_picture, side_by_side
-from qgs.io.pictures import write_png
-from qgs.io.records import read_records
+from qgs.engine.results import METRICS
+from qgs.engine.tracking import Trackers
+from qgs.io.files import read_records, write_text
 from qgs.model import QueryGaussianModel
 
 SAMPLES = 4

@@ -10,7 +10,7 @@ from typing import Any
 
 from qgs.composer import Recipe
 from qgs.contracts import SceneSourceConfig
-from qgs.data.index import EvaluationIndex, read_index
+from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.engine.tuning import tuning_loss
 from qgs.metrics.images import IMAGE_METRICS
 

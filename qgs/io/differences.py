@@ -8,14 +8,19 @@ from typing import Any
 
 from torch import Tensor
 
-from qgs.composer.show import flat
-from qgs.composer.yaml12 import dump
-from qgs.contracts.layout import Shapes
+from qgs.composer.recipe import flat
+from qgs.composer.yaml_text import dump
+from qgs.contracts.weights import Shapes
 
 ABSENT = "none"
+
+
 """Stands for the value of an option that a recipe does not have."""
 
+
 _INITIAL = re.compile(r"(\b|_)(init|std|layer_scale)(\b|_)")
+
+
 _ELSEWHERE = re.compile(r"^model\.(supervision|renderer)\.")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from qgs.io.atomic import replacing
+from qgs.io.files import replacing
 from qgs.types import Gaussians
 
 SH_C0 = 0.28209479177387814

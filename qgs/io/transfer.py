@@ -14,17 +14,20 @@ from torch import Tensor
 
 from qgs.composer import Recipe, resolve
 from qgs.contracts import WeightLayout
-from qgs.contracts.layout import Shapes
-from qgs.io.atomic import replacing, write_text
+from qgs.contracts.weights import Shapes
 from qgs.io.checkpoint import CheckpointError, load_recipe, write_checkpoint
 from qgs.io.differences import options_beside_weights, shapes_of
-from qgs.io.fitting import advice, fitting_recipe, recipe_text, without_prefix
+from qgs.io.files import replacing, write_text
 from qgs.io.published import (
     Names,
     PublishedError,
+    advice,
     exact_layout_of,
+    fitting_recipe,
     layout_of,
     names_in,
+    recipe_text,
+    without_prefix,
 )
 from qgs.io.weight_file import WeightFile, read_weight_file
 

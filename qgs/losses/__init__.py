@@ -1,7 +1,6 @@
 """What training minimises."""
 
-from qgs.losses.mask import Mask
-from qgs.losses.opacity import Opacity
+from qgs.losses.opacity import Mask, Opacity
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import (
     BehindCamera,

@@ -1,9 +1,10 @@
-"""`qgs/opacity`: Gaussians are drawn towards full opacity (TokenGS release)."""
+"""`qgs/opacity` and `qgs/mask`: opacities and coverage, drawn to known values (TokenGS release)."""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
+import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
@@ -37,3 +38,33 @@ class Opacity(Loss):
 @full_precision
 def _surprise(opacities: Tensor, eps: float) -> Tensor:
     return -(opacities + eps).log().mean()
+
+
+class Mask(Loss):
+    """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
+
+    name: ClassVar[str] = "mask"
+    renderings = "each"
+
+    class Config(ComponentConfig):
+        """weight: factor of the term."""
+
+        weight: float = Field(default=0.5, ge=0)
+
+    config: Config
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        """One term, `mask`. Raises ValueError for views without masks."""
+        if target.masks is None:
+            raise ValueError(
+                "the loss qgs/mask needs views with masks and these have none; "
+                "choose data with masks, or take the loss out of the recipe"
+            )
+        return {"mask": self.config.weight * _squared_error(rendering.alpha, target.masks)}
+
+
+@full_precision
+def _squared_error(alpha: Tensor, masks: Tensor) -> Tensor:
+    return F.mse_loss(alpha, masks)

@@ -1,17 +1,57 @@
-"""`qgs/photometric`: rendered against true images (TokenGS, LocusGS)."""
+"""`qgs/photometric`: rendered against true images by MSE and SSIM (TokenGS, LocusGS)."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
+import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss
 from qgs.geometry.precision import full_precision
-from qgs.losses.ssim import Padding, mean_ssim
 from qgs.types import LayerPrediction, Rendering, Views
+
+WINDOW = 11
+SIGMA = 1.5
+C1, C2 = 0.01**2, 0.03**2
+
+Padding = Literal["same", "valid"]
+
+
+@full_precision
+def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
+    """Mean structural similarity, 0-d, of images (..., H, W) in [0, 1] (Wang et al. 2004).
+
+    "same" pads with zeros, as the releases do; "valid" keeps to windows inside the image.
+    Raises ValueError for images smaller than the window with "valid".
+    """
+    height, width = images.shape[-2:]
+    if padding == "valid" and min(height, width) < WINDOW:
+        raise ValueError(
+            f'SSIM with padding "valid" needs images of at least {WINDOW} pixels a side, got '
+            f"{height} x {width}; raise data.image_size or use padding: same"
+        )
+    moments = torch.stack([images, truth, images * images, truth * truth, images * truth])
+    along_rows = moments @ _window(width, padding).to(moments)
+    blurred = along_rows.transpose(-1, -2) @ _window(height, padding).to(moments)
+    mean_x, mean_y, square_x, square_y, product = blurred
+    luminance = 2 * mean_x * mean_y + C1
+    structure = 2 * (product - mean_x * mean_y) + C2
+    energy = mean_x.square() + mean_y.square()
+    spread = square_x + square_y - energy + C2
+    return (luminance * structure / ((energy + C1) * spread)).mean()
+
+
+def _window(size: int, padding: Padding) -> Tensor:
+    """(size, outputs): column j holds the window's weights around output pixel j."""
+    position = torch.arange(size, dtype=torch.float64)
+    offset = position[:, None] - position
+    weight = torch.exp(-(offset**2) / (2 * SIGMA**2)) * (offset.abs() <= WINDOW // 2)
+    reach = torch.arange(-(WINDOW // 2), WINDOW // 2 + 1)
+    weight = weight / torch.exp(-(reach**2) / (2 * SIGMA**2)).sum()
+    return weight if padding == "same" else weight[:, WINDOW // 2 : size - WINDOW // 2]
 
 
 class Photometric(Loss):
@@ -23,7 +63,7 @@ class Photometric(Loss):
     class Config(ComponentConfig):
         """mse_weight, ssim_weight: of the two terms, as published.
 
-        padding: of the SSIM window, see `qgs.losses.ssim.mean_ssim`.
+        padding: of the SSIM window, see `qgs.losses.photometric.mean_ssim`.
         """
 
         mse_weight: float = Field(default=1.0, ge=0)

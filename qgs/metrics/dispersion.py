@@ -48,3 +48,12 @@ def spread(values: Tensor) -> Spread:
 def median(values: Tensor) -> Tensor:
     """Median over the last dimension, the mean of the middle two for an even count."""
     return torch.quantile(values, 0.5, dim=-1)
+
+
+OPACITY_USED = 1 / 255
+"""A Gaussian of lower opacity is never drawn: renderers skip alpha below 1/255."""
+
+
+def gaussians_used(opacities: Tensor) -> Tensor:
+    """How many of opacities (..., G) are above OPACITY_USED -> (...)."""
+    return (opacities > OPACITY_USED).sum(-1)

@@ -89,7 +89,8 @@ def load_lpips(weights: str | None = None) -> Lpips:
     package = find_spec("lpips")
     if package is None or not package.submodule_search_locations:
         raise LpipsUnavailableError(
-            "the package lpips, which holds its weights, is not installed: pip install 'qgs[lpips]'"
+            "the package lpips, which holds its weights, is not installed: "
+            'pip install "query-gaussians[lpips]"'
         )
     linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
     vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE

@@ -14,10 +14,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.renderers.inputs import background_of, check_inputs, raise_precision
-from qgs.renderers.projection import CLAMP_MARGIN
-from qgs.renderers.reference import resolve
+from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering
 
 _TILE = 16
@@ -40,7 +39,8 @@ class CpuRenderer(Renderer):
         if find_spec("numba") is None:
             raise MissingExtraError(
                 "the renderer qgs/cpu needs numba, which is not installed: run "
-                "`pip install qgs[cpu]`, or choose `renderer: {type: qgs/torch}` (much slower)"
+                '`pip install "query-gaussians[cpu]"`, or choose `renderer: {type: qgs/torch}` '
+                "(much slower)"
             )
 
     def forward(

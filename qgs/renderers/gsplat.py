@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.renderers.inputs import background_of, check_inputs
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -111,7 +111,7 @@ def _check_supported(gaussians: Gaussians, cameras: Cameras) -> None:
     if find_spec("gsplat") is None:
         raise MissingExtraError(
             "the renderer qgs/gsplat needs gsplat, which is not installed: run "
-            "`pip install qgs[gsplat]`, or choose `renderer: {type: qgs/torch}`"
+            '`pip install "query-gaussians[gsplat]"`, or choose `renderer: {type: qgs/torch}`'
         )
 
 

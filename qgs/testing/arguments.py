@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from qgs.composer.suggest import did_you_mean
+from qgs.composer.errors import did_you_mean
 from qgs.contracts import ModelDims
 from qgs.testing.wording import named
 

@@ -11,8 +11,8 @@ import torch
 from pydantic_core import to_jsonable_python
 from torch import Tensor, nn
 
-from qgs.composer.soundness import component_fault
-from qgs.composer.yaml12 import dump
+from qgs.composer.registry import component_fault
+from qgs.composer.yaml_text import dump
 from qgs.contracts import (
     Component,
     ComponentConfig,

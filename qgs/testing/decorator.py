@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from qgs.contracts import CONTRACT_VERSION, ComponentConfig
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.expected import ExpectedFailures, expected_of
 from qgs.testing.registry import TIERS, Check, Tier, case_given, checks_for, tiers_given

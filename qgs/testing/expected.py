@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
-from qgs.composer.suggest import did_you_mean
+from qgs.composer.errors import did_you_mean
 from qgs.contracts import Expected, ExpectedError
 from qgs.testing.case import Case
 from qgs.testing.faults import ContractError

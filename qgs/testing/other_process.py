@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.faults import CannotCheck, ElsewhereError
 

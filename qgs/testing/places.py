@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from qgs.composer.code_places import lies_in, package_of
+from qgs.composer.registry import lies_in, package_of
 from qgs.testing.faults import ElsewhereError
 
 SUITE = Path(__file__).parent

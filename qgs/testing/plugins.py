@@ -6,11 +6,11 @@ import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from qgs.composer.code_places import file_of
 from qgs.composer.registry import (
     InstalledPlugin,
     PluginError,
     default_config,
+    file_of,
     load_plugin,
 )
 from qgs.contracts import Component, ComponentConfig, Expected, ModelDims, Plugin

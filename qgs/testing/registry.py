@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from inspect import cleandoc
 from typing import Any, Literal, TypeAlias, get_args
 
+from qgs.composer.errors import did_you_mean
 from qgs.composer.slots import SLOTS
-from qgs.composer.suggest import did_you_mean
 from qgs.testing.case import Case
 from qgs.testing.wording import case_of, named
 

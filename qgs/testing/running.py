@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
-from qgs.composer.code_places import file_of
+from qgs.composer.registry import file_of
 from qgs.contracts import Expected, ExpectedError
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.testing.case import Case
 from qgs.testing.expected import expectation_fault, is_expected, reason_of
 from qgs.testing.faults import CannotCheck, ContractError

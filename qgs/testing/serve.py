@@ -26,7 +26,7 @@ def serve(threads: int) -> None:
     torch.set_num_threads(threads)
     pydantic.create_model("First")  # now it looks for its plugins, and not for who is watched
     with watched() as deeds:  # the built-in components come along
-        from qgs.contracts.extras import MissingExtraError
+        from qgs.contracts.component import MissingExtraError
         from qgs.testing.places import raised
     _deeds.extend(deeds)
     out = os.fdopen(os.dup(1), "w")
@@ -43,7 +43,7 @@ def serve(threads: int) -> None:
 
 
 def _import(request: dict[str, Any]) -> dict[str, Any]:
-    from qgs.composer.code_places import package_of
+    from qgs.composer.registry import package_of
 
     _module(request)
     package = package_of(request["file"])

@@ -1,6 +1,6 @@
 import pytest
 
-from qgs.analysis.frames import choose_frames
+from qgs.analysis.reconstruction import choose_frames
 
 
 def test_inputs_span_the_middle_and_novel_frames_lie_between():

@@ -1,6 +1,6 @@
 import torch
 
-from qgs.analysis.orbit import look_at, orbit
+from qgs.analysis.reconstruction import look_at, orbit
 
 
 def test_the_loop_is_smooth_closed_and_rigid(cameras):

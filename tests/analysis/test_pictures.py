@@ -2,15 +2,26 @@ import numpy as np
 import pytest
 import torch
 
-from qgs.analysis.pictures.anchors import support_picture
-from qgs.analysis.pictures.attention import attention_pictures, patch_maps
-from qgs.analysis.pictures.ellipses import project_support
-from qgs.analysis.pictures.figures import Curves, curves_figure, figure_picture, running_mean
-from qgs.analysis.pictures.images import enlarged, finer, washed
-from qgs.analysis.pictures.palette import CATEGORICAL
-from qgs.analysis.pictures.tokens import notable_tokens, rendered_weights, token_picture
-from qgs.geometry.projection import to_camera, to_pixels
-from qgs.io.drawing import NOTHING, depth_picture, depth_range, rgb_picture
+from qgs.drawing.figures import CATEGORICAL, Curves, curves_figure, figure_picture, running_mean
+from qgs.drawing.images import (
+    NOTHING,
+    depth_picture,
+    depth_range,
+    enlarged,
+    finer,
+    rgb_picture,
+    washed,
+)
+from qgs.drawing.queries import (
+    attention_pictures,
+    notable_tokens,
+    patch_maps,
+    project_support,
+    rendered_weights,
+    support_picture,
+    token_picture,
+)
+from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import SpatialSupport
 
 

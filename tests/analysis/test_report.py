@@ -1,10 +1,10 @@
 import pytest
 
-from qgs.analysis.pictures.figures import Curves
 from qgs.analysis.report import Baseline, Contender, Report, report_html
-from qgs.cli.contest_report import true_depth
+from qgs.cli.contest import true_depth
 from qgs.composer import resolve
-from qgs.data.loader import evaluation_samples
+from qgs.data.evaluation import evaluation_samples
+from qgs.drawing.figures import Curves
 
 PLAIN = {
     "recipe": 1,
@@ -17,7 +17,8 @@ PLAIN = {
         "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
         "supervision": {"type": "qgs/layers", "layers": [2]},
     },
-    "data": {"type": "qgs/rooms", "image_size": [16, 16], "test_scenes": 2},
+    "plugins": ["rooms"],
+    "data": {"type": "rooms/procedural", "image_size": [16, 16], "test_scenes": 2},
     "views": {"inputs": 2, "targets": 2, "gap": [3, 4], "scale_factor": 0.4},
     "evaluation": {"scenes": 2},
 }

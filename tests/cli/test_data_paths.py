@@ -41,5 +41,11 @@ def test_paths_become_absolute_and_urls_stay(given, expected, tmp_path, monkeypa
 
 
 def test_data_without_a_path_stays():
-    recipe = resolve({**RECIPE, "data": {"type": "qgs/rooms", "image_size": [16, 16]}})
+    recipe = resolve(
+        {
+            **RECIPE,
+            "plugins": ["rooms"],
+            "data": {"type": "rooms/procedural", "image_size": [16, 16]},
+        }
+    )
     assert with_absolute_path(recipe) is recipe

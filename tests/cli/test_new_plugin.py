@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 from qgs.cli import app
 from qgs.cli.new_plugin import check_name, rendered
 from qgs.composer.errors import Problems
-from qgs.composer.loader import load_mapping
 from qgs.composer.nodes import ListNode, ScalarNode
+from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import ModelDims
-from qgs.io.atomic import new_folder
+from qgs.io.files import new_folder
 from qgs.types import ImageMemory, QueryState
 
 
@@ -112,7 +112,7 @@ def test_a_distribution_that_is_installed_is_not_replaced(
         ("a" * 41, "has 41 characters"),
         ("qgs", "leave `qgs` out"),
         ("qgs-more", "leave `qgs` out"),
-        ("locus", "taken by qgs-locus"),
+        ("locus", "taken by query-gaussians-locus"),
         ("null", "would be read as None"),
         ("true", "would be read as True"),
         ("false", "choose another, such as `false-things`"),

@@ -17,7 +17,7 @@ SMALL = (
     "training.steps=2",
     "training.warmup=1",
 )
-ROOMS = "data={type: qgs/rooms, image_size: [16, 16]}"
+ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ ROOMS = "data={type: qgs/rooms, image_size: [16, 16]}"
     [
         ((), "no evaluation index at .*datasets/dl3dv/evaluation_2views.json"),
         (("evaluation.index=null", "init_from=null"), "datasets/dl3dv"),
-        (("evaluation.index=null", ROOMS), "runs/locus/dl3dv"),
+        (("evaluation.index=null", "plugins=[rooms]", ROOMS), "runs/locus/dl3dv"),
     ],
     ids=["index", "data", "base run"],
 )

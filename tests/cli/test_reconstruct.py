@@ -21,7 +21,8 @@ RECIPE = {
         "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
         "supervision": {"type": "qgs/layers", "layers": [1]},
     },
-    "data": {"type": "qgs/rooms", "image_size": [16, 16]},
+    "plugins": ["rooms"],
+    "data": {"type": "rooms/procedural", "image_size": [16, 16]},
     "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"},
 }
 

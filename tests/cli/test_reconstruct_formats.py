@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from qgs.cli.reconstruct import photos_config, was_trained_on
-from qgs.cli.scene_choice import scene_of
+from qgs.cli.reconstruct import photos_config, scene_of, was_trained_on
 from qgs.composer import resolve
 from qgs.data import PhotosSource
 
@@ -23,7 +22,14 @@ MODEL = {
 
 
 def recipe(**data):
-    return resolve({"recipe": 1, "model": MODEL, "data": {"image_size": [16, 16], **data}})
+    return resolve(
+        {
+            "recipe": 1,
+            "plugins": ["rooms"],
+            "model": MODEL,
+            "data": {"image_size": [16, 16], **data},
+        }
+    )
 
 
 @pytest.fixture
@@ -42,7 +48,7 @@ def scene(tmp_path):
 
 def test_photos_of_any_format_are_opened_for_a_model_of_other_data(scene):
     trained = recipe(type="qgs/photos", path="elsewhere", format="nerfstudio", images="images_2")
-    for source in (trained, recipe(type="qgs/rooms")):
+    for source in (trained, recipe(type="rooms/procedural")):
         config = photos_config(source, str(scene))
         opened = scene_of(PhotosSource(config), str(scene), None)
         assert opened.frame_name(2) == "images/2.png"
@@ -63,20 +69,24 @@ def test_several_scenes_are_refused(scene):
     shutil.copytree(scene, scene.parent / "b")
     root = str(scene.parent)
     with pytest.raises(ValueError, match="holds 2 scenes"):
-        scene_of(PhotosSource(photos_config(recipe(type="qgs/rooms"), root)), root, None)
+        scene_of(PhotosSource(photos_config(recipe(type="rooms/procedural"), root)), root, None)
 
 
 def test_files_of_no_format_are_told(tmp_path):
     (tmp_path / "transforms.txt").write_text("{}")
     with pytest.raises(FileNotFoundError, match=r"no transforms\.json nor another listing"):
-        PhotosSource(photos_config(recipe(type="qgs/rooms"), str(tmp_path)))
+        PhotosSource(photos_config(recipe(type="rooms/procedural"), str(tmp_path)))
 
 
 def test_a_recipe_without_data_takes_the_size_that_is_given(scene):
-    imported = resolve({"recipe": 1, "model": MODEL})
+    imported = resolve({"recipe": 1, "plugins": ["rooms"], "model": MODEL})
     with pytest.raises(ValueError, match="such as --size 256x256"):
         photos_config(imported, str(scene))
-    for source in (imported, recipe(type="qgs/rooms"), recipe(type="qgs/photos", path=str(scene))):
+    for source in (
+        imported,
+        recipe(type="rooms/procedural"),
+        recipe(type="qgs/photos", path=str(scene)),
+    ):
         config = photos_config(source, str(scene), (8, 24))
         opened = scene_of(PhotosSource(config), str(scene), None)
         assert opened.images([2]).shape == (1, 3, 8, 24)

@@ -6,18 +6,18 @@ import zipfile
 import numpy as np
 import pytest
 from PIL import Image
+from qgs_datatools import packing
 from upath import UPath
 
-from qgs.cli.scene_choice import chosen_scene
+from qgs.cli.reconstruct import chosen_scene
 from qgs.composer import resolve
 from qgs.data import PhotosSource
-from qgs.io import packing
 
 SIZE = (16, 16)
 
 
 def recipe(**data):
-    return resolve({"recipe": 1, "data": {"image_size": [*SIZE], **data}})
+    return resolve({"recipe": 1, "plugins": ["rooms"], "data": {"image_size": [*SIZE], **data}})
 
 
 @pytest.fixture
@@ -62,12 +62,12 @@ def test_an_archive(folders, tmp_path):
     with zipfile.ZipFile(file, "w") as archive:
         for path in (folders / "a").rglob("*"):
             archive.write(path, path.relative_to(folders / "a"))
-    scene, seen = chosen_scene(recipe(type="qgs/rooms"), str(file.parent), None, None)
+    scene, seen = chosen_scene(recipe(type="rooms/procedural"), str(file.parent), None, None)
     assert (scene.name, len(scene), list(seen)) == ("0a" * 32, 4, [])
 
 
 def test_a_scene_that_is_not_named_or_not_there(folders):
-    rooms = recipe(type="qgs/rooms")
+    rooms = recipe(type="rooms/procedural")
     assert chosen_scene(rooms, str(folders), None, "b")[0].name == "b"
     with pytest.raises(ValueError, match="holds 2 scenes: a, b: name one of them with --scene"):
         chosen_scene(rooms, str(folders), None, None)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from qgs import cli, engine
 from qgs.cli import app
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
 SMALL = (
@@ -115,13 +115,13 @@ def test_a_missing_extra_is_told_without_a_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def missing() -> None:
-        raise MissingExtraError("pip install qgs[cpu]")
+        raise MissingExtraError('pip install "query-gaussians[cpu]"')
 
     monkeypatch.setattr(cli, "app", missing)
     with pytest.raises(SystemExit) as stop:
         cli.main()
     assert stop.value.code == 2
-    assert "pip install qgs[cpu]" in capsys.readouterr().err
+    assert 'pip install "query-gaussians[cpu]"' in capsys.readouterr().err
 
 
 def test_eval_refuses_to_change_the_model(run: Path) -> None:

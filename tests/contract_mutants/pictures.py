@@ -7,11 +7,11 @@ from dataclasses import replace
 from itertools import count
 from typing import ClassVar
 
+from qgs_rooms.source import RoomsSource
 from torch import Tensor
 
 from qgs.components import LayerSupervision
 from qgs.contracts import Loss, Scene, Split
-from qgs.data import RoomsSource
 from qgs.losses import Photometric
 from qgs.renderers import TorchRenderer
 from qgs.types import Cameras, Gaussians, LayerPrediction, Rendering, Views

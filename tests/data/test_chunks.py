@@ -13,8 +13,8 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data.chunks import ChunksSource
+from qgs.data.chunks.files import ChunkStore, load_chunk
 from qgs.data.chunks.record import camera_faults, parse_record
-from qgs.data.chunks.store import ChunkStore, load_chunk
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 

@@ -11,13 +11,12 @@ import torch
 from photo_formats import synthetic, world_to_camera, write_colmap, write_nerfstudio
 from PIL import Image
 
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.data import PhotosSource
-from qgs.data.frames import PhotoFrame
 from qgs.data.paths import opened_path
-from qgs.data.photo_scene import PhotoScene
-from qgs.data.readers import formats_of, read_listing
-from qgs.data.validation import frame_faults
+from qgs.data.photos.formats import formats_of, read_listing
+from qgs.data.photos.frames import PhotoFrame, frame_faults
+from qgs.data.photos.scene import PhotoScene
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -198,7 +197,7 @@ def test_photos_beside_the_model_are_needed(tmp_path):
 def test_a_missing_package_is_told(tmp_path, monkeypatch):
     photos = synthetic(tmp_path / "photos", 2)
     folder = write_colmap(tmp_path, photos, "text")
-    monkeypatch.setattr("qgs.data.readers.colmap_model.find_spec", lambda name: None)
+    monkeypatch.setattr("qgs.data.photos.colmap_model.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install qgs\[colmap\]"):
         read(folder)
     assert formats_of(opened_path(folder)) == ["colmap"]

@@ -10,11 +10,10 @@ import torch
 from PIL import Image
 from upath import UPath
 
-from qgs.data import archives
-from qgs.data.archives import ArchivePath
-from qgs.data.dl3dv import Dl3dvSource
+from qgs.data import paths as archives
+from qgs.data.dl3dv import Dl3dvSource, read_scene_list
 from qgs.data.images import CropResize
-from qgs.data.scene_lists import read_scene_list
+from qgs.data.paths import ArchivePath
 
 LENS = {"camera_model": "OPENCV", "k1": -0.5, "k2": 0.01, "p1": 1e-3, "p2": -2e-3}
 

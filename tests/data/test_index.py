@@ -13,9 +13,14 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
-from qgs.data.evaluation import EvaluationPlan, SceneFailure, evaluation_samples
-from qgs.data.index import IndexEntry, read_index
-from qgs.data.photos import PhotosConfig, PhotosSource
+from qgs.data.evaluation import (
+    EvaluationPlan,
+    IndexEntry,
+    SceneFailure,
+    evaluation_samples,
+    read_index,
+)
+from qgs.data.photos.source import PhotosConfig, PhotosSource
 from qgs.data.sampling import Sample
 from qgs.types import Cameras
 

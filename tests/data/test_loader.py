@@ -16,9 +16,8 @@ from PIL import Image
 
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, SceneSource, SceneSourceConfig, ViewsConfig
-from qgs.data.loader import SampleError, Share, training_batches
-from qgs.data.order import SceneOrder
 from qgs.data.sampling import Batch
+from qgs.data.stream import SampleError, SceneOrder, Share, training_batches
 from qgs.types import Cameras
 
 TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"

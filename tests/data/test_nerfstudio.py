@@ -14,10 +14,10 @@ from qgs.contracts import ViewsConfig
 from qgs.data import PhotosSource, read_photos
 from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
-from qgs.data.photo_scene import PhotoScene
+from qgs.data.photos.frames import frame_faults, intrinsics_faults, pose_faults, size_faults
+from qgs.data.photos.scene import PhotoScene
+from qgs.data.photos.transforms import image_name, load_transforms, parse_transforms
 from qgs.data.sampling import make_sample
-from qgs.data.transforms_json import image_name, load_transforms, parse_transforms
-from qgs.data.validation import frame_faults, intrinsics_faults, pose_faults, size_faults
 
 
 def read(folder: Path, size=(30, 40), **options) -> PhotoScene:

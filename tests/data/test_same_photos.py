@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from qgs_datatools import packing
 from upath import UPath
 
 from qgs.contracts import Scene
 from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
-from qgs.data.encoded import EncodedScene
 from qgs.data.images import to_tensor
-from qgs.io import packing
+from qgs.data.photos.scene import EncodedScene
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 pytestmark = pytest.mark.skipif(

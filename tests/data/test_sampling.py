@@ -6,8 +6,8 @@ import torch
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
-from qgs.data.loader import training_batches
 from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views
+from qgs.data.stream import training_batches
 from qgs.types import Cameras, Views
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import torch
 
 from qgs.composer import resolve
-from qgs.data.loader import Share, training_batches
 from qgs.data.sampling import Batch
-from qgs.engine import train, trainer
+from qgs.data.stream import Share, training_batches
+from qgs.engine import train
+from qgs.engine import train as trainer
 
 
 def spoiled(*arguments: Any, share: Share, **options: Any) -> Generator[Batch, None, None]:

@@ -9,10 +9,9 @@ import torch
 
 from qgs.composer import resolve
 from qgs.engine.bench import Spread, Workload, in_turn, peak_memory, workload_of
-from qgs.engine.bench.tasks import make_task
+from qgs.engine.bench.work import make_task, posed_photos
 from qgs.engine.bench.worker import resident_bytes
-from qgs.engine.bench.workload import posed_photos
-from qgs.geometry.projection import to_camera, to_pixels
+from qgs.geometry.transforms import to_camera, to_pixels
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]

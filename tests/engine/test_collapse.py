@@ -14,9 +14,10 @@ from rich.console import Console
 import qgs
 from qgs.composer import Recipe
 from qgs.contracts import TrainingConfig
-from qgs.data.loader import evaluation_samples
+from qgs.data.evaluation import evaluation_samples
 from qgs.engine import CollapseError, RunFolder, train
-from qgs.engine.collapse import (
+from qgs.engine.distributed import StopRequest
+from qgs.engine.guard import (
     EMPTY_ALPHA,
     CollapseDetector,
     GoodWeights,
@@ -25,9 +26,8 @@ from qgs.engine.collapse import (
     measure,
     not_finite,
 )
-from qgs.engine.interrupt import StopRequest
-from qgs.engine.progress import TrainingProgress
-from qgs.engine.trainer import Trainer
+from qgs.engine.tracking import TrainingProgress
+from qgs.engine.training import Trainer
 from qgs.io.checkpoint import load_extra
 
 ALIVE = Vitals(alpha=0.5, deviation=0.3, gradient=0.1)

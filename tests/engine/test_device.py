@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from qgs.engine import device
-from qgs.engine.device import choose_device
+from qgs.engine import distributed as device
+from qgs.engine.distributed import choose_device
 
 
 @pytest.mark.parametrize(

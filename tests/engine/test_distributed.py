@@ -17,10 +17,10 @@ from rich.console import Console
 import qgs
 from qgs.composer import Recipe
 from qgs.engine import RunFolder, train
-from qgs.engine.interrupt import StopRequest
-from qgs.engine.progress import TrainingProgress
-from qgs.engine.state import read_state
-from qgs.engine.trainer import Trainer
+from qgs.engine.checkpoint import read_state
+from qgs.engine.distributed import StopRequest
+from qgs.engine.tracking import TrainingProgress
+from qgs.engine.training import Trainer
 
 WORKER = Path(__file__).with_name("distributed.py")
 FSDP = {"ACCELERATE_USE_FSDP": "true"}

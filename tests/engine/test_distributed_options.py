@@ -13,7 +13,7 @@ from pathlib import Path
 import yaml
 
 from qgs.composer import Recipe
-from qgs.engine.incidents import read_batch
+from qgs.engine.nonfinite import read_batch
 
 WORKER = Path(__file__).with_name("distributed_incident.py")
 

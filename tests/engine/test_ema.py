@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from qgs.composer import Recipe
-from qgs.engine.ema import MovingAverage
+from qgs.engine.optimizer import MovingAverage
 from qgs.io.checkpoint import unique_tensors
 
 

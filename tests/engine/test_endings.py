@@ -17,14 +17,13 @@ from rich.console import Console
 
 from qgs.composer import Recipe
 from qgs.data.sampling import Batch
-from qgs.data.stream import SampleStream
-from qgs.data.workers import WorkerError
+from qgs.data.stream import SampleStream, WorkerError
 from qgs.engine import NonFiniteError, RunFolder, TrainingResult, periodic, train
+from qgs.engine.checkpoint import read_state
+from qgs.engine.distributed import StopRequest, signal
 from qgs.engine.folder import RunFolder as Folder
-from qgs.engine.interrupt import StopRequest, signal
-from qgs.engine.progress import TrainingProgress
-from qgs.engine.state import read_state
-from qgs.engine.trainer import Trainer
+from qgs.engine.tracking import TrainingProgress
+from qgs.engine.training import Trainer
 
 QUIET = Console(quiet=True)
 

@@ -15,17 +15,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from qgs_rooms.source import RoomsSource
 from rich.console import Console
 
 import qgs.engine.evaluation as engine_evaluation
 from qgs.composer import Recipe
 from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
-from qgs.data.rooms import RoomsSource
 from qgs.engine import evaluate
 from qgs.engine.comparison import Comparisons
-from qgs.engine.scores import METHODS, Evaluation
-from qgs.engine.stored import read_results
+from qgs.engine.results import METHODS, Evaluation, read_results
 from qgs.metrics import mean_colour, nearest_input, psnr, ssim, token_dispersion
 from qgs.metrics.lpips import LpipsUnavailableError
 

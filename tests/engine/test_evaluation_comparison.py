@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from qgs.engine.comparison import Comparisons, paired_interval
-from qgs.engine.stored import StoredResults, read_results
+from qgs.engine.results import StoredResults, read_results
 
 HASHES = {"rooms": "a" * 64, "halls": "b" * 64}
 

@@ -16,7 +16,7 @@ from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Queries
 from qgs.engine import train
-from qgs.engine.initial import initialise
+from qgs.engine.checkpoint import initialise
 from qgs.io.checkpoint import CheckpointError, save
 from qgs.io.published import to_published
 from qgs.io.transfer import import_weights

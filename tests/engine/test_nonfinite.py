@@ -14,12 +14,10 @@ from torch import Tensor
 
 import qgs
 from qgs.composer import Recipe
-from qgs.data.loader import training_batches
-from qgs.engine.gradients import Gradients
-from qgs.engine.incidents import KEPT, Incidents, read_batch
-from qgs.engine.nonfinite import Finding, Watch
-from qgs.engine.objective import Objective
-from qgs.engine.processes import make_accelerator
+from qgs.data.stream import training_batches
+from qgs.engine.distributed import make_accelerator
+from qgs.engine.nonfinite import KEPT, Finding, Incidents, Watch, read_batch
+from qgs.engine.objective import Gradients, Objective
 
 NAN, INF = float("nan"), float("inf")
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from qgs.composer import Recipe
-from qgs.data.loader import training_batches
 from qgs.data.sampling import Batch
+from qgs.data.stream import training_batches
 from qgs.engine.objective import Objective
 from qgs.metrics import psnr
 

@@ -12,12 +12,12 @@ import torch
 from PIL import Image
 
 from qgs.composer import Recipe
-from qgs.engine.ema import MovingAverage
+from qgs.drawing.images import rgb_picture
+from qgs.engine.distributed import make_accelerator
 from qgs.engine.evaluation import evaluate
+from qgs.engine.optimizer import MovingAverage
 from qgs.engine.periodic import PeriodicEvaluation
-from qgs.engine.processes import make_accelerator
-from qgs.engine.trackers import Trackers
-from qgs.io.drawing import rgb_picture
+from qgs.engine.tracking import Trackers
 
 
 class Told(Trackers):

@@ -8,8 +8,8 @@ import re
 import pytest
 from rich.console import Console
 
-from qgs.engine import progress
-from qgs.engine.progress import TrainingProgress
+from qgs.engine import tracking as progress
+from qgs.engine.tracking import TrainingProgress
 
 
 def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from qgs.composer import Recipe, resolve
-from qgs.data.index import read_index
+from qgs.data.evaluation import read_index
 from qgs.engine.protocol import Protocol, index_of, protocol_of
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"

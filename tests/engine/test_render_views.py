@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from qgs.composer import Recipe
 from qgs.contracts import ComponentConfig, Loss
-from qgs.data.loader import training_batches
-from qgs.engine.collapse import measure
+from qgs.data.stream import training_batches
+from qgs.engine.guard import measure
 from qgs.engine.objective import Objective, Outcome
 from qgs.losses import Mask, Opacity
 from qgs.metrics import psnr

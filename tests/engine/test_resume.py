@@ -16,12 +16,10 @@ from rich.console import Console
 
 from qgs.composer import Recipe
 from qgs.engine import RunFolder, TrainingResult, train
-from qgs.engine.interrupt import StopRequest
-from qgs.engine.progress import TrainingProgress
-from qgs.engine.resume import OtherRunError
-from qgs.engine.seeds import RandomStates
-from qgs.engine.state import read_state, write_state
-from qgs.engine.trainer import Trainer
+from qgs.engine.checkpoint import OtherRunError, RandomStates, read_state, write_state
+from qgs.engine.distributed import StopRequest
+from qgs.engine.tracking import TrainingProgress
+from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointError, load_extra
 
 QUIET = Console(quiet=True)
@@ -170,7 +168,7 @@ def test_a_kill_between_the_first_two_files_loses_nothing(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr("qgs.engine.saver.save", die)
+        patch.setattr("qgs.engine.checkpoint.save", die)
         with pytest.raises(Killed):
             train(recipe, run, console=QUIET, device="cpu")
     assert not (run / "checkpoint.safetensors").exists()

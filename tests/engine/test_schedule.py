@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from qgs.contracts import TrainingConfig
-from qgs.engine.schedule import OneCycle
+from qgs.engine.optimizer import OneCycle
 
 
 @pytest.mark.parametrize(("steps", "warmup"), [(40, 10), (100, 2), (7, 3), (500, 400)])

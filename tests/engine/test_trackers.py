@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from qgs.composer import Recipe
-from qgs.contracts.extras import MissingExtraError
-from qgs.engine import trackers
-from qgs.engine.processes import make_accelerator
-from qgs.engine.trackers import Trackers
+from qgs.contracts.component import MissingExtraError
+from qgs.engine import tracking as trackers
+from qgs.engine.distributed import make_accelerator
+from qgs.engine.tracking import Trackers
 
 
 def picture() -> np.ndarray:

@@ -15,11 +15,12 @@ from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe, resolve
-from qgs.data.loader import training_batches
-from qgs.engine import RunFolder, interrupt, train
+from qgs.data.stream import training_batches
+from qgs.engine import RunFolder, train
+from qgs.engine import distributed as interrupt
+from qgs.engine.distributed import stop_requests
 from qgs.engine.folder import checkpoint_of
-from qgs.engine.interrupt import stop_requests
-from qgs.engine.schedule import OneCycle
+from qgs.engine.optimizer import OneCycle
 from qgs.io.checkpoint import load_extra
 
 QUIET = Console(quiet=True)

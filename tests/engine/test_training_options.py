@@ -15,11 +15,12 @@ from rich.console import Console
 import qgs
 from qgs.cli.contest import curves_of
 from qgs.composer import Recipe
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleStream
-from qgs.engine import NonFiniteError, TrainingResult, trackers, train
-from qgs.engine.incidents import PATIENCE, read_batch
+from qgs.engine import NonFiniteError, TrainingResult, train
+from qgs.engine import tracking as trackers
+from qgs.engine.nonfinite import PATIENCE, read_batch
 
 QUIET = Console(quiet=True)
 

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from qgs.composer import resolve
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.io.checkpoint import unique_tensors
 from qgs.io.published import to_published
 from qgs.model import QueryGaussianModel

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 from golden.dumped import metadata
-from qgs_locus.released import locusgs_recipe
+from published.locus import locusgs_recipe
+from published.tokengs import tokengs_recipe
 
-from qgs.components.released import tokengs_recipe
 from qgs.composer import resolve
-from qgs.composer.show import flat
+from qgs.composer.recipe import flat
 
 BACKBONE = [
     ({"enc_embed_dim": 48, "token_dim": 48}, {"width": 48}),

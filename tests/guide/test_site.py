@@ -14,7 +14,8 @@ ROOT = Path(__file__).parents[2]
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     for package in ("mkdocs", "material", "mkdocstrings"):
         pytest.importorskip(
-            package, reason=f"{package} is not installed: `pip install qgs[docs]` builds the site"
+            package,
+            reason=f'{package} is not installed: `pip install "query-gaussians[docs]"`',
         )
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

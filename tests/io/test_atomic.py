@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from qgs.io.atomic import is_leftover, replacing, replacing_entries
+from qgs.io.files import is_leftover, replacing, replacing_entries
 
 
 def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from safetensors.torch import save_file
 import qgs
 from qgs.composer import resolve
 from qgs.contracts import CONTRACT_VERSION
-from qgs.io.atomic import replacing, write_text
 from qgs.io.checkpoint import (
     CheckpointError,
     load_extra,
@@ -25,6 +24,7 @@ from qgs.io.checkpoint import (
     save,
     unique_tensors,
 )
+from qgs.io.files import replacing, write_text
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
@@ -90,12 +90,12 @@ def test_recipe_and_versions_travel_along(model: QueryGaussianModel, saved: Path
 def test_the_distributions_of_plugins_travel_along(tmp_path: Path) -> None:
     save(qgs.compose(RECIPES / "locus.yaml", SMALL), tmp_path / "a.safetensors")
     metadata = metadata_of(tmp_path / "a.safetensors")
-    assert json.loads(metadata["qgs.distributions"]) == {"qgs": "qgs", "locus": "qgs-locus"}
+    assert json.loads(metadata["qgs.distributions"]) == {"qgs": "query-gaussians", "locus": "query-gaussians-locus"}
 
 
 @pytest.fixture
 def old_locus(tmp_path: Path) -> Path:
-    """A checkpoint of LocusGS that says it was made with qgs-locus 0.0.7."""
+    """A checkpoint of LocusGS that says it was made with query-gaussians-locus 0.0.7."""
     path = tmp_path / "old.safetensors"
     save(qgs.compose(RECIPES / "locus.yaml", SMALL), path)
     versions = json.loads(metadata_of(path)["qgs.plugins"]) | {"locus": "0.0.7"}
@@ -114,7 +114,7 @@ def orphan(old_locus: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("forgotten", "made_with"),
     [
-        ((), "qgs-locus {}"),
+        ((), "query-gaussians-locus {}"),
         (("qgs.distributions",), "the plugin `locus` {}"),
     ],
     ids=["now", "before distributions were kept"],
@@ -138,7 +138,7 @@ def test_another_release_of_a_plugin_is_told(old_locus: Path) -> None:
     recipe = json.loads(metadata_of(old_locus)["qgs.recipe"])
     recipe["model"]["decoder"]["refinement"]["type"] = "locus/gone_since"
     rewrite(old_locus, **{"qgs.recipe": json.dumps(recipe)})
-    with pytest.raises(CheckpointError, match=r"qgs-locus 0\.0\.7, .*; install those releases:"):
+    with pytest.raises(CheckpointError, match=r"query-gaussians-locus 0\.0\.7, .*; install those releases:"):
         qgs.load(old_locus)
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from qgs.io.pictures import write_gif, write_png
+from qgs.drawing.images import write_gif, write_png
 
 
 def test_png_keeps_every_pixel(tmp_path):

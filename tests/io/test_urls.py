@@ -4,7 +4,7 @@ import pytest
 from upath import UPath
 
 from qgs.data.paths import is_local, opened_path, stays_inside
-from qgs.io.urls import opened_replacing, write_bytes
+from qgs.io.files import opened_replacing, write_bytes
 
 
 @pytest.fixture(params=["{}", "file://{}", "memory://urls{}"])

@@ -1,4 +1,4 @@
-"""A plugin that was written outside this repository, beside the wheels of qgs and qgs-locus."""
+"""A plugin that was written outside this repository, beside the wheels of qgs and query-gaussians-locus."""
 
 from __future__ import annotations
 

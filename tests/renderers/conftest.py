@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.renderers import CpuRenderer, GsplatRenderer, TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 

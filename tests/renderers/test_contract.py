@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from qgs.contracts import RendererConfig
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.renderers import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 

@@ -9,7 +9,7 @@ import torch
 
 from qgs.contracts import RendererConfig
 from qgs.renderers import TorchRenderer
-from qgs.renderers.projection import project
+from qgs.renderers.reference import project
 from qgs.types import Cameras, Gaussians
 
 

@@ -10,9 +10,9 @@ from contract_mutants.inner_options import LosesAnOption
 from contract_mutants.modules import Counts
 
 from qgs.components import MlpFeedForward
-from qgs.composer.builtin import BUILTIN
+from qgs.composer.registry import BUILTIN
 from qgs.contracts import Centers, Component, ModelDims, ViewsConfig
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.testing import (
     CHECKS,
     Case,

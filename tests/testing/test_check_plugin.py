@@ -11,7 +11,7 @@ from qgs.cli import app
 from qgs.components import FreeCenters, GaussianHead, MlpFeedForward
 from qgs.composer.registry import InstalledPlugin, PluginError
 from qgs.contracts import CONTRACT_VERSION, ExpectedError, Plugin, ViewsConfig
-from qgs.contracts.extras import MissingExtraError
+from qgs.contracts.component import MissingExtraError
 from qgs.data import ChunksSource
 from qgs.renderers import TorchRenderer
 from qgs.testing import cases_of, check_plugin
@@ -56,7 +56,7 @@ class NeedsMore(MlpFeedForward):
     name = "needs_more"
 
     def __init__(self, config, dims):
-        raise MissingExtraError("needs_more needs numba: run `pip install qgs[cpu]`")
+        raise MissingExtraError('needs_more needs numba: run `pip install "query-gaussians[cpu]"`')
 
 
 class OnOtherDevices(TorchRenderer):
@@ -186,7 +186,7 @@ def test_a_component_that_leaves_the_process_fails(monkeypatch, component) -> No
 @pytest.mark.parametrize(
     ("component", "why"),
     [
-        (NeedsMore, "needs_more needs numba: run `pip install qgs[cpu]`"),
+        (NeedsMore, 'needs_more needs numba: run `pip install "query-gaussians[cpu]"`'),
         (OnOtherDevices, "runs on cuda alone, which is not here"),
     ],
 )

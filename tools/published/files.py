@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from published.idle_options import IDLE_OPTIONS
-from qgs.contracts.released import ReleasedOptions
+from published.options import ReleasedOptions
 
 WEIGHTS = "weights."
 EXPECTED = "expected."

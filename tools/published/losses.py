@@ -15,9 +15,9 @@ from qgs_locus.visibility import AnchorVisibility
 from torch import Tensor
 
 from published.files import EXPECTED, GoldenFile, GoldenFileError
+from published.options import ReleasedOptions
 from qgs.contracts import Loss
-from qgs.contracts.released import ReleasedOptions
-from qgs.geometry.projection import to_pixels
+from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
 from qgs.metrics import psnr
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from qgs_locus.released import locusgs_recipe
 from torch import Tensor
 
 from published.files import GoldenFile, GoldenFileError
+from published.locus import locusgs_recipe
 from published.recording import model_tensors
-from qgs.components.released import tokengs_recipe
+from published.tokengs import tokengs_recipe
 from qgs.composer import resolve
-from qgs.contracts.layout import real_ratio
+from qgs.contracts.weights import real_ratio
 from qgs.io.published import from_published
 from qgs.types import Cameras, Views
 

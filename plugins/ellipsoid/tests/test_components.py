@@ -20,7 +20,7 @@ from qgs import QueryState
 from qgs.components import GaussianHead, posact
 from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
 HALF = math.sqrt(0.5)

@@ -7,7 +7,7 @@ from qgs_locus.layout import LOCUSGS
 
 import qgs
 from qgs.contracts import LayoutError
-from qgs.contracts.layout import Shapes
+from qgs.contracts.weights import Shapes
 
 MODEL = {
     "width": 48,

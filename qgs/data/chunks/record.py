@@ -13,9 +13,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from qgs.data.frames import Fault
-from qgs.data.validation import intrinsics_faults, pose_faults
-from qgs.data.wording import a_type
+from qgs.data.lazy import a_type
+from qgs.data.photos.frames import Fault, intrinsics_faults, pose_faults
 
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_faults` tells
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height

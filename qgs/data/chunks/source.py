@@ -15,14 +15,13 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.chunks.listing import Listing, has_chunks, list_scenes
+from qgs.data.chunks.files import ChunkStore, Listing, has_chunks, list_scenes
 from qgs.data.chunks.record import Record, judge_record
-from qgs.data.chunks.store import ChunkStore
-from qgs.data.encoded import EncodedFrame, EncodedScene
-from qgs.data.frames import Size
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
-from qgs.data.lazy_scenes import LazyScenes
+from qgs.data.lazy import LazyScenes
 from qgs.data.paths import opened_path
+from qgs.data.photos.frames import Size
+from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from qgs.types import Cameras
 
 _log = logging.getLogger(__name__)

@@ -1,10 +1,8 @@
 """How fast and how large models are: any number of recipes, measured in turn in one run."""
 
 from qgs.engine.bench.memory import Peak, peak_memory
-from qgs.engine.bench.report import Report, Result
-from qgs.engine.bench.run import Measures, Subject, bench
-from qgs.engine.bench.timing import Spread, in_turn
-from qgs.engine.bench.workload import Workload, workload_of
+from qgs.engine.bench.run import Measures, Report, Result, Spread, Subject, bench, in_turn
+from qgs.engine.bench.work import Workload, workload_of
 
 __all__ = [
     "Measures",

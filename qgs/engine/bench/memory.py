@@ -8,8 +8,7 @@ import sys
 from dataclasses import asdict, dataclass
 
 from qgs.composer import Recipe
-from qgs.engine.bench.tasks import Operation
-from qgs.engine.bench.workload import Workload
+from qgs.engine.bench.work import Operation, Workload
 
 
 @dataclass(frozen=True)

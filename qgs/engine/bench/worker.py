@@ -12,8 +12,7 @@ import torch
 
 from qgs.composer import resolve
 from qgs.engine.bench.memory import Peak
-from qgs.engine.bench.tasks import Operation, make_task
-from qgs.engine.bench.workload import Workload
+from qgs.engine.bench.work import Operation, Workload, make_task
 
 
 def measure(

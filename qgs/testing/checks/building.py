@@ -7,7 +7,7 @@ import inspect
 import torch
 from torch import nn
 
-from qgs.composer.code_places import package_of
+from qgs.composer.registry import package_of
 from qgs.testing.audit import watched
 from qgs.testing.case import Case
 from qgs.testing.faults import expect

@@ -8,13 +8,11 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from qgs.composer.decode import decode_config
+from qgs.composer.decode import decode_config, models_in
 from qgs.composer.errors import Problems, RecipeError
-from qgs.composer.explain import models_in
-from qgs.composer.loader import load_mapping
+from qgs.composer.flow import variants
 from qgs.composer.nodes import ScalarNode
-from qgs.composer.providers import variants
-from qgs.composer.yaml12 import dump
+from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import ComponentConfig, Problem
 from qgs.testing.case import Case
 from qgs.testing.faults import expect

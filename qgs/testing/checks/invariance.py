@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.testing.case import Case
 from qgs.testing.faults import expect
 from qgs.testing.registry import check

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from qgs.composer.providers import variants
+from qgs.composer.flow import variants
 from qgs.contracts import FieldSpec, Loss
 from qgs.testing.case import Case
 from qgs.testing.faults import expect

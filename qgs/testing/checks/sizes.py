@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from qgs.composer.code_places import file_of
-from qgs.composer.promises import fits
+from qgs.composer.flow import fits
+from qgs.composer.registry import file_of
 from qgs.testing.case import Case
 from qgs.testing.chance import drawn_from
 from qgs.testing.faults import ContractError, expect

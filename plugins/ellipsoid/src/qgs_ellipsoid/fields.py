@@ -7,7 +7,7 @@ from torch import Tensor
 
 from qgs.contracts import Fields, FieldSpec
 from qgs.geometry.precision import full_precision
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import QueryState
 from qgs_ellipsoid.rotations import unit_quats
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from qgs.components import GaussianHead
 from qgs.contracts import Fields
 from qgs.geometry.precision import full_precision
-from qgs.geometry.rotations import quat_to_matrix
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import GaussianAttributes, QueryState
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, shape_fields
 from qgs_ellipsoid.rotations import quat_product, unit_quats

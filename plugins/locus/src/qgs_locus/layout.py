@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from qgs.components.layout import BACKBONE_RENAMES, DECODER, LEGIBLE, backbone
-from qgs.contracts.layout import Rename, Shapes, Unused, WeightLayout
+from qgs.components.weights import BACKBONE_RENAMES, DECODER, LEGIBLE, backbone
+from qgs.contracts.weights import Rename, Shapes, Unused, WeightLayout
 
 _CROSS = DECODER + "{}.gs_cross_attn."
 _Q_NORM = _CROSS + "q_norm."

@@ -1,0 +1,279 @@
+"""`qgs data check` and `qgs data pack`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from qgs_datatools.check import CheckReport, SceneReport
+
+app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
+
+_ROWS = 40
+
+
+class Format(StrEnum):
+    """Formats of data sets; auto tells them from what is there."""
+
+    auto = "auto"
+    nerfstudio = "nerfstudio"
+    blender = "blender"
+    colmap = "colmap"
+    llff = "llff"
+    chunks = "chunks"
+    dl3dv = "dl3dv"
+
+
+@app.command("check")
+def check(
+    path: Annotated[str, typer.Argument(help="Data set: a folder, an archive, a chunk, a URL.")],
+    index: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluation index to compare with the scenes; repeatable."),
+    ] = None,
+    format: Annotated[
+        Format, typer.Option(help="Only scenes listed in this format.")
+    ] = Format.auto,
+    images: Annotated[
+        str | None, typer.Option(help="Folder of photos to read, such as images_4.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="HTML page to write, with cameras and the worst pairs.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Read only the headers of images, match none.")
+    ] = False,
+    geometry: Annotated[
+        int, typer.Option(help="In how many scenes poses are judged by photos.", min=0)
+    ] = 20,
+    threads: Annotated[int, typer.Option(help="Threads that decode images.", min=1)] = 8,
+) -> None:
+    """Find what is wrong with a data set: one line for each fault, with scene, frame and remedy.
+
+    Every image is decoded, and poses are compared with what neighbouring photos share. Exit code 1
+    when there are errors, 0 when there are none or only warnings.
+    """
+    from rich.console import Console
+
+    from qgs.data.paths import opened_path
+    from qgs_datatools.check import Options, check
+
+    console = Console()
+    options = Options(geometry, quick, threads, format.value, images)
+    indices = [opened_path(name) for name in index or []]
+    with console.status("listing scenes") as status:
+        result = check(
+            opened_path(path), options, indices,
+            lambda done, total, name: status.update(f"{done} of {total} scenes, now {name}"),
+        )  # fmt: skip
+    _print(console, result)
+    if report is not None:
+        from qgs.io.files import write_text
+        from qgs_datatools.page import check_html
+
+        write_text(report, check_html(result))
+        _line(console, f"report: {report}")
+    if result.errors:
+        raise typer.Exit(1)
+
+
+def _print(console: Console, result: CheckReport) -> None:
+    if result.scenes:
+        console.print(_table(result.scenes))
+    hidden = len(result.scenes) - _ROWS
+    if hidden > 0:
+        _line(console, f"and {hidden} more scenes, none of them with more findings than these")
+    for finding in result.findings:
+        _line(console, str(finding))
+    for summary in result.indices:
+        _line(console, f"index {summary}")
+    for note in result.notes:
+        _line(console, f"note: {note}")
+    warnings = len(result.findings) - result.errors
+    counts = (
+        _counted(len(result.scenes), "scene"),
+        _counted(result.errors, "error"),
+        _counted(warnings, "warning"),
+    )
+    _line(console, f"{result.path}: {', '.join(counts)}")
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(scenes: Sequence[SceneReport]) -> Table:
+    from rich.table import Table
+
+    table = Table(header_style="bold", box=None, pad_edge=False)
+    table.add_column("scene", overflow="fold", min_width=12)
+    table.add_column("format")
+    for column in ("frames", "decodable", "missing", "bad poses", "epipolar px"):
+        table.add_column(column, justify="right")
+    shown = (
+        sorted(scenes, key=lambda scene: -len(scene.findings)) if len(scenes) > _ROWS else scenes
+    )
+    for scene in shown[:_ROWS]:
+        table.add_row(*_row(scene))
+    return table
+
+
+def _row(scene: SceneReport) -> list[str]:
+    counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
+    return [scene.name, scene.kind, *map(str, counts), scene.epipolar]
+
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from qgs.contracts import SceneSource
+    from qgs_datatools.packing import Packed, Splits
+
+Options = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Option of the source, such as images=images_4; repeatable."),
+]
+
+
+@app.command("pack")
+def pack(
+    path: Annotated[str, typer.Argument(help="Data set, or recipe (.yaml) whose data to pack.")],
+    out: Annotated[str, typer.Option(help="New folder or URL for the chunks.")],
+    options: Options = None,
+    image_size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="Height and width of all images; their own by default.", min=1),
+    ] = None,
+    jpeg: Annotated[
+        int | None,
+        typer.Option(
+            help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100
+        ),
+    ] = None,
+    chunk_mb: Annotated[int, typer.Option(help="Size of a chunk, in megabytes.", min=1)] = 100,
+    test_scenes: Annotated[
+        str | None, typer.Option(help="File that names the test scenes: an index, a list.")
+    ] = None,
+    test_every: Annotated[
+        int | None, typer.Option(help="Every n-th scene is a test scene.", min=2)
+    ] = None,
+    leave_out_broken: Annotated[
+        bool, typer.Option(help="Leave out scenes that cannot be read, and name them.")
+    ] = False,
+) -> None:
+    """Turn any data set into chunks, the format that training reads fastest.
+
+    JPEG and PNG photos of pinhole cameras stay as they are; others are undistorted, resized if
+    asked to, and written as PNG. Called again, it finishes what was interrupted.
+    """
+    from rich.console import Console
+
+    from qgs.data.paths import opened_path
+    from qgs_datatools import packing
+
+    console = Console()
+    source, settings = _opened(path, options or [], image_size)
+    splits = _splits(source, test_scenes, test_every)
+    settings |= {"test_scenes": test_scenes, "test_every": test_every}
+    with _Progress(console, sum(map(len, splits.values()))) as progress:
+        packed = packing.pack(
+            source,
+            splits,
+            opened_path(out),
+            settings,
+            packing.Encoding(image_size is not None, jpeg),
+            chunk_bytes=chunk_mb * 2**20,
+            leave_out_broken=leave_out_broken,
+            progress=progress.scene,
+        )
+    _conclude(console, packed, out)
+
+
+def _opened(
+    path: str, options: list[str], image_size: tuple[int, int] | None
+) -> tuple[SceneSource, dict[str, Any]]:
+    """The source of scenes at `path`, and what it was asked for."""
+    from qgs.composer import resolve
+    from qgs.data.paths import opened_path
+    from qgs.data.recognition import recognised
+
+    overrides = [f"data.{option}" for option in options]
+    if Path(path).suffix in {".yaml", ".yml"}:
+        recipe = resolve(path, overrides)
+    else:
+        type_ = recognised(opened_path(path))
+        recipe = resolve({"recipe": 1, "data": {"type": type_, "path": path}}, overrides)
+    source = recipe.build_data()
+    if image_size is not None:
+        source = type(source)(source.config.model_copy(update={"image_size": image_size}))
+    return source, {"source": type(source).name, **source.config.model_dump(mode="json")}
+
+
+def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None) -> Splits:
+    from qgs.data.dl3dv import read_scene_list
+    from qgs.data.paths import opened_path
+    from qgs_datatools.packing import own_splits, splits_by_list, splits_by_number
+
+    if test_scenes is not None and test_every is not None:
+        raise typer.BadParameter("give --test-scenes or --test-every, not both")
+    if test_scenes is not None:
+        return splits_by_list(source, read_scene_list(opened_path(test_scenes)))
+    if test_every is not None:
+        return splits_by_number(source, test_every)
+    return own_splits(source)
+
+
+class _Progress:
+    """A bar of scenes; nothing where no terminal is."""
+
+    def __init__(self, console: Console, scenes: int) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+        from rich.progress import TimeRemainingColumn as TimeLeft
+
+        columns = (MofNCompleteColumn(), BarColumn(), TimeLeft(), TextColumn("{task.description}"))
+        self._bar = Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        )
+        self._task = self._bar.add_task("", total=scenes)
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def scene(self, name: str) -> None:
+        """A scene is dealt with."""
+        self._bar.update(self._task, advance=1, description=name)
+
+
+def _conclude(console: Console, packed: Packed, out: str) -> None:
+    scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
+    again = f", {packed.resumed} of them packed before" if packed.resumed else ""
+    written = packed.frames - packed.kept
+    console.print(
+        f"{out}: scenes {scenes}{again}; {packed.frames} images now, {packed.kept} kept as they "
+        f"were, {written} written anew",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+    if not packed.scenes["test"]:
+        console.print("there are no test scenes: held-out frames are what is evaluated")
+    if packed.left_out:
+        console.print(f"{len(packed.left_out)} scenes could not be read and are left out:")
+        for name, reason in packed.left_out.items():
+            console.print(f"  {name}: {reason}", highlight=False, markup=False, soft_wrap=True)

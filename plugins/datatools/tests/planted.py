@@ -1,0 +1,98 @@
+"""Sound data sets of several formats, and copies of them to plant faults in."""
+
+import json
+import zipfile
+
+import numpy as np
+import torch
+from qgs_datatools.check import Options, check
+from textured_room import INTRINSICS, SIZE
+from upath import UPath
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+HASH = "0123456789abcdef" * 4
+FRAMES = 6
+
+
+def good_sets(root, shots) -> None:
+    """A nerfstudio folder, chunks with two scenes and an index, and an archive, all sound."""
+    listing = json.dumps(transforms(shots))
+    (root / "room" / "images").mkdir(parents=True)
+    (root / "room" / "transforms.json").write_text(listing)
+    for number, shot in enumerate(shots):
+        (root / "room" / "images" / f"{number}.jpg").write_bytes(shot.encoded())
+    (root / "chunks" / "test").mkdir(parents=True)
+    save(root / "chunks", [record("a", shots), record("b", shots[:3])])
+    (root / "chunks" / "test" / "index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
+    index = {"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}
+    (root / "chunks" / "evaluation.json").write_text(json.dumps(index))
+    (root / "archives").mkdir()
+    with zipfile.ZipFile(root / "archives" / f"{HASH}.zip", "w") as archive:
+        archive.writestr("transforms.json", listing)
+        for number, shot in enumerate(shots):
+            archive.writestr(f"images/{number}.jpg", shot.encoded())
+
+
+def transforms(shots) -> dict:
+    fx, fy, cx, cy = INTRINSICS
+    top = {"w": SIZE[1], "h": SIZE[0], "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    frames = [
+        {"file_path": f"images/{number}.jpg", "transform_matrix": (shot.c2w @ FLIP).tolist()}
+        for number, shot in enumerate(shots)
+    ]
+    return {**top, "frames": frames}
+
+
+def record(key: str, shots) -> dict:
+    fx, fy, cx, cy = INTRINSICS
+    height, width = SIZE
+    rows = [
+        [fx / width, fy / height, cx / width, cy / height, 0, 0,
+         *np.linalg.inv(shot.c2w)[:3].flatten()]
+        for shot in shots
+    ]  # fmt: skip
+    images = [torch.frombuffer(bytearray(shot.encoded()), dtype=torch.uint8) for shot in shots]
+    stamps = torch.arange(len(shots))
+    return {
+        "key": key, "url": "", "timestamps": stamps,
+        "cameras": torch.tensor(rows, dtype=torch.float32), "images": images,
+    }  # fmt: skip
+
+
+def save(root, content) -> None:
+    with (root / "test" / "0.torch").open("wb") as file:
+        torch.save(content, file)
+
+
+def told(path, index=(), geometry: int = 1) -> list[str]:
+    options = Options(geometry=geometry, threads=2)
+    report = check(UPath(path), options, [UPath(file) for file in index])
+    return [str(finding) for finding in report.findings]
+
+
+class Copy:
+    """A copy of one of the good sets, to plant faults in."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def listing(self, change) -> None:
+        file = self.path / "transforms.json"
+        data = json.loads(file.read_text())
+        change(data)
+        file.write_text(json.dumps(data))
+
+    def poses(self, change) -> None:
+        """Replace every pose (4, 4), given its number."""
+
+        def changed(data):
+            for number, frame in enumerate(data["frames"]):
+                pose = change(number, np.array(frame["transform_matrix"]))
+                frame["transform_matrix"] = pose.tolist()
+
+        self.listing(changed)
+
+    def chunk(self, change) -> None:
+        content = torch.load(self.path / "test" / "0.torch", weights_only=True)
+        changed = change(content)
+        save(self.path, content if changed is None else changed)

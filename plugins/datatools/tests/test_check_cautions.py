@@ -1,0 +1,144 @@
+"""What is odd but may be meant, what is not done, and what is told of it."""
+
+import io
+import shutil
+
+import pytest
+from PIL import Image
+from planted import FLIP, FRAMES, HASH, told
+from qgs_datatools.check import Options, check
+from textured_room import SIZE
+from upath import UPath
+
+
+def test_image_of_another_scale_than_the_rest(room):
+    file = room.path / "images" / "3.jpg"
+    Image.open(file).resize((90, 60)).save(file)
+    assert told(room.path) == [
+        "error: room, frame 3 (images/3.jpg): the image is 90 x 60 pixels, but listed as 180 x "
+        "120, another scale than the rest of the scene: give the original image, or one scaled as "
+        "the others"
+    ]
+
+
+def test_listed_size_that_intrinsics_do_not_go_with(room):
+    room.listing(lambda data: data.update(w=360, h=240))
+    assert told(room.path) == [
+        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): the image is 180 x 120 pixels, "
+        "but listed as 360 x 240: correct the listed width and height, which the intrinsics do not "
+        "go with"
+    ]
+
+
+def test_a_scaled_copy_passes(room):
+    room.listing(lambda data: data.update({key: 4 * data[key] for key in data if key != "frames"}))
+    (room.path / "images").rename(room.path / "images_4")
+    assert told(room.path) == []
+
+
+def test_a_repeated_photo_is_a_warning(room, shots):
+    room.poses(lambda number, pose: shots[2].c2w @ FLIP if number == 5 else pose)
+    shutil.copy(room.path / "images" / "2.jpg", room.path / "images" / "5.jpg")
+    assert told(room.path) == [
+        "warning: room, frame 5 (images/5.jpg): the photo and its pose repeat frame 2 "
+        "(images/2.jpg): remove one of the two"
+    ]
+
+
+def test_chunk_that_index_json_names_and_that_is_missing(chunks):
+    (chunks.path / "test" / "index.json").write_text(
+        '{"a": "0.torch", "c": "1.torch", "d": "0.torch"}'
+    )
+    assert told(chunks.path, geometry=0) == [
+        "error: test/1.torch: the chunk does not exist; index.json places there 1 scene: c: "
+        "download the chunk, or take its scenes out of index.json",
+        "error: d: test/index.json places the scene in 0.torch, which does not hold it: take the "
+        "scene out of index.json, or get the chunk that holds it",
+        "warning: b: test/0.torch holds the scene, but test/index.json does not name it, so that "
+        "it is never read: add it to index.json",
+    ]
+
+
+def test_plain_photos_are_not_judged_and_that_is_told(room):
+    for number in range(FRAMES):
+        shade = (20 * number, 30, 90)
+        Image.new("RGB", SIZE[::-1], shade).save(room.path / "images" / f"{number}.jpg")
+    assert told(room.path, geometry=1) == [
+        "warning: room: the poses are not judged against the photos: too few matches, below 24 in "
+        "every pair that was tried: look at the cameras yourself, in the picture that --report "
+        "draws"
+    ]
+
+
+def test_what_is_not_done_is_told(good):
+    def notes(options):
+        return check(UPath(good / "chunks"), options).notes
+
+    assert notes(Options(headers_only=True)) == [
+        "quick: only headers of images were read, and no pose was judged by photos"
+    ]
+    assert notes(Options(geometry=0)) == ["no pose was judged by photos (--geometry 0)"]
+    assert notes(Options(geometry=1)) == [
+        "poses were judged by photos in 1 of 2 scenes; --geometry 2 judges all"
+    ]
+
+
+def test_masks_that_are_missing_or_damaged(room):
+    (room.path / "masks").mkdir()
+    (room.path / "masks" / "1.png").write_bytes(b"no image")
+    file = io.BytesIO()
+    Image.new("L", SIZE[::-1], 255).save(file, "PNG")
+    (room.path / "masks" / "2.png").write_bytes(file.getvalue())
+
+    def masked(data):
+        for number in (0, 1, 2):
+            data["frames"][number]["mask_path"] = f"masks/{number}.png"
+
+    room.listing(masked)
+    first, second = told(room.path, geometry=0)
+    assert first == (
+        "error: room, frame 0 (images/0.jpg): its mask does not exist in masks: add it, or list no "
+        "mask"
+    )
+    assert second.startswith("error: room, frame 1 (images/1.jpg): ")
+    assert "1.png cannot be read as the mask of a photo" in second
+
+
+def test_many_missing_masks_are_one_line_that_names_no_single_one(room):
+    room.listing(
+        lambda data: [
+            frame.update(mask_path=frame["file_path"].replace("images", "masks"))
+            for frame in data["frames"]
+        ]
+    )
+    (line,) = told(room.path, geometry=0)
+    assert line == (
+        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): its mask does not exist in masks: "
+        "add it, or list no mask"
+    )
+
+
+def test_other_data_sets_beside_scenes_are_named(room, chunks, tmp_path):
+    assert told(tmp_path) == [
+        "warning: chunks: the folder is another data set (chunks) and is not checked with the "
+        f"photos beside it: run `qgs data check {chunks.path}`"
+    ]
+
+
+def test_single_files_are_data_sets_too(good):
+    def names(path):
+        return [scene.name for scene in check(UPath(path), Options(headers_only=True)).scenes]
+
+    assert names(good / "archives" / f"{HASH}.zip") == [HASH]
+    assert names(good / "chunks" / "test" / "0.torch") == ["a", "b"]
+    assert names(good / "room" / "transforms.json") == ["room"]
+
+
+def test_nothing_passes_in_silence(room, chunks):
+    with pytest.raises(FileNotFoundError, match="holds no chunks: leave --format out"):
+        check(UPath(room.path), Options(format="chunks"))
+    with pytest.raises(FileNotFoundError, match="no evaluation index at"):
+        check(UPath(room.path), Options(geometry=0), [UPath(room.path / "none.json")])
+    chunks.chunk(lambda _: [])
+    (line,) = [line for line in told(chunks.path) if "0.torch: " in line]
+    assert line.startswith("error: test/0.torch: the chunk holds no scene: pack the data set again")

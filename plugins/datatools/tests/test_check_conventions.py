@@ -1,0 +1,77 @@
+"""Poses written in another convention than the format's are named, in every format."""
+
+import numpy as np
+import photo_formats
+import pytest
+from qgs_datatools.check import Options, check
+from qgs_datatools.conventions import LLFF, OPENCV, OPENGL
+from textured_room import INTRINSICS, SIZE, walk
+from upath import UPath
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+WRITTEN_AND_READ = [
+    (OPENGL, "flipped", lambda c2w: c2w),
+    (OPENGL, "inverted", np.linalg.inv),
+    (OPENGL, "inverted and flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
+    (OPENCV, "flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
+    (OPENCV, "inverted", lambda c2w: c2w),
+    (OPENCV, "inverted and flipped", lambda c2w: c2w @ FLIP),
+    (LLFF, "OpenGL axes", lambda c2w: c2w @ FLIP),
+    (LLFF, "OpenCV axes", lambda c2w: c2w),
+    (LLFF, "flipped", lambda c2w: c2w[:, [1, 0, 2, 3]] * [-1, 1, 1, 1]),
+    (LLFF, "turned", lambda c2w: c2w[:, [1, 0, 2, 3]] * [1, -1, 1, 1]),
+]
+"""How true OpenCV poses are written by mistake."""
+
+
+def read(convention, stored: np.ndarray) -> np.ndarray:
+    """What a reader of the format makes of a stored matrix."""
+    if convention is OPENGL:
+        return stored @ FLIP
+    if convention is OPENCV:
+        return np.linalg.inv(stored)
+    down, right, back, centre = stored.T
+    return np.stack([right, down, -back, centre], 1)
+
+
+@pytest.mark.parametrize(("convention", "name", "write"), WRITTEN_AND_READ)
+def test_a_misreading_gives_the_true_poses_back(convention, name, write):
+    first, second = (shot.c2w for shot in walk(2))
+    meant = convention.misreadings[name].meant
+    as_meant = [meant(read(convention, write(pose))) for pose in (first, second)]
+    relative = np.linalg.inv(as_meant[1]) @ as_meant[0]
+    assert relative == pytest.approx(np.linalg.inv(second) @ first)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> photo_formats.PhotoSet:
+    """Three photos, and their poses with OpenGL's axes where OpenCV's are expected."""
+    folder = tmp_path_factory.mktemp("photos")
+    files = tuple(folder / f"{number}.jpg" for number in range(3))
+    shots = walk(6)[:3]
+    for file, shot in zip(files, shots, strict=True):
+        file.write_bytes(shot.encoded())
+    c2w = np.stack([shot.c2w @ FLIP for shot in shots])
+    return photo_formats.PhotoSet(files, c2w, INTRINSICS, SIZE)
+
+
+def told(path) -> str:
+    (finding,) = check(UPath(path), Options(threads=2)).findings
+    assert finding.frames == (0, 1, 2)
+    return finding.reason
+
+
+def test_blender(photos, tmp_path):
+    path = photo_formats.write_blender(tmp_path / "set", photo_formats.centred(photos), 3)
+    assert "these look like OpenCV poses read as OpenGL" in told(path)
+
+
+def test_colmap(photos, tmp_path):
+    pytest.importorskip("pycolmap")
+    path = photo_formats.write_colmap(tmp_path / "set", photos, "binary")
+    assert "these look like OpenGL poses read as OpenCV" in told(path)
+
+
+def test_llff(photos, tmp_path):
+    path = photo_formats.write_llff(tmp_path / "set", photo_formats.centred(photos))
+    assert "the axes look like (up, right, forward), OpenGL and OpenCV mixed" in told(path)

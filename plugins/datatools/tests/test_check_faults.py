@@ -1,0 +1,291 @@
+"""Each planted fault is found as exactly one line; the untouched sets pass without any."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from planted import FLIP, HASH, told
+from qgs_datatools.check import Options, check
+from qgs_datatools.folders import chunk_folders
+from textured_room import SIZE
+from upath import UPath
+
+
+@pytest.mark.parametrize("name", ["room", "chunks", "archives"])
+def test_untouched_sets_pass(good, name):
+    report = check(UPath(good / name), Options(threads=2))
+    assert report.findings == []
+    assert report.notes == []
+    for scene in report.scenes:
+        assert scene.geometry.verdict.agrees
+        assert scene.geometry.pixels < 0.6
+        assert scene.listed == scene.decodable > 0
+
+
+def test_missing_image(room):
+    (room.path / "images" / "2.jpg").unlink()
+    assert told(room.path) == [
+        "error: room, frame 2 (images/2.jpg): the image does not exist: add the file, or remove "
+        "the frame from transforms.json"
+    ]
+
+
+def test_truncated_jpeg(room):
+    file = room.path / "images" / "2.jpg"
+    file.write_bytes(file.read_bytes()[:-400])
+    (line,) = told(room.path)
+    assert line.startswith("error: room, frame 2 (images/2.jpg): the image cannot be decoded (")
+    assert line.endswith("replace the file, or remove the frame from transforms.json")
+
+
+def test_truncated_jpeg_in_a_chunk(chunks):
+    def cut(content):
+        content[0]["images"][4] = content[0]["images"][4][:-400].clone()
+
+    chunks.chunk(cut)
+    (line,) = told(chunks.path)
+    assert line.startswith("error: a, frame 4 (4): the image cannot be decoded (")
+    assert line.endswith("replace the file, or remove the frame from the chunk")
+
+
+def test_image_of_another_shape(room):
+    file = room.path / "images" / "3.jpg"
+    Image.open(file).resize((160, 120)).save(file)
+    assert told(room.path) == [
+        "error: room, frame 3 (images/3.jpg): the image is 160 x 120 pixels, but listed as 180 x "
+        "120, another aspect ratio, so that the intrinsics cannot be scaled: give the original "
+        "image, or correct the listed size"
+    ]
+
+
+def test_width_and_height_swapped(room):
+    room.listing(lambda data: data.update(w=SIZE[0], h=SIZE[1]))
+    assert told(room.path) == [
+        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): the image is 180 x 120 pixels, "
+        "but listed as 120 x 180, another aspect ratio, so that the intrinsics cannot be scaled: "
+        "width and height are swapped; swap them back"
+    ]
+
+
+def test_sides_swapped_in_a_chunks_intrinsics(chunks):
+    def swap(content):
+        content[0]["cameras"][:, :4] *= torch.tensor([1.5, 1 / 1.5, 1.5, 1 / 1.5])
+
+    chunks.chunk(swap)
+    (line,) = told(chunks.path)
+    assert line.startswith("error: a, frames 0-5 (0 to 5): fx and fy differ as if divided by the")
+    assert "width and height are swapped; divide fx and cx by the width" in line
+
+
+def test_opencv_poses_in_a_transforms_json(room):
+    room.poses(lambda number, pose: pose @ FLIP)
+    (line,) = told(room.path, geometry=1)
+    assert line.startswith(
+        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): these look like OpenCV poses read "
+        "as OpenGL (matches lie "
+    )
+    assert line.endswith(
+        "negate columns 1 and 2 (the camera's y and z axes) of every transform_matrix"
+    )
+
+
+def test_opengl_poses_in_a_chunk(chunks):
+    def flip(content):
+        w2c = content[0]["cameras"][:, 6:].reshape(-1, 3, 4)
+        w2c[:, 1:] *= -1
+
+    chunks.chunk(flip)
+    (line,) = told(chunks.path, geometry=1)
+    assert line.startswith(
+        "error: a, frames 0-5 (0 to 5): these look like OpenGL poses read as OpenCV (matches lie "
+    )
+    assert line.endswith(
+        "negate rows 1 and 2 (the camera's y and z axes) of every world-to-camera matrix"
+    )
+
+
+def test_mirrored_pose(room):
+    room.poses(lambda number, pose: pose @ np.diag([-1, 1, 1, 1]) if number == 1 else pose)
+    assert told(room.path) == [
+        "error: room, frame 1 (images/1.jpg): the pose mirrors and so is not rigid (determinant "
+        "-1): negate one axis of the camera, or export the poses again"
+    ]
+
+
+def test_nan_pose(room):
+    room.poses(lambda number, pose: pose * np.nan if number == 4 else pose)
+    assert told(room.path) == [
+        "error: room, frame 4 (images/4.jpg): the pose has NaN or infinite numbers: remove the "
+        "frame"
+    ]
+
+
+def test_nan_pose_in_a_chunk(chunks):
+    def broken(content):
+        content[1]["cameras"][2, 9:] = np.nan
+
+    chunks.chunk(broken)
+    assert told(chunks.path) == [
+        "error: b, frame 2 (2): the pose has NaN or infinite numbers: remove the frame"
+    ]
+
+
+def test_duplicate_pose(room, shots):
+    room.poses(lambda number, pose: shots[2].c2w @ FLIP if number == 5 else pose)
+    assert told(room.path) == [
+        "error: room, frame 5 (images/5.jpg): the pose repeats that of frame 2 (images/2.jpg), "
+        "whose photo is another one: correct the pose, or remove one of the frames"
+    ]
+
+
+def test_zero_baseline(room, shots):
+    def moved(number, pose):
+        pose[:3, 3] = shots[2].c2w[:3, 3] if number == 3 else pose[:3, 3]
+        return pose
+
+    room.poses(moved)
+    assert told(room.path) == [
+        "error: room, frame 3 (images/3.jpg): the camera stands on the same point as that of frame "
+        "2 (images/2.jpg), a zero baseline, so that the two tell no depth: correct the position, "
+        "or remove one of the frames"
+    ]
+
+
+def far_away(number, pose):
+    """In metres of a map's grid."""
+    pose[:3, 3] += [2e5, 3e5, 100]
+    return pose
+
+
+def test_sound_poses_far_from_the_origin_pass(room):
+    room.poses(far_away)
+    assert told(room.path) == []
+
+
+def test_zero_baseline_far_from_the_origin(room, shots):
+    def moved(number, pose):
+        pose[:3, 3] = shots[2].c2w[:3, 3] if number == 3 else pose[:3, 3]
+        return far_away(number, pose)
+
+    room.poses(moved)
+    (line,) = told(room.path)
+    assert "room, frame 3 (images/3.jpg): the camera stands on the same point as that of" in line
+
+
+def test_all_cameras_on_one_point(chunks):
+    def centred(content):
+        content[0]["cameras"][:, [9, 13, 17]] = 0
+
+    chunks.chunk(centred)
+    assert told(chunks.path, geometry=1) == [
+        "error: a, frames 0-5 (0 to 5): all 6 cameras stand on one point, so that no depth can be "
+        "told: export the poses with their translations"
+    ]
+
+
+def test_principal_point_off_the_image(room):
+    room.listing(lambda data: data["frames"][1].update(cx=200.0))
+    assert told(room.path) == [
+        "error: room, frame 1 (images/1.jpg): the principal point lies off the image (fx 145, fy "
+        "147, cx 200, cy 61, 180 x 120 pixels): correct cx and cy, unless the photo is cut from a "
+        "larger one"
+    ]
+
+
+def test_normalised_intrinsics_read_as_pixels(room):
+    room.listing(lambda data: data.update(fl_x=0.8, fl_y=1.2, cx=0.5, cy=0.5))
+    assert told(room.path) == [
+        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): the intrinsics look normalised "
+        "(fx 0.8, fy 1.2, cx 0.5, cy 0.5): they must be in pixels; multiply fx and cx by the "
+        "width, fy and cy by the height"
+    ]
+
+
+def test_pixels_in_a_chunk(chunks):
+    def scaled(content):
+        content[0]["cameras"][:, :4] *= torch.tensor([180, 120, 180, 120])
+
+    chunks.chunk(scaled)
+    assert told(chunks.path) == [
+        "error: a, frames 0-5 (0 to 5): the intrinsics (145, 147, 89, 61) look like pixels: chunks "
+        "hold fx and cx divided by the image's width, fy and cy by its height"
+    ]
+
+
+def test_index_scene_that_is_absent(chunks, tmp_path):
+    index = tmp_path / "wanted.json"
+    index.write_text(json.dumps({"nowhere": {"context": [0], "target": [1]}, "b": None}))
+    assert told(chunks.path, [index], geometry=0) == [
+        "error: nowhere: the index wanted.json names the scene, which is not there: add the scene, "
+        "or take it out of the index; correct the name if it is spelled wrong"
+    ]
+
+
+def test_index_frame_out_of_range(chunks):
+    index = {"b": {"context": [0, 2], "target": [3]}}
+    (chunks.path / "evaluation.json").write_text(json.dumps(index))
+    assert told(chunks.path, geometry=0) == [
+        "error: b, frame 3: the index evaluation.json has the target frame 3, but the scene's 3 "
+        "frames are 0 to 2: correct the index, or add the missing frames to the scene"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ({"key": "a"}, "the file holds a dict, expected a list of mappings"),
+        (
+            [torch.zeros(2), torch.zeros(2)],
+            "2 of its 2 entries are no mappings with a 'key' (the first is a Tensor)",
+        ),
+    ],
+)
+def test_chunk_that_is_no_list_of_mappings(chunks, content, reason):
+    chunks.chunk(lambda _: content)
+    assert told(chunks.path) == [
+        f"error: test/0.torch: {reason}; index.json places there 2 scenes: a, b: pack the data set "
+        "again with `qgs data pack`, or copy the file again"
+    ]
+
+
+class Counted(str):
+    """A string that counts how often any is compared."""
+
+    __slots__ = ()
+    compared = 0
+    __hash__ = str.__hash__
+
+    def __eq__(self, other):
+        Counted.compared += 1
+        return super().__eq__(other)
+
+
+def test_keys_are_looked_up_and_not_searched(tmp_path, monkeypatch):
+    number = 300
+    keys = {f"{n}.torch": Counted(f"scene {n}") for n in range(number)}
+    (tmp_path / "index.json").touch()
+    for name in list(keys)[1:]:
+        (tmp_path / name).touch()
+    module = "qgs_datatools.folders"
+    monkeypatch.setattr(f"{module}.load_chunk", lambda file: [{"key": keys[file.name]}])
+    monkeypatch.setattr(
+        f"{module}.read_chunk_index",
+        lambda file: {key: Counted(name) for name, key in keys.items()},
+    )
+    (folder,) = chunk_folders(UPath(tmp_path))
+    assert [finding.scene for finding in folder.findings] == ["0.torch"]
+    assert len(folder.candidates) == number - 1
+    assert Counted.compared < 10 * number
+
+
+def test_archive_that_leads_outside(archives):
+    file = archives.path / f"{HASH}.zip"
+    with zipfile.ZipFile(file, "a") as archive:
+        archive.writestr("../evil.txt", "x")
+    assert told(archives.path) == [
+        f"error: {HASH}: {file} holds the name '../evil.txt', which leads outside the archive: it "
+        "is not read. Get the archive from its publisher again"
+    ]

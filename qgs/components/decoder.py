@@ -1,0 +1,109 @@
+"""The default decoder layer: attention by content alone, an MLP, nothing to refine (TokenGS)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components.blocks import NORM_EPS, CrossAttentionCore, Mlp, SelfAttentionCore
+from qgs.contracts import (
+    AttentionWeights,
+    ComponentConfig,
+    CrossAttention,
+    FeedForward,
+    ModelDims,
+    Refinement,
+    SelfAttention,
+)
+from qgs.contracts.component import Fields
+from qgs.contracts.encoder import MEMORY_FIELDS
+from qgs.types import ImageMemory, QueryState
+
+
+class ContentCrossAttention(CrossAttention):
+    """softmax(q k / sqrt(d)) v over all image tokens."""
+
+    name: ClassVar[str] = "content"
+
+    class Config(ComponentConfig):
+        """norm_eps: of every LayerNorm."""
+
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        """Keys and values."""
+        return {name: MEMORY_FIELDS[name] for name in ("memory.keys", "memory.values")}
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
+        """The update (B, N, D)."""
+        return self.core(state.features, memory.keys, memory.values)
+
+    def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
+        """Attention over image tokens."""
+        return self.core.explain(state.features, memory.keys, queries)
+
+
+class ContentSelfAttention(SelfAttention):
+    """Pre-norm self-attention over the N queries of a scene."""
+
+    name: ClassVar[str] = "content"
+
+    class Config(ComponentConfig):
+        """norm_eps: of every LayerNorm."""
+
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
+
+    def forward(self, state: QueryState) -> Tensor:
+        """The update (B, N, D)."""
+        return self.attention(self.norm(state.features))
+
+    def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
+        """Attention over queries."""
+        return self.attention.explain(self.norm(state.features), queries)
+
+
+class MlpFeedForward(FeedForward):
+    """LayerNorm, D -> ratio*D -> D with GELU."""
+
+    name: ClassVar[str] = "mlp"
+
+    class Config(ComponentConfig):
+        """ratio: hidden width, rounded down, over D. norm_eps: of the LayerNorm."""
+
+        ratio: float = Field(default=4.0, ge=1)
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.mlp = Mlp(dims.width, int(config.ratio * dims.width), dims.width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """The update (B, N, D)."""
+        return self.mlp(self.norm(features))
+
+
+class NoRefinement(Refinement):
+    """Passes the state on."""
+
+    name: ClassVar[str] = "none"
+
+    def forward(self, state: QueryState) -> QueryState:
+        """The state, as it is."""
+        return state

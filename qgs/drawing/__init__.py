@@ -1,0 +1,1 @@
+"""Drawing: tensors to pictures, queries over photos, labelled figures."""

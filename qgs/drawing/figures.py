@@ -1,0 +1,167 @@
+"""Labelled figures: comparison grids with a depth scale, training curves; colours of all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qgs.drawing.images import DEPTH_MAP, NOTHING, Picture
+
+Color = tuple[int, int, int]
+
+CATEGORICAL: tuple[Color, ...] = (
+    (213, 94, 0),
+    (0, 114, 178),
+    (0, 158, 115),
+    (204, 121, 167),
+    (230, 159, 0),
+    (86, 180, 233),
+)
+"""Distinct for colour-blind readers, on light ground and on photos."""
+
+INK: Color = (32, 36, 42)
+MUTED: Color = (122, 128, 136)
+PAPER: Color = (255, 255, 255)
+ATTENTION_MAP = "magma"
+
+
+def hex_color(color: Color) -> str:
+    """#rrggbb."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def categorical(index: int) -> Color:
+    """The colour of the `index`-th series or token; they repeat after six."""
+    return CATEGORICAL[index % len(CATEGORICAL)]
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """Matplotlib settings of every figure, for the `with` block only."""
+    from matplotlib import rc_context
+
+    ink = hex_color(INK)
+    style: dict[Any, Any] = {
+        "font.family": "sans-serif",
+        "font.size": 9,
+        "text.color": ink,
+        "axes.labelcolor": ink,
+        "axes.edgecolor": hex_color(MUTED),
+        "axes.linewidth": 0.7,
+        "axes.titlesize": 9,
+        "axes.titlelocation": "left",
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "grid.color": hex_color(NOTHING),
+        "grid.linewidth": 0.7,
+        "axes.axisbelow": True,
+        "xtick.color": hex_color(MUTED),
+        "ytick.color": hex_color(MUTED),
+        "xtick.labelcolor": ink,
+        "ytick.labelcolor": ink,
+        "lines.linewidth": 1.6,
+        "legend.frameon": False,
+        "figure.facecolor": "white",
+    }
+    with rc_context(style):
+        yield
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLUMN_INCHES = 1.9
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What training reported: seconds since its start, loss, and PSNR of the supervised views."""
+
+    seconds: Sequence[float]
+    loss: Sequence[float]
+    psnr: Sequence[float]
+
+
+def figure_picture(figure: Figure, dpi: int = 120) -> Picture:
+    """The figure as a picture."""
+    from PIL import Image
+
+    buffer = BytesIO()
+    with figure_style():
+        figure.savefig(buffer, format="png", dpi=dpi)
+    return np.asarray(Image.open(buffer).convert("RGB"))
+
+
+def grid_figure(
+    rows: Mapping[str, Sequence[Picture]],
+    columns: Sequence[str],
+    depth_row: tuple[str, float, float] | None = None,
+) -> Figure:
+    """Rows of pictures under column titles; `depth_row` (row, near, far) gets a colour scale."""
+    from matplotlib.figure import Figure
+
+    aspect = np.divide(*next(iter(rows.values()))[0].shape[:2])
+    size = (COLUMN_INCHES * len(columns) + 0.9, COLUMN_INCHES * aspect * len(rows) + 0.6)
+    with figure_style():
+        figure = Figure(figsize=size, layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)  # type: ignore[union-attr]
+        axes = figure.subplots(len(rows), len(columns), squeeze=False)
+        for line, (label, pictures) in zip(axes, rows.items(), strict=True):
+            for axis, picture in zip(line, pictures, strict=True):
+                axis.imshow(picture)
+                axis.set(xticks=[], yticks=[])
+                axis.spines[:].set_visible(False)
+            line[0].set_ylabel(label)
+            if depth_row and label == depth_row[0]:
+                _depth_scale(figure, line, *depth_row[1:])
+        for axis, title in zip(axes[0], columns, strict=True):
+            axis.set_title(title)
+    return figure
+
+
+def _depth_scale(figure: Figure, line: np.ndarray, near: float, far: float) -> None:
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    scale = ScalarMappable(Normalize(near, far), colormaps[DEPTH_MAP])
+    bar = figure.colorbar(scale, ax=list(line), fraction=0.03, pad=0.01)
+    bar.set_label("depth, world units")
+    bar.outline.set_visible(False)  # type: ignore[operator]
+
+
+def curves_figure(curves: Mapping[str, Curves]) -> Figure:
+    """Loss and PSNR against seconds of training: the raw values pale, their running mean strong."""
+    from matplotlib.figure import Figure
+
+    with figure_style():
+        figure = Figure(figsize=(8.4, 2.9), layout="constrained")
+        loss_axis, psnr_axis = figure.subplots(1, 2)
+        for index, (name, run) in enumerate(curves.items()):
+            color = hex_color(categorical(index))
+            for axis, values in ((loss_axis, run.loss), (psnr_axis, run.psnr)):
+                axis.plot(run.seconds, values, color=color, alpha=0.18, linewidth=0.7)
+                axis.plot(run.seconds, running_mean(values), color=color, label=name)
+        loss_axis.set(title="Training loss", xlabel="seconds", yscale="log")
+        psnr_axis.set(title="PSNR of the training views, dB", xlabel="seconds")
+        psnr_axis.legend(loc="lower right")
+        loss_axis.yaxis.set_major_formatter("{x:g}")
+        loss_axis.yaxis.set_minor_formatter("{x:g}")
+        loss_axis.tick_params(which="minor", color=hex_color(MUTED), labelsize=7)
+    return figure
+
+
+def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
+    """Centred mean over `share` of the values, with a shorter window at both ends."""
+    array = np.asarray(values, dtype=float)
+    half = int(len(array) * share / 2)
+    total = np.concatenate([[0.0], np.cumsum(array)])
+    index = np.arange(len(array))
+    reach = np.minimum(half, np.minimum(index, len(array) - 1 - index))
+    return (total[index + reach + 1] - total[index - reach]) / (2 * reach + 1)

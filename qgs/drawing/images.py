@@ -1,0 +1,126 @@
+"""Tensors to pictures (H, W, 3) uint8, of RGB, depth and other sizes; PNG and GIF files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from qgs.io.files import replacing
+from qgs.types import Cameras
+
+Picture = np.ndarray
+"""uint8 (H, W, 3)."""
+
+NOTHING = (232, 233, 235)
+"""Colour of where there is nothing to show: no depth, no attention."""
+
+DEPTH_MAP = "viridis_r"
+
+
+def rgb_picture(image: Tensor) -> Picture:
+    """RGB (3, H, W), clipped to [0, 1]."""
+    pixels = image.detach().float().clamp(0, 1).mul(255).round().byte()
+    return pixels.permute(1, 2, 0).cpu().numpy()
+
+
+def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
+    """Depth (1, H, W) from near (light) to far (dark); pixels without depth (0) are grey."""
+    from matplotlib import colormaps
+
+    values = depth.detach().float().cpu().numpy()[0]
+    shade = np.clip((values - near) / max(far - near, 1e-12), 0, 1)
+    picture = (colormaps[DEPTH_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
+    picture[values <= 0] = NOTHING
+    return picture
+
+
+def depth_range(depths: Tensor) -> tuple[float, float]:
+    """The 2nd and 98th percentile of all depths that are not 0, for a scale that pictures share."""
+    seen = depths.detach()[depths.detach() > 0].float()
+    if seen.numel() == 0:
+        return 0.0, 1.0
+    near, far = torch.quantile(seen.cpu(), torch.tensor([0.02, 0.98])).tolist()
+    return near, far
+
+
+def side_by_side(pictures: list[Picture], gap: int = 4) -> Picture:
+    """Pictures of one height in a row, white between them."""
+    height = pictures[0].shape[0]
+    spacer = np.full((height, gap, 3), 255, np.uint8)
+    parts = [part for picture in pictures for part in (picture, spacer)]
+    return np.concatenate(parts[:-1], 1)
+
+
+def png_bytes(picture: np.ndarray) -> bytes:
+    """A uint8 (H, W, 3) picture as the bytes of a PNG file."""
+    buffer = BytesIO()
+    _checked(picture).save(buffer, format="PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def write_png(picture: np.ndarray, path: str | Path) -> None:
+    """Write a uint8 (H, W, 3) picture."""
+    data = png_bytes(picture)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_gif(frames: Sequence[np.ndarray], path: str | Path, frames_per_second: float) -> None:
+    """Write uint8 (H, W, 3) frames of one size as a GIF that loops for ever.
+
+    All frames share one palette, so that flat areas do not flicker. Raises ValueError for no
+    frames or frames of several sizes.
+    """
+    sizes = {frame.shape for frame in frames}
+    if len(sizes) != 1:
+        raise ValueError(f"a GIF needs frames of one size, got {sorted(sizes) or 'none'}")
+    images = [_checked(frame) for frame in frames]
+    sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
+    palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
+    paletted = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    with replacing(path) as temporary:
+        paletted[0].save(
+            temporary,
+            format="GIF",
+            save_all=True,
+            append_images=paletted[1:],
+            duration=round(1000 / frames_per_second),
+            loop=0,
+        )
+
+
+def _checked(picture: np.ndarray) -> Image.Image:
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise ValueError(
+            f"a picture must be uint8 (H, W, 3), got {picture.dtype} {tuple(picture.shape)}"
+        )
+    return Image.fromarray(picture)
+
+
+def enlarged(picture: Picture, side: int, *, smooth: bool = False) -> Picture:
+    """The picture with its longer side at `side` pixels; sharp pixels unless `smooth`."""
+    height, width = picture.shape[:2]
+    factor = side / max(height, width)
+    size = (round(width * factor), round(height * factor))
+    resample = Image.Resampling.BICUBIC if smooth else Image.Resampling.NEAREST
+    return np.asarray(Image.fromarray(picture).resize(size, resample))
+
+
+def finer(cameras: Cameras, side: int) -> Cameras:
+    """The same cameras with at least `side` pixels on the longer side, a whole multiple."""
+    height, width = cameras.size
+    factor = max(1, round(side / max(height, width)))
+    return Cameras(cameras.c2w, cameras.intrinsics * factor, (height * factor, width * factor))
+
+
+def washed(picture: Picture, strength: float = 0.6) -> Picture:
+    """Greys, lightened towards white by `strength`: a ground to draw on."""
+    grey = picture.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    light = 255 - (255 - grey) * (1 - strength)
+    return np.repeat(light[..., None], 3, -1).round().astype(np.uint8)

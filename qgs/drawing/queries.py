@@ -1,0 +1,277 @@
+"""Queries drawn onto photos: their supports, what they attend to, their Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from einops import rearrange
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from qgs.drawing.figures import ATTENTION_MAP, INK, Color, categorical
+from qgs.drawing.images import Picture, rgb_picture, washed
+from qgs.geometry.precision import full_precision
+from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Gaussians, SpatialSupport
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Outlines in one image, pixels. whole: the ellipsoid is in front of the camera, all of it.
+
+    centers: (N, 2) of the outlines. axes: (N, 2, 2), semi-axes as columns. Only rows where `whole`
+    is true are ellipses. points: (N, 2) the ellipsoids' own centres in the image, at camera-frame
+    z `depths` (N,); only those of positive depth mean something.
+    """
+
+    centers: Tensor
+    axes: Tensor
+    points: Tensor
+    depths: Tensor
+    whole: Tensor
+
+
+def project_support(support: SpatialSupport, cameras: Cameras) -> Ellipses:
+    """Exact perspective outlines of the first scene's ellipsoids in one camera, cameras (1, 1).
+
+    An ellipsoid with centre c and axes A (camera frame) has the dual quadric A A^T - c c^T, whose
+    image under K is the dual conic of the outline (Hartley and Zisserman, section 8.3).
+    """
+    rotation = cameras.w2c[0, 0, :3, :3]
+    centers = to_camera(support.centers[:1], cameras)[0, 0]
+    return _outlines(centers, rotation @ support.axes[0], cameras.intrinsics[0, 0])
+
+
+@full_precision
+def _outlines(centers_N3: Tensor, axes_N33: Tensor, intrinsics: Tensor) -> Ellipses:
+    fx, fy, cx, cy = intrinsics.unbind()
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    calibration = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
+    quadric = axes_N33 @ axes_N33.mT - centers_N3[:, :, None] * centers_N3[:, None, :]
+    conic = calibration @ quadric @ calibration.T
+    scale = -conic[:, 2, 2]
+    whole = (scale > 1e-9) & (centers_N3[:, 2] > 0)
+    conic = conic / torch.where(whole, scale, 1)[:, None, None]
+    centers = -conic[:, :2, 2]
+    shape = conic[:, :2, :2] + centers[:, :, None] * centers[:, None, :]
+    lengths, directions = torch.linalg.eigh(torch.where(whole[:, None, None], shape, 0))
+    axes = directions * lengths.clamp_min(0).sqrt()[:, None, :]
+    depths = centers_N3[:, 2]
+    in_front = torch.where(depths[:, None] > 0, centers_N3, centers_N3.new_tensor([0, 0, 1]))
+    return Ellipses(centers, axes, to_pixels(in_front, intrinsics), depths, whole)
+
+
+OVERSAMPLING = 3
+OUTLINE_POINTS = 96
+
+
+def support_picture(
+    photo: Picture, support: SpatialSupport, cameras: Cameras, colors: Mapping[int, Color]
+) -> Picture:
+    """All centres as dots, the queries of `colors` as outlined ellipses in their colours.
+
+    photo: the view of cameras (1, 1), at any size of its aspect. An outline that passes behind the
+    camera is not drawn; its centre is, if it lies in front.
+    """
+    ellipses = project_support(support, cameras)
+    height, width = photo.shape[:2]
+    scale = OVERSAMPLING * width / cameras.size[1]
+    canvas = Image.fromarray(washed(photo, 0.45)).resize(
+        (width * OVERSAMPLING, height * OVERSAMPLING), Image.Resampling.BICUBIC
+    )
+    draw = ImageDraw.Draw(canvas, "RGBA")
+    for index in torch.argsort(ellipses.depths, descending=True).tolist():
+        if index not in colors:
+            _draw_center(draw, ellipses, index, scale, INK, 1.5)
+    for index, color in colors.items():
+        _draw_outline(draw, ellipses, index, scale, color)
+        _draw_center(draw, ellipses, index, scale, color, 3.0)
+    return np.asarray(canvas.resize((width, height), Image.Resampling.LANCZOS))
+
+
+def _draw_center(
+    draw: ImageDraw.ImageDraw,
+    ellipses: Ellipses,
+    index: int,
+    scale: float,
+    color: Color,
+    radius: float,
+) -> None:
+    if ellipses.depths[index] <= 0:
+        return
+    x, y = (ellipses.points[index] * scale).clamp(-1e5, 1e5).tolist()
+    r = radius * OVERSAMPLING
+    draw.ellipse((x - r, y - r, x + r, y + r), fill=(*color, 190))
+
+
+def _draw_outline(
+    draw: ImageDraw.ImageDraw, ellipses: Ellipses, index: int, scale: float, color: Color
+) -> None:
+    if not ellipses.whole[index]:
+        return
+    angle = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS)
+    circle = torch.stack([angle.cos(), angle.sin()])
+    outline = (ellipses.centers[index][:, None] + ellipses.axes[index] @ circle) * scale
+    points = [tuple(point) for point in outline.T.clamp(-1e5, 1e5).tolist()]
+    draw.polygon(points, fill=(*color, 22))
+    draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
+
+
+def patch_maps(row_M: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
+    """Scores (M,) of image tokens as one map per view (V, H/P, W/P)."""
+    return row_M.detach().float().cpu().reshape(grid).numpy()
+
+
+def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
+    """Each photo in pale grey with its map on top; the views share one colour scale."""
+    from matplotlib import colormaps
+
+    low, high = float(maps.min()), float(maps.max())
+    shades = (maps - low) / max(high - low, 1e-12)
+    pictures = []
+    for photo, shade in zip(photos, shades, strict=True):
+        height, width = photo.shape[:2]
+        patches = Image.fromarray((shade * 255).round().astype(np.uint8))
+        cells = np.asarray(patches.resize((width, height), Image.Resampling.NEAREST)) / 255
+        color = colormaps[ATTENTION_MAP](cells)[..., :3] * 255
+        mixed = 0.72 * color + 0.28 * washed(photo, 0.2)
+        pictures.append(mixed.round().astype(np.uint8))
+    return pictures
+
+
+@dataclass(frozen=True)
+class Token:
+    """A query whose Gaussians are shown.
+
+    weight: pixels it accounts for, the sum of its blending weights. spread: mean distance of its
+    Gaussians to their centroid, world units.
+    """
+
+    query: int
+    color: Color
+    weight: float
+    spread: float
+
+
+def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """Blending weight of each Gaussian, summed over all pixels of all cameras: (B, G), in pixels.
+
+    A render is linear in the colours, so this is the gradient of its sum, for any renderer.
+    """
+    colors = gaussians.colors.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        rgb = model.render(replace(gaussians, colors=colors), cameras).rgb
+        (gradient,) = torch.autograd.grad(rgb.sum(), colors)
+    return gradient.mean(-1)
+
+
+def notable_tokens(
+    model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
+) -> list[Token]:
+    """`count` tokens that matter to cameras (1, V) and stand apart, the heaviest first.
+
+    Of the heaviest eighth, each next token is the one farthest from those already taken, by the
+    pixel of its weighted centroid in the first camera.
+    """
+    queries = model.queries.count
+    weights_NK = rearrange(
+        rendered_weights(model, gaussians, cameras)[0], "(n k) -> n k", n=queries
+    )
+    means_NK3 = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries)
+    weights = weights_NK.sum(1)
+    candidates = weights.topk(min(max(queries // 8, 2 * count), queries)).indices
+    share_CK = weights_NK[candidates] / weights[candidates, None].clamp_min(1e-12)
+    centres = (means_NK3[candidates] * share_CK[..., None]).sum(1)
+    chosen = _spread_out(_pixels(centres, cameras[:, :1]), count)
+    return [
+        Token(
+            query=int(candidates[index]),
+            color=categorical(rank),
+            weight=float(weights[candidates[index]]),
+            spread=float(_spread(means_NK3[candidates[index]])),
+        )
+        for rank, index in enumerate(chosen)
+    ]
+
+
+def token_picture(
+    model: QueryGaussianModel, gaussians: Gaussians, tokens: Sequence[Token], cameras: Cameras
+) -> Picture:
+    """The scene in pale grey, the Gaussians of `tokens` in their colours, on top of everything.
+
+    cameras (1, 1). Lines join each Gaussian in front of the camera to its token's centroid.
+    """
+    scene = rgb_picture(model.render(gaussians, cameras).rgb[0, 0])
+    painted = model.render(
+        _painted(gaussians, tokens, model.queries.count), cameras, torch.zeros(3)
+    )
+    alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
+    color = painted.rgb[0, 0].permute(1, 2, 0).cpu().numpy() * 255
+    picture = washed(scene) * (1 - alpha) + color
+    picture = picture.clip(0, 255).round().astype(np.uint8)
+    return _with_stars(
+        picture, _token_means(gaussians, tokens, model.queries.count), tokens, cameras
+    )
+
+
+def _token_means(gaussians: Gaussians, tokens: Sequence[Token], queries: int) -> Tensor:
+    means = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries)
+    return means[torch.tensor([token.query for token in tokens], dtype=torch.long)]
+
+
+def _painted(gaussians: Gaussians, tokens: Sequence[Token], queries: int) -> Gaussians:
+    """Only the Gaussians of `tokens`, in their colours, opaque enough to be seen."""
+    per_query = gaussians.count // queries
+    starts = torch.tensor([token.query * per_query for token in tokens], dtype=torch.long)
+    index = (starts[:, None] + torch.arange(per_query)).flatten().to(gaussians.means.device)
+    shown = gaussians[:, index]
+    paint = torch.tensor([token.color for token in tokens]).view(-1, 3).to(shown.colors) / 255
+    colors = paint.repeat_interleave(per_query, 0)[None]
+    return replace(shown, colors=colors, opacities=shown.opacities.clamp_min(0.5))
+
+
+def _with_stars(
+    picture: Picture, means_TK3: Tensor, tokens: Sequence[Token], cameras: Cameras
+) -> Picture:
+    scale = OVERSAMPLING
+    large = Image.fromarray(picture).resize(
+        (picture.shape[1] * scale, picture.shape[0] * scale), Image.Resampling.BICUBIC
+    )
+    draw = ImageDraw.Draw(large, "RGBA")
+    for means, token in zip(means_TK3, tokens, strict=True):
+        front = to_camera(means[None], cameras)[0, 0, :, 2] > 1e-3
+        centre = means.mean(0, keepdim=True)
+        points = _pixels(torch.cat([centre, means[front]]), cameras).clamp(-1e4, 1e4) * scale
+        hub, *rays = [tuple(point) for point in points.tolist()]
+        for end in rays:
+            draw.line([hub, end], fill=(*token.color, 200), width=scale)
+        for x, y in rays:
+            radius = 1.6 * scale
+            box = (x - radius, y - radius, x + radius, y + radius)
+            draw.ellipse(box, fill=(*token.color, 255), outline=(*INK, 160))
+    return np.asarray(large.resize(picture.shape[1::-1], Image.Resampling.LANCZOS))
+
+
+def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
+    """Pixels (P, 2) of world points (P, 3) in the first of cameras (1, V), z floored at 1 mm."""
+    in_camera = to_camera(points[None], cameras)[0, 0]
+    in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
+    return to_pixels(in_camera, cameras.intrinsics[0, 0]).cpu()
+
+
+def _spread(means_K3: Tensor) -> Tensor:
+    return (means_K3 - means_K3.mean(0)).norm(dim=-1).mean()
+
+
+def _spread_out(points: Tensor, count: int) -> list[int]:
+    """Indices of `count` points, starting with the first, each farthest from those before."""
+    chosen = [0]
+    distance = (points - points[0]).norm(dim=-1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=-1))
+    return chosen

@@ -1,0 +1,164 @@
+"""What is measured: inputs of a size, and operations ready to be called again and again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from qgs.composer import Recipe
+from qgs.contracts import SceneSourceConfig
+from qgs.engine.objective import Objective
+from qgs.engine.optimizer import make_optimizer
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Views
+
+Precision: TypeAlias = Literal["float32", "bf16"]
+
+
+@dataclass(frozen=True)
+class Workload:
+    """views, targets: photos read and photos rendered per scene. size: (H, W) of both, in pixels.
+
+    batch: scenes at once. precision: float32, or bf16 for autocast.
+    """
+
+    views: int
+    targets: int
+    size: tuple[int, int]
+    batch: int = 1
+    device: str = "cpu"
+    precision: Precision = "float32"
+
+    def autocast(self) -> torch.autocast:
+        """The context in which the model runs."""
+        enabled = self.precision == "bf16"
+        return torch.autocast(self.device, torch.bfloat16, enabled=enabled)
+
+    def inputs(self) -> Views:
+        """Random photos (batch, views), the same each time."""
+        return posed_photos(self.batch, self.views, self.size, seed=0).to(self.device)
+
+    def supervision(self) -> Views:
+        """Random photos (batch, targets), the same each time."""
+        return posed_photos(self.batch, self.targets, self.size, seed=1).to(self.device)
+
+
+def workload_of(
+    recipe: Recipe,
+    *,
+    views: int | None = None,
+    size: tuple[int, int] | None = None,
+    batch: int = 1,
+    device: str = "cpu",
+    precision: Precision = "float32",
+) -> Workload:
+    """The workload of `recipe`: its `views` and `data.image_size`, unless given here.
+
+    Raises ValueError when nothing says how large the images are.
+    """
+    data = recipe.parts.get(("data",))
+    if size is None and data is not None and isinstance(data.config, SceneSourceConfig):
+        size = data.config.image_size
+    if size is None:
+        raise ValueError(
+            "the recipe has no data.image_size, so the size of the photos is not known; "
+            "give one with --size HxW, such as --size 256x256"
+        )
+    return Workload(
+        views or recipe.views.inputs, recipe.views.targets, size, batch, device, precision
+    )
+
+
+def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
+    """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point.
+
+    The first camera is the identity, as pose normalisation leaves it; the field of view is some 53
+    degrees across the longer side.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.rand(batch, count, 3, *size, generator=generator)
+    c2w = torch.stack([_on_arc(math.radians(10 * index)) for index in range(count)])
+    focal = float(max(size))
+    height, width = size
+    intrinsics = torch.tensor([focal, focal, width / 2, height / 2])
+    cameras = Cameras(
+        c2w.expand(batch, -1, -1, -1).contiguous(), intrinsics.expand(batch, count, 4), size
+    )
+    return Views(images, cameras)
+
+
+def _on_arc(angle: float) -> Tensor:
+    """Camera-to-world matrix (4, 4), `angle` radians along the arc in the x-z plane."""
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return torch.tensor(
+        [
+            [cosine, 0.0, sine, -sine],
+            [0.0, 1.0, 0.0, 0.0],
+            [-sine, 0.0, cosine, 1.0 - cosine],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+Task: TypeAlias = Callable[[], object]
+Operation: TypeAlias = Literal["forward", "render", "step"]
+
+
+def make_task(
+    operation: Operation, recipe: Recipe, model: QueryGaussianModel, workload: Workload
+) -> Task:
+    """`operation` as a call without arguments that leaves nothing behind but changed weights.
+
+    forward: photos to the Gaussians of the last layer, no gradients. render: those Gaussians from
+    the cameras of the targets, no gradients. step: forward, every supervised layer rendered,
+    losses, backward, clipped gradients, AdamW.
+    """
+    if operation == "step":
+        return _step(recipe, model.train(), workload)
+    model.eval()
+    return _forward(model, workload) if operation == "forward" else _render(model, workload)
+
+
+def _forward(model: QueryGaussianModel, workload: Workload) -> Task:
+    views = workload.inputs()
+
+    @torch.inference_mode()
+    def forward() -> None:
+        with workload.autocast():
+            model(views)
+
+    return forward
+
+
+def _render(model: QueryGaussianModel, workload: Workload) -> Task:
+    cameras = workload.supervision().cameras
+    with torch.inference_mode(), workload.autocast():
+        gaussians = model(workload.inputs()).gaussians
+
+    @torch.inference_mode()
+    def render() -> None:
+        model.render(gaussians, cameras)
+
+    return render
+
+
+def _step(recipe: Recipe, model: QueryGaussianModel, workload: Workload) -> Task:
+    losses, render_views = recipe.build_losses(), recipe.training.render_views
+    objective = Objective(model, losses, render_views).to(workload.device)
+    optimizer = make_optimizer(objective, recipe.training)
+    inputs, targets = workload.inputs(), workload.supervision()
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        with workload.autocast():
+            outcome = objective(inputs, targets)
+        outcome.total.backward()
+        nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
+        optimizer.step()
+
+    return step

@@ -1,0 +1,189 @@
+"""Devices and processes of a run, and asking it to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib.util import find_spec
+from types import FrameType
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import InitProcessGroupKwargs
+from torch import Tensor, nn
+from torch.distributed.fsdp import FSDPModule, fully_shard
+from torch.distributed.tensor import DTensor, distribute_tensor
+
+from qgs.model import QueryGaussianModel
+
+PATIENCE = timedelta(hours=24)
+"""How long processes wait for each other: while one evaluates or saves, the others do.
+
+torch's own 10 minutes with NCCL would end such runs. A process that died is none of this: the
+launcher notices it and ends the others.
+"""
+
+
+def make_accelerator(device: str) -> Accelerator:
+    """The processes that `accelerate launch` or `torchrun` started, or this one alone.
+
+    device: "cpu" or "cuda". Autocast is the trainer's own, so no mixed precision is asked for.
+    """
+    patience = InitProcessGroupKwargs(timeout=PATIENCE)
+    return Accelerator(cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[patience])
+
+
+def wants_shards(accelerator: Accelerator) -> bool:
+    """Whether `accelerate launch --use_fsdp` started several processes."""
+    asked = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() in ("1", "true")
+    return asked and accelerator.num_processes > 1
+
+
+def shard(model: QueryGaussianModel) -> None:
+    """Lay the parameters of `model` in shards over all processes (FSDP2), in place.
+
+    Each decoder layer gathers its weights when it runs; the rest is gathered for the whole pass.
+    Parameters without a dimension to cut stay whole on every process, see `average_gradients`.
+    """
+    scalars = {parameter for parameter in model.parameters() if parameter.ndim == 0}
+    for layer in model.decoder:
+        fully_shard(layer, ignored_params=scalars)
+    fully_shard(model, ignored_params=scalars)
+
+
+def sharded(module: nn.Module) -> list[FSDPModule]:
+    """The modules inside `module` whose parameters `shard` laid in shards."""
+    return [inner for inner in module.modules() if isinstance(inner, FSDPModule)]
+
+
+@contextmanager
+def unsynchronised(accelerator: Accelerator, module: nn.Module) -> Iterator[None]:
+    """Leave gradients unshared between processes for the `with` block; a later pass shares them."""
+    shards = sharded(module)
+    for inner in shards:
+        inner.set_requires_gradient_sync(False, recurse=False)
+    try:
+        with accelerator.no_sync(module):
+            yield
+    finally:
+        for inner in shards:
+            inner.set_requires_gradient_sync(True, recurse=False)
+
+
+def average_gradients(accelerator: Accelerator, module: nn.Module) -> None:
+    """Average the gradients of parameters that are whole beside others in shards."""
+    if not sharded(module):
+        return
+    for parameter in module.parameters():
+        if parameter.grad is not None and not isinstance(parameter, DTensor):
+            parameter.grad.copy_(mean(accelerator, parameter.grad))
+
+
+def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
+    """Mean of `value` over processes."""
+    reduced = accelerator.reduce(value, "mean")
+    assert isinstance(reduced, Tensor)
+    return reduced
+
+
+def whole(tensor: Tensor) -> Tensor:
+    """`tensor` without gradient; where processes hold shards of it, gathered, in host memory.
+
+    All processes must call this.
+    """
+    tensor = tensor.detach()
+    return tensor.full_tensor().cpu() if isinstance(tensor, DTensor) else tensor
+
+
+def placed_like(tensor: Tensor, other: Tensor) -> Tensor:
+    """The whole `tensor` on the device of `other`, as shards where `other` lies in shards."""
+    tensor = tensor.to(other.device)
+    if isinstance(other, DTensor) and tensor.shape == other.shape:
+        mesh, placements = other.device_mesh, other.placements
+        return distribute_tensor(tensor, mesh, placements, src_data_rank=None)
+    return tensor
+
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
+    """ "cpu" or "cuda" for one of DEVICES.
+
+    "auto" takes CUDA when there is such a device and gsplat, the renderer for it, is installed;
+    where only gsplat is missing, `say` is told. Raises ValueError for another name, or for "cuda"
+    without such a device.
+    """
+    if wanted not in DEVICES:
+        raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        raise ValueError(
+            "the device 'cuda' was asked for, but torch finds none: install a torch with CUDA and "
+            "its driver, or choose 'cpu'"
+        )
+    if wanted != "auto":
+        return wanted
+    if available and find_spec("gsplat") is None:
+        say(
+            "Computing on the CPU although a CUDA device is there: its renderer, gsplat, is not "
+            'installed (`pip install "query-gaussians[gsplat]"`, or --device cuda for recipes with '
+            "another one)"
+        )
+        return "cpu"
+    return "cuda" if available else "cpu"
+
+
+PAUSE = 1.0
+"""Seconds after which a second Ctrl-C is a person's: launchers and terminals repeat theirs."""
+
+
+@dataclass
+class StopRequest:
+    """Whether someone asked training to stop, and by which signal."""
+
+    signal: signal.Signals | None = None
+
+    def __bool__(self) -> bool:
+        return self.signal is not None
+
+
+@contextmanager
+def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
+    """Turn the first SIGINT or SIGTERM inside the block into a request, and say so unless `quiet`.
+
+    Launchers (torchrun, Slurm) send their signals more than once, so that later ones are ignored;
+    only a second SIGINT, PAUSE seconds or more after the first, raises KeyboardInterrupt.
+    Outside the main thread, where Python delivers no signals, requests never come.
+    """
+    request = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+    patience_ends = float("inf")
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        nonlocal patience_ends
+        if number == signal.SIGINT:
+            if time.monotonic() >= patience_ends:
+                raise KeyboardInterrupt
+            patience_ends = min(patience_ends, time.monotonic() + PAUSE)
+        if request:
+            return
+        request.signal = signal.Signals(number)
+        if not quiet:  # not by print, which must not be entered twice
+            told = f"\n{request.signal.name}: finishing the step, saving; Ctrl-C again to give up\n"
+            os.write(2, told.encode())
+
+    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,143 @@
+"""What is told while a model trains: on the terminal, and to experiment trackers."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from datetime import timedelta
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from qgs.composer import Recipe
+from qgs.composer.recipe import flat
+from qgs.contracts.component import MissingExtraError
+from qgs.io.files import write_text
+
+_PLAIN = (bool, int, float, str)
+
+
+class Trackers:
+    """The trackers of a recipe, opened when the run's folder exists; all on the main process.
+
+    TensorBoard writes into RUN/tensorboard, wandb into RUN/wandb; its run goes on when training is
+    resumed. Raises MissingExtraError for a tracker whose package is not installed.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        for name in names:
+            if find_spec(name) is None:
+                raise MissingExtraError(
+                    f"training.trackers names {name}, which is not installed: run "
+                    f"`pip install qgs[{name}]`, or take it out of training.trackers"
+                )
+        self._names = names
+        self._open: list[GeneralTracker] = []
+
+    def open(self, run: Path, recipe: Recipe, step: int = 0) -> None:
+        """Track into the folder `run` from step `step` + 1 on; tell the options of `recipe`."""
+        self._open = [_OPENERS[name](run, step) for name in self._names]
+        values = {k: v if isinstance(v, _PLAIN) else str(v) for k, v in flat(recipe.tree).items()}
+        for tracker in self._open:
+            tracker.store_init_configuration(values)
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Numbers of a step, by name."""
+        for tracker in self._open:
+            tracker.log(dict(values), step=step)
+
+    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
+        """A uint8 (H, W, 3) picture."""
+        for tracker in self._open:
+            if isinstance(tracker, TensorBoardTracker):
+                tracker.log_images({name: picture[None]}, step=step, dataformats="NHWC")
+            elif isinstance(tracker, WandBTracker):
+                tracker.log_images({name: [picture]}, step=step)
+
+    def close(self) -> None:
+        """End tracking; what was told is on the disk then."""
+        for tracker in self._open:
+            tracker.finish()
+        self._open = []
+
+
+def _tensorboard(run: Path, step: int) -> GeneralTracker:
+    tracker = TensorBoardTracker("tensorboard", logging_dir=run, purge_step=step + 1)
+    tracker.start()
+    return tracker
+
+
+def _wandb(run: Path, step: int) -> GeneralTracker:
+    place = run / "wandb" / "id"
+    if not place.is_file():
+        write_text(place, uuid.uuid4().hex)
+    tracker = WandBTracker(
+        "qgs", name=run.resolve().name, dir=str(run), id=place.read_text(), resume="allow"
+    )
+    tracker.start()
+    return tracker
+
+
+_OPENERS: Mapping[str, Callable[[Path, int], Any]] = {"tensorboard": _tensorboard, "wandb": _wandb}
+
+
+_REFRESH_SECONDS = 0.25
+_LOG_SECONDS = 15.0
+
+
+class TrainingProgress:
+    """A bar with loss, PSNR, images/s and time left; a line now and then where no terminal is."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bar = Progress(
+            TextColumn("step {task.fields[step]}"),
+            BarColumn(),
+            TextColumn("{task.fields[line]}"),
+            console=console,
+            auto_refresh=False,
+            transient=True,
+        )
+        self._task = self._bar.add_task("training", total=1.0, step=0, line="")
+        self._next = 0.0
+        self._start: tuple[int, float, float] | None = None
+        self._interval = _REFRESH_SECONDS if console.is_terminal else _LOG_SECONDS
+
+    def __enter__(self) -> TrainingProgress:
+        if self._console.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def update(
+        self, step: int, loss: float, psnr: float, images: int, seconds: float, used: float
+    ) -> bool:
+        """Show a step, unless the last one was shown a moment ago; returns whether it did.
+
+        images, seconds: of the whole run so far. used: fraction of the budget. Speed and time left
+        are those of this session, which began with the first step that this is told.
+        """
+        if self._start is None:
+            self._start = images, seconds, used
+        now = time.monotonic()
+        if now < self._next:
+            return False
+        self._next = now + self._interval
+        done, spent = images - self._start[0], seconds - self._start[1]
+        gained = used - self._start[2]
+        rate = done / spent if spent else 0.0
+        left = str(timedelta(seconds=round(spent * (1 - used) / gained))) if gained else "?"
+        line = f"loss {loss:.4f}  PSNR {psnr:5.2f}  {rate:.0f} images/s  {left} left"
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=used, step=step, line=line, refresh=True)
+        else:
+            self._console.print(f"step {step}  {line}", highlight=False)
+        return True

@@ -1,0 +1,168 @@
+"""Files appear whole or not at all, on disk and behind URLs; files of JSON records."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+
+from upath import UPath
+
+from qgs.data.paths import is_local
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well.
+
+    Makes missing parent folders; the file gets the usual permissions whatever wrote it. When the
+    block raises, `path` stays as it was. The new file is on the disk before it takes the place of
+    the old one, and its name when the block has ended.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        yield temporary
+        temporary.chmod(mode)
+        _synchronise(temporary)
+        os.replace(temporary, target)
+        _synchronise(target.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether `path` is a file that a process killed inside `replacing` left, or is now writing.
+
+    safetensors, too, writes to a name of its own (.tmpXXXXXX) first.
+    """
+    name = r"\..+\.\d+\.tmp|\.tmp[A-Za-z0-9]{6}"
+    return bool(re.fullmatch(name, path.name)) and path.is_file()
+
+
+def _synchronise(path: Path) -> None:
+    """Wait until `path`, a file or a folder, is on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+@contextmanager
+def replacing_entries(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary folder whose entries move into `folder` when the block ends well.
+
+    An entry takes the place of all that was under its name, folders included; what else `folder`
+    holds stays. When the block raises, `folder` stays as it was.
+    """
+    target = Path(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
+        fresh, old = Path(temporary, "fresh"), Path(temporary, "old")
+        fresh.mkdir()
+        old.mkdir()
+        yield fresh
+        target.mkdir(exist_ok=True)
+        for entry in sorted(fresh.iterdir()):
+            place = target / entry.name
+            if place.exists():
+                place.rename(old / entry.name)
+            entry.rename(place)
+
+
+@contextmanager
+def new_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary folder that becomes `folder` when the block ends well.
+
+    Makes missing parent folders. Raises FileExistsError if there is anything at `folder`, also
+    when it appeared while the block ran. When the block raises, there is no `folder`.
+    """
+    target = Path(folder)
+    _refuse_existing(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
+        fresh = Path(temporary, target.name)
+        fresh.mkdir()
+        yield fresh
+        _refuse_existing(target)
+        fresh.rename(target)
+
+
+def _refuse_existing(target: Path) -> None:
+    if target.exists() or target.is_symlink():
+        raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write `text` as UTF-8 to `path`, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+_log = logging.getLogger(__name__)
+
+
+def read_records(path: Path) -> list[dict[str, Any]]:
+    """The records of `path` that tell their "step"; none when the file does not exist.
+
+    A line that is no such record is left out with a warning; a last line without an end is what a
+    killed process leaves, and is left out too.
+    """
+    if not path.is_file():
+        return []
+    *lines, _ = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    records = []
+    for number, line in enumerate(lines, start=1):
+        record = _parsed(line)
+        if record is None:
+            _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
+        else:
+            records.append(record)
+    return records
+
+
+def _parsed(line: str) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("step"), int) else None
+
+
+@contextmanager
+def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
+    """A file to write, which takes the place of `path` when the block ends well.
+
+    Makes missing parent folders. Object stores show an object when it is complete, so moving it is
+    as atomic as their copying. When the block raises, `path` stays as it was.
+    """
+    if is_local(path):
+        with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:
+            yield file
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+        path.fs.mv(temporary.path, path.path)
+    except BaseException:
+        if temporary.exists():
+            temporary.unlink()
+        raise
+
+
+def write_bytes(path: UPath, data: bytes) -> None:
+    """Write `data` to `path`, whole or not at all."""
+    with opened_replacing(path) as file:
+        file.write(data)

@@ -1,0 +1,62 @@
+"""What the options of a TokenGS run say in a recipe (TokenGS release)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from published.options import ReleasedOptions
+
+UNSUPPORTED_BUT = {
+    "num_dynamic_gs_tokens": 0,
+    "time_embedding": False,
+    "use_multiscale_encoder": False,
+    "use_latent_bottleneck": False,
+}
+"""Parts of the release that stand outside of its published models."""
+
+
+def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The recipe of the model that TokenGS builds from `options`.
+
+    Raises ReleasedOptionError for options that are missing or not understood.
+    """
+    released = ReleasedOptions(options)
+    model = backbone(released)
+    model["head"] |= {
+        "gaussians_per_query": released.count("dec_patch_size") ** 2,
+        "opacity_bias": -released.number("opacity_bias"),
+        "scale_input_limit": None,
+        "quat_eps": 1e-12,
+    }
+    model["queries"] = {"type": "qgs/latent", **query_options(released)}
+    model["centers"] = {
+        "type": "qgs/free",
+        "z_offset": released.number("gaussian_z_offset"),
+        "input_limit": None,
+        "output_limit": None,
+    }
+    model["supervision"] = {"layers": [released.count("dec_depth")]}
+    return {"recipe": 1, "model": model}
+
+
+def backbone(options: ReleasedOptions) -> dict[str, Any]:
+    """What TokenGS and its descendants share: sizes, encoder, decoder depth, scale cap."""
+    width = options.count("enc_embed_dim")
+    options.only({**UNSUPPORTED_BUT, "token_dim": width})
+    return {
+        "width": width,
+        "heads": options.count("enc_num_heads"),
+        "encoder": {
+            "patch_size": options.count("patch_size"),
+            "depth": options.count("enc_depth"),
+            "mlp_ratio": options.number("mlp_ratio"),
+        },
+        "decoder": {"depth": options.count("dec_depth")},
+        "head": {"scale_cap": options.number("gaussian_scale_cap")},
+    }
+
+
+def query_options(options: ReleasedOptions) -> dict[str, Any]:
+    """Number and initial spread of the queries."""
+    return {"count": options.count("num_gs_tokens"), "std": options.number("gs_token_std")}
