@@ -10,16 +10,16 @@ Every container is frozen. A component returns a new one and never writes into t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor
 
 
-class _TensorContainer:
-    """Moves every tensor of a frozen dataclass, one level of nesting included."""
+class TensorContainer:
+    """A frozen dataclass of tensors, containers and mappings of them."""
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """Return a copy with every tensor moved as by `Tensor.to`.
@@ -28,16 +28,47 @@ class _TensorContainer:
         longer the float32 that components count on.
         """
 
-        def move(value: Any) -> Any:
-            if isinstance(value, Tensor | _TensorContainer):
-                return value.to(*args, **kwargs)
-            if isinstance(value, Mapping):
-                return {key: move(item) for key, item in value.items()}
-            return value
+        copy = {name: map_tensors(lambda x: x.to(*args, **kwargs), v) for name, v in _items(self)}
+        return replace(cast(Any, self), **copy)
 
-        container: Any = self
-        moved = {f.name: move(getattr(self, f.name)) for f in fields(container) if f.init}
-        return replace(container, **moved)
+
+def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
+    """`value` with `function(tensor)` in place of every tensor.
+
+    Goes into containers, mappings, lists and tuples; whatever holds no changed tensor is itself.
+    """
+    if isinstance(value, Tensor):
+        return function(value)
+    if not isinstance(value, TensorContainer | Mapping | list | tuple):
+        return value
+    items = list(_items(value))
+    mapped = [(name, map_tensors(function, item)) for name, item in items]
+    if all(new is old for (_, new), (_, old) in zip(mapped, items, strict=True)):
+        return value
+    if isinstance(value, TensorContainer):
+        return replace(cast(Any, value), **dict(mapped))
+    if isinstance(value, Mapping):
+        return dict(mapped)
+    return getattr(value, "_make", type(value))([item for _, item in mapped])
+
+
+def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Every tensor in `value` with its dotted name, such as `gaussians.means`.
+
+    Goes where `map_tensors` goes. name: of `value` itself.
+    """
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, TensorContainer | Mapping | list | tuple):
+        for key, item in _items(value):
+            yield from named_tensors(item, f"{name}.{key}" if name else str(key))
+
+
+def _items(value: Any) -> Iterator[tuple[Any, Any]]:
+    if isinstance(value, TensorContainer):
+        yield from ((f.name, getattr(value, f.name)) for f in fields(cast(Any, value)) if f.init)
+    else:
+        yield from value.items() if isinstance(value, Mapping) else enumerate(value)
 
 
 def _expect(name: str, tensor: Tensor, trailing: tuple[int | None, ...]) -> None:
@@ -57,7 +88,7 @@ def _expect_shape(name: str, tensor: Tensor, wanted: tuple[int, ...]) -> None:
 
 
 @dataclass(frozen=True)
-class Cameras(_TensorContainer):
+class Cameras(TensorContainer):
     """Pinhole cameras of one image size.
 
     c2w: (..., 4, 4) camera-to-world, OpenCV axes, rigid.
@@ -95,7 +126,7 @@ class Cameras(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class Views(_TensorContainer):
+class Views(TensorContainer):
     """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V).
 
     masks: (B, V, 1, H, W) in [0, 1], 1 where the photo shows what is to be modelled; None for
@@ -134,7 +165,7 @@ class Views(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class ImageMemory(_TensorContainer):
+class ImageMemory(TensorContainer):
     """What the encoder leaves for the decoder.
 
     keys, values: (B, h, M, D/h), made once for all decoder layers.
@@ -185,7 +216,7 @@ class ImageMemory(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class QueryState(_TensorContainer):
+class QueryState(TensorContainer):
     """The state of every query: features (B, N, D) and named fields (B, N, ...)."""
 
     features: Tensor
@@ -220,7 +251,7 @@ class QueryState(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class GaussianAttributes(_TensorContainer):
+class GaussianAttributes(TensorContainer):
     """What a head reads off each query; everything of a Gaussian but its mean.
 
     offsets: (B, N, K, 3) raw, before any activation: a `centers` component turns them into means.
@@ -242,7 +273,7 @@ class GaussianAttributes(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class Gaussians(_TensorContainer):
+class Gaussians(TensorContainer):
     """G Gaussians per scene, ordered query by query.
 
     means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
@@ -271,7 +302,7 @@ class Gaussians(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class Rendering(_TensorContainer):
+class Rendering(TensorContainer):
     """What cameras see: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
 
     `rgb` is over the background, `alpha` in [0, 1], `depth` the expected camera-frame z of what
@@ -294,7 +325,7 @@ class Rendering(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class SpatialSupport(_TensorContainer):
+class SpatialSupport(TensorContainer):
     """Where queries look, for pictures: an ellipsoid per query.
 
     centers: (B, N, 3) world. axes: (B, N, 3, 3), its semi-axes as columns, world units.
@@ -309,7 +340,7 @@ class SpatialSupport(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class LayerPrediction(_TensorContainer):
+class LayerPrediction(TensorContainer):
     """What one decoder layer predicts: its Gaussians and the state they were decoded from."""
 
     gaussians: Gaussians
@@ -317,7 +348,7 @@ class LayerPrediction(_TensorContainer):
 
 
 @dataclass(frozen=True)
-class Prediction(_TensorContainer):
+class Prediction(TensorContainer):
     """A forward pass: the last layer's Gaussians and state, and those of every decoded layer.
 
     layers: layer number (1 is the first) to LayerPrediction, ascending.

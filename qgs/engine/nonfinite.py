@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from qgs.engine.distributed import whole
 from qgs.engine.objective import Gradients, Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
 from qgs.io.files import replacing_entries
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Views, named_tensors
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Watch:
         """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
         if self.first:
             return
-        for path, tensor in _tensors(value):
+        for path, tensor in named_tensors(value, name):
             described = described_nonfinite(tensor)
             if described:
-                self.first = Finding(f"{name}{path}", described, max(self._batch, 0))
+                self.first = Finding(path, described, max(self._batch, 0))
                 return
 
     @contextmanager
@@ -95,9 +95,9 @@ class Watch:
         call = f" (call {self._calls[name]})" if self._calls[name] > 1 else ""
         what = f"output{call} of {name}"
         self.see(what, output)
-        for path, tensor in _tensors(output):
+        for path, tensor in named_tensors(output, f"gradient of the {what}"):
             if tensor.requires_grad:
-                tensor.register_hook(partial(self.see, f"gradient of the {what}{path}"))
+                tensor.register_hook(partial(self.see, path))
 
 
 def described_nonfinite(tensor: Tensor) -> str:
@@ -108,22 +108,6 @@ def described_nonfinite(tensor: Tensor) -> str:
     nan, infinite = int(torch.isnan(tensor).sum()), int(torch.isinf(tensor).sum())
     counts = [f"{n} {word}" for n, word in ((nan, "NaN"), (infinite, "infinite")) if n]
     return f"{' and '.join(counts)} of {tensor.numel()} values"
-
-
-def _tensors(value: Any, path: str = "") -> Iterator[tuple[str, Tensor]]:
-    """The tensors of a nest, each with its path such as `.gaussians.means`."""
-    if isinstance(value, Tensor):
-        yield path, value
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _tensors(item, f"{path}.{key}")
-    elif isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            yield from _tensors(item, f"{path}.{index}")
-    elif is_dataclass(value):
-        for field in fields(value):
-            if field.init:
-                yield from _tensors(getattr(value, field.name), f"{path}.{field.name}")
 
 
 PATIENCE = 10

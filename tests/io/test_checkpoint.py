@@ -90,7 +90,10 @@ def test_recipe_and_versions_travel_along(model: QueryGaussianModel, saved: Path
 def test_the_distributions_of_plugins_travel_along(tmp_path: Path) -> None:
     save(qgs.compose(RECIPES / "locus.yaml", SMALL), tmp_path / "a.safetensors")
     metadata = metadata_of(tmp_path / "a.safetensors")
-    assert json.loads(metadata["qgs.distributions"]) == {"qgs": "query-gaussians", "locus": "query-gaussians-locus"}
+    assert json.loads(metadata["qgs.distributions"]) == {
+        "qgs": "query-gaussians",
+        "locus": "query-gaussians-locus",
+    }
 
 
 @pytest.fixture
@@ -138,7 +141,9 @@ def test_another_release_of_a_plugin_is_told(old_locus: Path) -> None:
     recipe = json.loads(metadata_of(old_locus)["qgs.recipe"])
     recipe["model"]["decoder"]["refinement"]["type"] = "locus/gone_since"
     rewrite(old_locus, **{"qgs.recipe": json.dumps(recipe)})
-    with pytest.raises(CheckpointError, match=r"query-gaussians-locus 0\.0\.7, .*; install those releases:"):
+    with pytest.raises(
+        CheckpointError, match=r"query-gaussians-locus 0\.0\.7, .*; install those releases:"
+    ):
         qgs.load(old_locus)
 
 
