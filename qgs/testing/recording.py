@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from qgs.geometry import precision
+from qgs import types
 from qgs.testing.trees import mapped
 from qgs.types import LayerPrediction, QueryState
 
@@ -35,8 +35,7 @@ PASSING_ON = {
     for function in (
         QueryState.__post_init__,
         QueryState.replace,
-        precision._raised,
-        precision._device_of,
+        types._items,
     )
 }
 """Code that goes through all fields for the component, which sees none of them."""
