@@ -9,12 +9,7 @@ from fnmatch import fnmatchcase
 from qgs.composer.errors import Problems, did_you_mean, nearest
 from qgs.composer.files import merge
 from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, is_null, kind_of
-from qgs.composer.slots import (
-    LAYER_SLOTS,
-    MODEL_SLOTS,
-    SLOTS,
-    Slot,
-)
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot
 
 
 @dataclass(frozen=True)
@@ -40,14 +35,14 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
     template = [_place(decoder, ("model", "decoder", name), SLOTS[name]) for name in LAYER_SLOTS]
     places += template
     places += _layers(decoder.child_map("layers"), template, depth, problems)
-    losses = tree.child_map("losses")
-    places += [
-        _place(losses, ("losses", name), SLOTS["losses"])
-        for name, node in losses.items.items()
-        if not is_null(node)
-    ]
-    if not is_null(tree.items.get("data")):
-        places.append(_place(tree, ("data",), SLOTS["data"]))
+    for name, section in SECTIONS.items():
+        slot = SLOTS[name]
+        if section.named:
+            below = tree.child_map(name)
+            written = [key for key, node in below.items.items() if not is_null(node)]
+            places += [_place(below, (name, key), slot) for key in written]
+        elif slot.default or not is_null(tree.items.get(name)):
+            places.append(_place(tree, (name,), slot))
     return {place.path: place for place in places}
 
 

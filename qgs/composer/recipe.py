@@ -12,13 +12,13 @@ import torch
 from qgs.composer.build import build_model, build_plain
 from qgs.composer.decode import Chosen, decode_places
 from qgs.composer.errors import Problems
-from qgs.composer.files import apply_overrides, read_recipe
+from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import check_declarations, check_flow, decoded_layers, execution_order
 from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, from_plain, locate
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.registry import PluginError, Registry
 from qgs.composer.sections import Settings, check_tree, decode_settings, load_plugins
-from qgs.composer.slots import DEFAULT_LOSSES, LAYER_SLOTS, MODEL_SLOTS
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import dump
 from qgs.contracts import (
     ComponentConfig,
@@ -63,9 +63,14 @@ class Resolution:
         self._put_decoder(settings.decoder.depth)
         for name in MODEL_SLOTS[2:]:
             self._put_component(("model", name))
-        self._put_losses()
-        if ("data",) in parts:
-            self._put_component(("data",))
+        for name, section in SECTIONS.items():
+            if section.named:
+                self.tree[name] = {}
+            for path in [path for path in parts if path[0] == name]:
+                self._put_component(path)
+            dropped = [key for key in section.defaults if (name, key) not in parts]
+            for key in dropped if section.defaults_stay else ():
+                self._put((name, key), None, self._written((name, key)))
         self._put_settings(("views",), settings.views)
         self._put_settings(("training",), settings.training)
         self._put_settings(("evaluation",), settings.evaluation)
@@ -108,12 +113,6 @@ class Resolution:
             overrides += [(i, name) for i, layer in enumerate(layers) if not _same(layer, template)]
         for index, name in sorted(overrides, key=lambda pair: pair[0]):
             self._put_component(("model", "decoder", "layers", str(index), name))
-
-    def _put_losses(self) -> None:
-        self.tree["losses"] = {}
-        for path in self.parts:
-            if path[0] == "losses":
-                self._put_component(path)
 
     def _put(self, path: KeyPath, value: Any, origin: str) -> None:
         node = self.tree
@@ -176,17 +175,17 @@ class Recipe:
 
         `losses: {}` gives none: fine for everything but training, which refuses it.
         """
-        return {
-            path[1]: build_plain(chosen)
-            for path, chosen in self.parts.items()
-            if path[0] == "losses"
-        }
+        return self._build_named("losses")
 
     def build_data(self) -> SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""
         if ("data",) not in self.parts:
             raise ValueError("this recipe has no data; add `data: {type: PLUGIN/NAME}`")
         return build_plain(self.parts["data",])
+
+    def _build_named(self, section: str) -> dict[str, Any]:
+        """The components of a section such as `losses`, by name."""
+        return {p[1]: build_plain(chosen) for p, chosen in self.parts.items() if p[0] == section}
 
 
 def resolve(
@@ -206,7 +205,7 @@ def resolve(
     tree = apply_overrides(read_recipe(recipe, problems), overrides, problems)
     tree = check_tree(tree, problems)
     problems.raise_if_stopped()
-    tree = _with_default_losses(tree)
+    tree = _with_defaults(tree)
     settings = decode_settings(tree, problems)
     registry = load_plugins(tree, problems, plugins)
     places = expand(tree, settings.decoder.depth, problems)
@@ -217,12 +216,17 @@ def resolve(
     return _finish(tree, settings, registry, parts)
 
 
-def _with_default_losses(tree: MapNode) -> MapNode:
-    if "losses" in tree.items:
-        return tree
+def _with_defaults(tree: MapNode) -> MapNode:
+    """`tree` with the default components of sections such as `losses`."""
     origin = Origin("default")
-    losses = {name: {"type": kind} for name, kind in DEFAULT_LOSSES.items()}
-    return tree.with_item("losses", from_plain(losses, origin), origin)
+    for name, section in SECTIONS.items():
+        if section.named and (name not in tree.items or section.defaults_stay):
+            defaults = {key: {"type": kind} for key, kind in section.defaults.items()}
+            node = from_plain(defaults, origin)
+            if name in tree.items:
+                node = merge(node, tree.items[name], (name,))
+            tree = tree.with_item(name, node, tree.keys.get(name, origin))
+    return tree
 
 
 def _check_components(

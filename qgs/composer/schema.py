@@ -6,7 +6,7 @@ from typing import Any
 
 from qgs.composer.registry import Registry
 from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS, Slot
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
 _NAMES = {"type": "array", "items": {"type": "string"}}
@@ -35,8 +35,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
         "plugins": _NAMES,
         "swap": _mapping_of({"anyOf": [*map(_ref, SLOTS), {"type": "null"}]}),
         "model": model,
-        "losses": _mapping_of({"anyOf": [_ref("losses"), {"type": "null"}]}),
-        "data": {"anyOf": [_ref("data"), {"type": "null"}]},
+        **{name: _section(name) for name in SECTIONS},
         "views": _settings(ViewsConfig),
         "training": _settings(TrainingConfig),
         "evaluation": _settings(EvaluationConfig),
@@ -47,6 +46,11 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
         **recipe,
         "$defs": definitions,
     }
+
+
+def _section(name: str) -> dict[str, Any]:
+    component = {"anyOf": [_ref(name), {"type": "null"}]}
+    return _mapping_of(component) if SECTIONS[name].named else component
 
 
 def _slot(slot: Slot, registry: Registry) -> dict[str, Any]:

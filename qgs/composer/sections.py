@@ -12,7 +12,7 @@ from qgs.composer.decode import ConfigT, decode_config
 from qgs.composer.errors import Problems, did_you_mean
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, ScalarNode, is_null, kind_of
 from qgs.composer.registry import PluginError, Registry, builtin, load_plugin, not_installed
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.contracts import ComponentConfig, EvaluationConfig, Plugin, TrainingConfig, ViewsConfig
 
 
@@ -49,10 +49,8 @@ _SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
 }
 """Sections that hold settings beside other things."""
 
-TOP_SECTIONS = ("plugins", "swap", "model", "losses", "data", "views", "training", "evaluation")
-
 _CHILDREN: dict[KeyPath, tuple[str, ...]] = {
-    (): TOP_SECTIONS,
+    (): ("plugins", "swap", "model", *SECTIONS, "views", "training", "evaluation"),
     ("model",): (*MODEL_SLOTS, "decoder"),
     ("model", "decoder"): (*LAYER_SLOTS, "layers"),
 }
@@ -62,7 +60,7 @@ _MAPPINGS: tuple[KeyPath, ...] = (
     ("model",),
     ("model", "decoder"),
     ("model", "decoder", "layers"),
-    ("losses",),
+    *((name,) for name, section in SECTIONS.items() if section.named),
     ("swap",),
     ("views",),
     ("training",),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from qgs.composer.nodes import KeyPath, MapNode, Node, ScalarNode, is_null
@@ -57,8 +58,28 @@ SLOTS = {
 MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
 LAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward", "refinement")
 
+
+@dataclass(frozen=True)
+class Section:
+    """A top-level section of components, called like its slot.
+
+    named: whether it maps names to components; else it is one component, and there is always one
+        if its slot has a default type.
+    defaults: name to type of the components of a recipe that has no such section.
+    defaults_stay: whether they also stand beside those that are written; `NAME: null` drops one.
+    """
+
+    named: bool = False
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    defaults_stay: bool = False
+
+
 DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
-"""What a recipe without `losses` is trained with."""
+
+SECTIONS = {
+    "losses": Section(named=True, defaults=DEFAULT_LOSSES),
+    "data": Section(),
+}
 
 
 def slot_at(path: KeyPath) -> Slot | None:
@@ -70,10 +91,10 @@ def slot_at(path: KeyPath) -> Slot | None:
             return SLOTS[name]
         case ("model", "decoder", "layers", _, name) if name in LAYER_SLOTS:
             return SLOTS[name]
-        case ("losses", _):
-            return SLOTS["losses"]
-        case ("data",):
-            return SLOTS["data"]
+        case (name,) if name in SECTIONS and not SECTIONS[name].named:
+            return SLOTS[name]
+        case (name, _) if name in SECTIONS and SECTIONS[name].named:
+            return SLOTS[name]
     return None
 
 

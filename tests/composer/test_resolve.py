@@ -15,6 +15,7 @@ from qgs.composer.errors import Problems
 from qgs.composer.files import merge
 from qgs.composer.nodes import Origin, from_plain, to_plain
 from qgs.composer.recipe import annotated
+from qgs.composer.slots import DEFAULT_LOSSES, SECTIONS, Section
 from qgs.composer.yaml_text import dump, load_text
 
 RECIPES = sorted(
@@ -175,6 +176,16 @@ def test_null_leaves_the_default(write):
     assert tree["losses"] == {}
     dropped = resolve({"recipe": 1, "losses": {"a": {"type": "qgs/photometric"}}}, ["losses.a="])
     assert dropped.tree["losses"] == {}
+
+
+def test_defaults_that_stay_lie_under_what_is_written_and_null_drops_one(monkeypatch):
+    monkeypatch.setitem(SECTIONS, "losses", Section(True, DEFAULT_LOSSES, defaults_stay=True))
+    written = {"photometric": {"mse_weight": 2.0}, "visibility": None}
+    recipe = resolve(SMALL | {"losses": written}, ["losses.mine.type=qgs/opacity"])
+    assert list(recipe.build_losses()) == ["photometric", "mine"]
+    assert recipe.tree["losses"]["photometric"]["mse_weight"] == 2.0
+    assert recipe.tree["losses"]["visibility"] is None
+    assert resolve(recipe.tree).tree == recipe.tree
 
 
 def test_overrides_are_read_like_files_and_the_last_wins():
