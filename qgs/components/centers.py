@@ -38,15 +38,12 @@ class FreeCenters(Centers):
     name: ClassVar[str] = "free"
 
     class Config(ComponentConfig):
-        """z_offset: world units; 1 in TokenGS, 0 in LocusGS's free-centre ablation.
-
-        input_limit, output_limit: clamps of posact, None for none (LocusGS release: 100 and 1000;
-        TokenGS release: none).
-        """
-
         z_offset: float = 1.0
+        """Added to z, world units (1 in TokenGS, 0 in LocusGS's free-centre ablation)."""
         input_limit: float | None = Field(default=100.0, gt=0)
+        """Raw offsets are clamped to +- this; null for no clamp (LocusGS 100, TokenGS null)."""
         output_limit: float | None = Field(default=1000.0, gt=0)
+        """Offsets are clamped to +- this, world units; null for no clamp (LocusGS 1000)."""
 
     config: Config
 

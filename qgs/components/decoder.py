@@ -28,9 +28,8 @@ class ContentCrossAttention(CrossAttention):
     name: ClassVar[str] = "content"
 
     class Config(ComponentConfig):
-        """norm_eps: of every LayerNorm."""
-
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
 
     config: Config
 
@@ -58,9 +57,8 @@ class ContentSelfAttention(SelfAttention):
     name: ClassVar[str] = "content"
 
     class Config(ComponentConfig):
-        """norm_eps: of every LayerNorm."""
-
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
 
     config: Config
 
@@ -84,10 +82,10 @@ class MlpFeedForward(FeedForward):
     name: ClassVar[str] = "mlp"
 
     class Config(ComponentConfig):
-        """ratio: hidden width, rounded down, over D. norm_eps: of the LayerNorm."""
-
         ratio: float = Field(default=4.0, ge=1)
+        """Hidden width (rounded down) over the model's width."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by the LayerNorm."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

@@ -58,16 +58,16 @@ class MultiViewViT(Encoder):
     name: ClassVar[str] = "multiview_vit"
 
     class Config(ComponentConfig):
-        """patch_size: P in pixels. depth: blocks. layer_scale: its initial value.
-
-        mlp_ratio: hidden width of the MLPs over D. norm_eps: of every LayerNorm.
-        """
-
         patch_size: int = Field(default=8, ge=1)
+        """Side of a patch, pixels; must divide both sides of the image."""
         depth: int = Field(default=3, ge=0)
+        """Number of ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
+        """Hidden width of the MLPs (rounded down) over the model's width."""
         layer_scale: float = Field(default=0.01, gt=0)
+        """Initial value of every LayerScale factor of the encoder."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

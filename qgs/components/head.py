@@ -34,24 +34,26 @@ class GaussianHead(Head):
     name: ClassVar[str] = "gaussian_head"
 
     class Config(ComponentConfig):
-        """Defaults are the LocusGS release's; TokenGS: scale_input_limit null, quat_eps 1e-12.
-
-        gaussians_per_query: K. init_std, position_std: truncated normal of all weights, of those
-        that make positions (None: the same). norm, norm_eps: a LayerNorm before the linear layer
-        (in neither release; steadier when small) and its epsilon. scale_cap: largest scale c, world
-        units. scale_input_limit: clamp before the exponential, None for none. opacity_bias: added
-        to the opacity logit. quat_eps: floor of the quaternion's length before division.
-        """
+        """Defaults are the LocusGS release's."""
 
         gaussians_per_query: int = Field(default=64, ge=1)
+        """K, the Gaussians decoded from each query."""
         init_std: float = Field(default=0.002, gt=0)
+        """Standard deviation of the truncated normal that the weights start from."""
         position_std: float | None = Field(default=None, gt=0)
+        """The same for the weights that make positions; null for `init_std`."""
         norm: bool = False
+        """A LayerNorm before the linear layer (in neither release; steadier for small models)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by that LayerNorm."""
         scale_cap: float = Field(default=0.075, gt=0)
+        """Largest scale, world units; a raw scale of 0 gives 1/e of it."""
         scale_input_limit: float | None = Field(default=10.0, gt=0)
+        """Raw scales are clamped to +- this before the exponential; null for no clamp (TokenGS)."""
         opacity_bias: float = -2.0
+        """Added to the opacity logit."""
         quat_eps: float = Field(default=1e-4, gt=0)
+        """Least length that a raw quaternion is divided by (TokenGS: 1e-12)."""
 
     config: Config
 

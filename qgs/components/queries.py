@@ -18,10 +18,10 @@ class LatentQueries(Queries):
     name: ClassVar[str] = "latent"
 
     class Config(ComponentConfig):
-        """count: N. std: of the normal distribution they start from."""
-
         count: int = Field(default=4096, ge=1)
+        """N, the number of queries."""
         std: float = Field(default=0.01, ge=0)
+        """Standard deviation of the normal distribution that the features start from."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

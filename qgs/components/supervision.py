@@ -16,9 +16,8 @@ class LayerSupervision(Supervision):
     name: ClassVar[str] = "layers"
 
     class Config(ComponentConfig):
-        """layers: numbers of the supervised decoder layers, ascending; 1 is the first."""
-
         layers: tuple[int, ...] = Field(default=(12,), min_length=1)
+        """Numbers of the supervised decoder layers, ascending; 1 is the first."""
 
         @field_validator("layers")
         @classmethod

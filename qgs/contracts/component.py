@@ -26,7 +26,13 @@ class ComponentConfig(BaseModel):
     __component__: ClassVar[type[Component] | None] = None
     """The class whose options these are; None for settings that belong to none."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True,
+        strict=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -128,8 +134,12 @@ class Component(ABC):
         if not (isinstance(inherited, type) and issubclass(inherited, ComponentConfig)):
             return  # no sound component: whoever loads it says so
         if inherited.__qualname__ != f"{cls.__qualname__}.Config":
-            where = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.Config"}
-            cls.Config = type("Config", (inherited,), {**where, "__doc__": inherited.__doc__})
+            own: dict[str, Any] = {"__qualname__": f"{cls.__qualname__}.Config"}
+            own["__module__"] = cls.__module__
+            # It has no options of its own; looking for their docstrings would take 15 ms.
+            own["model_config"] = ConfigDict(use_attribute_docstrings=False)
+            cls.Config = type("Config", (inherited,), own)
+            cls.Config.model_config["use_attribute_docstrings"] = True  # for what inherits from it
         cls.Config.__component__ = cls
 
     @classmethod

@@ -16,21 +16,22 @@ Channel: TypeAlias = Annotated[float, Field(ge=0, le=1)]
 
 
 class RendererConfig(ComponentConfig):
-    """Splatting settings that every renderer obeys (defaults: both releases, gsplat 1.5.3).
-
-    near, far: camera-frame z outside which a Gaussian is dropped. dilation: pixel^2 added to the
-    diagonal of the projected covariance. alpha_min: contributions below it are skipped. alpha_cap:
-    upper bound of one contribution. transmittance_min: a pixel stops before its transmittance would
-    fall to this. background: RGB in [0, 1] behind everything.
-    """
+    """Splatting settings that every renderer obeys (defaults: both releases, gsplat 1.5.3)."""
 
     near: float = Field(default=0.025, gt=0)
+    """Gaussians nearer than this camera-frame z are dropped, world units."""
     far: float = Field(default=125.0, gt=0, validate_default=True)
+    """Gaussians beyond this camera-frame z are dropped, world units."""
     dilation: float = Field(default=0.3, ge=0)
+    """Added to the diagonal of the projected covariance, pixel^2."""
     alpha_min: float = Field(default=1 / 255, gt=0, lt=1)
+    """Contributions to a pixel below this are skipped."""
     alpha_cap: float = Field(default=0.999, gt=0, lt=1)
+    """Upper bound of one Gaussian's contribution to a pixel."""
     transmittance_min: float = Field(default=1e-4, ge=0, lt=1)
+    """A pixel takes no more Gaussians once its transmittance would fall to this."""
     background: tuple[Channel, Channel, Channel] = (0.5, 0.5, 0.5)
+    """RGB in [0, 1] behind everything."""
 
     @field_validator("far")
     @classmethod
@@ -62,7 +63,7 @@ class Renderer(Component, torch.nn.Module):
     camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 
     class Config(RendererConfig):
-        """The common settings."""
+        """The settings of every renderer; add your own below."""
 
     def __init__(self, config: RendererConfig) -> None:
         torch.nn.Module.__init__(self)

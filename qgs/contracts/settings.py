@@ -13,24 +13,24 @@ Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
 class ViewsConfig(ComponentConfig):
-    """How views are drawn from a scene and brought into the model's frame (TokenGS release).
-
-    inputs, targets: views per sample. gap: [min, max] frames between the first and the last input
-    frame, both ends included; it shrinks to what a scene has, and where that is below min, the
-    scene is named in a warning. The other inputs lie between, targets are drawn from the same span.
-    frame: the camera that becomes the identity. scale: "constant" multiplies translations by
-    `scale_factor`; "distance" divides them by the largest distance from the first input camera to
-    another one, then multiplies by `scale_factor`. scale_factor: see `scale`. mirror: probability
-    of mirroring a training sample in x.
-    """
+    """How views are drawn from a scene and brought into the model's frame (TokenGS release)."""
 
     inputs: int = Field(default=4, ge=1)
+    """Input views per sample."""
     targets: int = Field(default=4, ge=1)
+    """Target views per sample, drawn from the span of the inputs."""
     gap: tuple[int, int] = (10, 40)
+    """[min, max] frames from the first input to the last, which count too; it shrinks to what a
+    scene has, with a warning where that is below min."""
     frame: Literal["first_cam", "mean_cam"] = "first_cam"
+    """The camera that becomes the identity: the first input, or the mean of the inputs."""
     scale: Literal["constant", "distance"] = "constant"
+    """Translations are multiplied by `scale_factor`; with "distance", they are divided by the
+    largest distance from the first input camera to another one before."""
     scale_factor: float = Field(default=0.15, gt=0)
+    """Factor of all translations, see `scale`."""
     mirror: float = Field(default=0.5, ge=0, le=1)
+    """Probability of mirroring a training sample in x."""
 
     @field_validator("gap")
     @classmethod

@@ -20,10 +20,10 @@ class Opacity(Loss):
     renderings = "none"
 
     class Config(ComponentConfig):
-        """weight: factor of the term. eps: keeps the logarithm finite (TokenGS release)."""
-
         weight: float = Field(default=0.1, ge=0)
+        """Factor of the term in the objective."""
         eps: float = Field(default=1e-6, gt=0)
+        """Added to the opacity, so that the logarithm is finite (TokenGS release)."""
 
     config: Config
 
@@ -47,9 +47,8 @@ class Mask(Loss):
     renderings = "each"
 
     class Config(ComponentConfig):
-        """weight: factor of the term."""
-
         weight: float = Field(default=0.5, ge=0)
+        """Factor of the term in the objective."""
 
     config: Config
 

@@ -61,14 +61,12 @@ class Photometric(Loss):
     renderings = "each"
 
     class Config(ComponentConfig):
-        """mse_weight, ssim_weight: of the two terms, as published.
-
-        padding: of the SSIM window, see `qgs.losses.photometric.mean_ssim`.
-        """
-
         mse_weight: float = Field(default=1.0, ge=0)
+        """Factor of the mean squared error; 0 leaves the term out."""
         ssim_weight: float = Field(default=0.2, ge=0)
+        """Factor of (1 - SSIM) / 2; 0 leaves the term out."""
         padding: Padding = "same"
+        """Borders of SSIM: "same" pads with zeros (releases), "valid" uses whole windows only."""
 
     config: Config
 

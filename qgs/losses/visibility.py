@@ -25,17 +25,19 @@ INFINITE_PIXEL = 1e6
 class VisibilityOptions(ComponentConfig):
     """Options of a visibility loss.
 
-    weight: factor of the term. clamp: upper bound per point, half images (release: 1), None for
-    none. near: in a view, points with z <= near are behind the camera. behind_camera: "published"
-    ignores the sign of z as both releases do, so that such a point is seen mirrored and may count
-    as visible; "invisible" gives it the full `clamp` in that view. Like every clamped point it gets
-    no gradient from there, and still moves under views that it stands in front of.
+    A point behind the camera, like every clamped point, gets no gradient from that view; it still
+    moves under views that it stands in front of.
     """
 
     weight: float = Field(default=1.0, ge=0)
+    """Factor of the term in the objective."""
     clamp: float | None = Field(default=1.0, gt=0)
+    """Upper bound per point, in halves of an image side (release: 1); null for no bound."""
     near: float = Field(default=0.025, gt=0)
+    """Camera-frame z at or below which a point is behind the camera, world units."""
     behind_camera: BehindCamera = "published"
+    """A point behind the camera is seen mirrored, so it may count as visible ("published", as in
+    both releases), or it costs the full `clamp` in that view ("invisible")."""
 
     @property
     def behind(self) -> float | None:
@@ -62,12 +64,8 @@ class Visibility(Loss):
     renderings = "none"
 
     class Config(VisibilityOptions):
-        """See `VisibilityOptions`.
-
-        infinite_pixel: stands for x / 0, x != 0, in pixels; nothing can tell below a clamp.
-        """
-
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
+        """Stands for x / 0 with x != 0, pixels; no effect when `clamp` is set."""
 
     config: Config
 

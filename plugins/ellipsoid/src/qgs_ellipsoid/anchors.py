@@ -24,18 +24,16 @@ class EllipsoidQueries(Queries):
     name: ClassVar[str] = "anchored"
 
     class Config(RadiusOptions):
-        """count: N. std: of the features. center_init: where anchors start, see `locus/anchored`.
-
-        init_radii: softplus of the raw radii that every anchor starts with, along the axes of the
-        world: its semi-axes, but for `radius_min`.
-        """
-
         count: int = Field(default=4096, ge=1)
+        """N, the number of queries."""
         std: float = Field(default=0.01, ge=0)
+        """Standard deviation of the normal distribution that the features start from."""
         init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
+        """softplus of the raw radii that every anchor starts with, along the world's axes."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
+        """Distribution that the anchor centres start from."""
 
     config: Config
 

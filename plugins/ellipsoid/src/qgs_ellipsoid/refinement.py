@@ -23,18 +23,20 @@ class EllipsoidRefinement(Refinement):
     name: ClassVar[str] = "refine"
 
     class Config(RadiusOptions):
-        """center, rotation, radius: what is refined; the last two are the shape.
-
-        center_step, input_limit, output_limit, zero_init: see `locus/refine`.
-        """
-
         center: bool = True
+        """Whether centres are refined."""
         rotation: bool = True
+        """Whether rotations are refined."""
         radius: bool = True
+        """Whether the three radii are refined."""
         center_step: Literal["posact", "linear"] = "posact"
+        """The step of a centre for an MLP output t: posact(t) (release) or t itself (paper)."""
         input_limit: float | None = Field(default=100.0, gt=0)
+        """MLP outputs are clamped to +- this before posact; null for no clamp."""
         output_limit: float | None = Field(default=1000.0, gt=0)
+        """Steps are clamped to +- this after posact, world units; null for no clamp."""
         zero_init: bool = False
+        """The last layer of each MLP starts at zero (in neither release; steadier at first)."""
 
     config: Config
 

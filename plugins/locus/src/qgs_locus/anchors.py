@@ -32,11 +32,14 @@ from qgs_locus.fields import (
 
 
 class NormalCenters(ComponentConfig):
-    """Centres start normally distributed around `mean`, world units (release: N(0, 1), z + 1)."""
+    """Centres start normally distributed (release: N(0, 1), z + 1)."""
 
     kind: Literal["normal"] = "normal"
+    """Centres start normally distributed around `mean`."""
     mean: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Mean of the centres, world units."""
     std: float = Field(default=1.0, ge=0)
+    """Standard deviation of each coordinate, world units."""
 
     def sample(self, count: int) -> Tensor:
         """Centres (count, 3)."""
@@ -44,14 +47,14 @@ class NormalCenters(ComponentConfig):
 
 
 class FrustumCenters(ComponentConfig):
-    """Centres start inside the first camera's frustum, uniform in log depth and in the image.
-
-    depth: [nearest, farthest] z, world units. slope: largest |x / z| and |y / z|.
-    """
+    """Centres start inside the first camera's frustum, uniform in log depth and in the image."""
 
     kind: Literal["frustum"]
+    """Centres start inside the first camera's frustum, uniform in log depth and in the image."""
     depth: tuple[float, float] = (0.3, 3.0)
+    """[nearest, farthest] z, world units."""
     slope: float = Field(default=0.6, gt=0)
+    """Largest |x / z| and |y / z|."""
 
     @field_validator("depth")
     @classmethod
@@ -77,18 +80,18 @@ class AnchoredQueries(Queries):
     name: ClassVar[str] = "anchored"
 
     class Config(RadiusOptions):
-        """count: N. std: of the features. radius: False for centres alone.
-
-        init_radius: r that every anchor starts with, world units. center_init: where they start.
-        """
-
         count: int = Field(default=4096, ge=1)
+        """N, the number of queries."""
         std: float = Field(default=0.01, ge=0)
+        """Standard deviation of the normal distribution that the features start from."""
         radius: bool = True
+        """Whether anchors have a support radius; false for centres alone."""
         init_radius: float = Field(default=1.0, gt=0)
+        """softplus of the raw radius that every anchor starts with, world units."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
+        """Distribution that the anchor centres start from."""
 
     config: Config
 

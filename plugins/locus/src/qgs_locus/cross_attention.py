@@ -42,20 +42,20 @@ class RayBiasedCrossAttention(CrossAttention):
     name: ClassVar[str] = "ray_biased"
 
     class Config(RadiusOptions):
-        """bandwidth: sigma follows the radius or is fixed. sigma0: its factor, world units.
-
-        sigma_sq_min: floor of (sigma0 r)^2. bias_min: lower clamp of b. direction_eps: floor of the
-        length of a patch's mean direction before it is normalised. gamma_init: start of g, one
-        number per layer, gamma = softplus(g). norm_eps: of every LayerNorm.
-        """
-
         bandwidth: Literal["radius", "fixed"] = "radius"
+        """sigma is `sigma0` times the anchor's radius, or `sigma0` for every anchor ("fixed")."""
         sigma0: float = Field(default=0.1, gt=0)
+        """Bandwidth per radius, or the bandwidth in world units if it is fixed."""
         sigma_sq_min: float = Field(default=1e-3, gt=0)
+        """Least (sigma0 r)^2, world units squared."""
         bias_min: float = Field(default=-20.0, lt=0)
+        """Lower clamp of the bias b, before gamma."""
         direction_eps: float = Field(default=1e-6, gt=0)
+        """Least length that the mean direction of a patch is divided by."""
         gamma_init: float = -2.25
+        """Initial g of each layer; the weight of the bias is gamma = softplus(g)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
 
     config: Config
 

@@ -30,11 +30,14 @@ from qgs_locus.fields import (
 
 
 class OffsetOptions(ComponentConfig):
-    """offset: posact(t) (release) or t itself (paper). input_limit, output_limit: see posact."""
+    """How raw offsets become displacements from the anchor."""
 
     offset: Literal["posact", "linear"] = "posact"
+    """Displacement of a raw offset t: posact(t) (release) or t itself (paper)."""
     input_limit: float | None = Field(default=100.0, gt=0)
+    """Raw offsets are clamped to +- this before posact; null for no clamp."""
     output_limit: float | None = Field(default=1000.0, gt=0)
+    """Displacements are clamped to +- this after posact; null for no clamp."""
 
     def displacement(self, raw: Tensor) -> Tensor:
         """Displacements of raw offsets, float32 or better, any shape."""
@@ -54,7 +57,7 @@ class AnchorOffsetCenters(Centers):
     name: ClassVar[str] = "anchor_offset"
 
     class Config(OffsetOptions):
-        """See OffsetOptions."""
+        """See `OffsetOptions`."""
 
     config: Config
 
@@ -79,7 +82,7 @@ class RadiusScaledCenters(Centers):
     name: ClassVar[str] = "radius_scaled"
 
     class Config(OffsetOptions, RadiusOptions):
-        """See OffsetOptions and RadiusOptions."""
+        """See `OffsetOptions` and `RadiusOptions`."""
 
     config: Config
 

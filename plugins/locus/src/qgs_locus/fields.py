@@ -20,14 +20,13 @@ CENTER_FIELD: Fields = {CENTER: FieldSpec((3,), frame="world")}
 
 
 class RadiusOptions(ComponentConfig):
-    """How a support radius r is read from the raw radius rho; all components must agree.
-
-    radius_bound: "floor" is r = max(softplus(rho), radius_min) (release), "offset" is
-    r = softplus(rho) + radius_min (paper). radius_min: world units.
-    """
+    """How a support radius r is read from the raw radius rho; all components must agree."""
 
     radius_bound: Literal["floor", "offset"] = "floor"
+    """r = max(softplus(rho), radius_min) ("floor", release) or softplus(rho) + radius_min (paper);
+    the same in all components."""
     radius_min: float = Field(default=1e-3, ge=0)
+    """Least support radius, world units; the same in all components."""
 
 
 def radius_field(options: RadiusOptions) -> Fields:

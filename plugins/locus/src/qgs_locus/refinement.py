@@ -21,19 +21,18 @@ class AnchorRefinement(Refinement):
     name: ClassVar[str] = "refine"
 
     class Config(RadiusOptions):
-        """center, radius: which of the two is refined.
-
-        center_step: the step is posact(f(x)) (release) or f(x) (paper). input_limit, output_limit:
-        clamps of posact. zero_init: the last layer of each head starts at zero (in neither release;
-        steadier in short trainings), else as PyTorch initialises it.
-        """
-
         center: bool = True
+        """Whether centres are refined."""
         radius: bool = True
+        """Whether radii are refined."""
         center_step: Literal["posact", "linear"] = "posact"
+        """The step of a centre for an MLP output t: posact(t) (release) or t itself (paper)."""
         input_limit: float | None = Field(default=100.0, gt=0)
+        """MLP outputs are clamped to +- this before posact; null for no clamp."""
         output_limit: float | None = Field(default=1000.0, gt=0)
+        """Steps are clamped to +- this after posact, world units; null for no clamp."""
         zero_init: bool = False
+        """The last layer of each MLP starts at zero (in neither release; steadier at first)."""
 
     config: Config
 

@@ -40,17 +40,16 @@ class AnchorAwareSelfAttention(SelfAttention):
     name: ClassVar[str] = "anchor_aware"
 
     class Config(ComponentConfig):
-        """position: what is embedded, "tanh" of the centre (release) or "raw" (paper).
-
-        features: sines and cosines per axis. temperature, divisor_eps: see `sine_embedding`.
-        norm_eps: of every LayerNorm.
-        """
-
         position: Literal["tanh", "raw"] = "tanh"
+        """What is embedded: tanh of the centre (release) or the centre itself ("raw", paper)."""
         features: int = Field(default=128, ge=2, multiple_of=2)
+        """Sines and cosines per axis."""
         temperature: float = Field(default=10_000.0, gt=0)
+        """Longest period over shortest, nearly; base of the frequencies of the sines."""
         divisor_eps: float = Field(default=1e-6, ge=0)
+        """Added to the divisor of each frequency (LocusGS release)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
 
     config: Config
 

@@ -21,13 +21,10 @@ class AnchorVisibility(Loss):
     renderings = "none"
 
     class Config(VisibilityOptions):
-        """See `qgs.losses.VisibilityOptions`.
-
-        z_guard: |z| below it is replaced by +z_guard before the division (LocusGS release).
-        """
-
         weight: float = Field(default=0.1, ge=0)
+        """Factor of the term in the objective."""
         z_guard: float = Field(default=1e-3, gt=0)
+        """|z| below this is replaced by it before the division, world units (LocusGS release)."""
 
     config: Config
 
