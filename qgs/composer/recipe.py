@@ -24,6 +24,7 @@ from qgs.contracts import (
     ComponentConfig,
     EvaluationConfig,
     Loss,
+    Metric,
     ModelDims,
     Plugin,
     RecipeContext,
@@ -176,6 +177,10 @@ class Recipe:
         `losses: {}` gives none: fine for everything but training, which refuses it.
         """
         return self._build_named("losses")
+
+    def build_metrics(self) -> dict[str, Metric]:
+        """What evaluations measure, by the names that the recipe gives."""
+        return self._build_named("metrics")
 
     def build_data(self) -> SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""

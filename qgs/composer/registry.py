@@ -19,6 +19,7 @@ import qgs
 import qgs.components
 import qgs.data
 import qgs.losses
+import qgs.metrics
 import qgs.renderers
 from qgs.composer.slots import SLOTS
 from qgs.contracts import (
@@ -195,6 +196,7 @@ BUILTIN = Plugin(
         *qgs.components.COMPONENTS,
         *qgs.renderers.COMPONENTS,
         *qgs.losses.COMPONENTS,
+        *qgs.metrics.COMPONENTS,
         *qgs.data.COMPONENTS,
     ),
     layouts=(qgs.components.TOKENGS,),

@@ -15,6 +15,7 @@ from qgs.contracts import (
     FeedForward,
     Head,
     Loss,
+    Metric,
     Queries,
     Refinement,
     Renderer,
@@ -51,6 +52,7 @@ SLOTS = {
         Slot(Supervision, "qgs/layers"),
         Slot(Renderer, "qgs/auto"),
         Slot(Loss, None),
+        Slot(Metric, None),
         Slot(SceneSource, None),
     )
 }
@@ -75,10 +77,12 @@ class Section:
 
 
 DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
+DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
 
 SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
+    "metrics": Section(named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
 }
 
 

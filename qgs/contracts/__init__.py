@@ -24,6 +24,7 @@ from qgs.contracts.decoder import (
 from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
 from qgs.contracts.head import Centers, Head
 from qgs.contracts.loss import Loss, Supervision
+from qgs.contracts.metric import Column, Metric, MetricInput
 from qgs.contracts.plugin import (
     CONTRACT_VERSION,
     ENTRY_POINT_GROUP,
@@ -42,6 +43,7 @@ __all__ = [
     "MEMORY_FIELDS",
     "AttentionWeights",
     "Centers",
+    "Column",
     "Component",
     "ComponentConfig",
     "CrossAttention",
@@ -55,6 +57,8 @@ __all__ = [
     "Head",
     "LayoutError",
     "Loss",
+    "Metric",
+    "MetricInput",
     "ModelComponent",
     "ModelDims",
     "OptionError",

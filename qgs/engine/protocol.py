@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from qgs.composer import Recipe
-from qgs.contracts import SceneSourceConfig
+from qgs.contracts import Metric, SceneSourceConfig
 from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.engine.tuning import tuning_loss
-from qgs.metrics.images import IMAGE_METRICS
 
 _CROP = "centre crop to the aspect ratio of image_size, then Lanczos resize"
 
@@ -76,15 +75,14 @@ def protocol_of(
     )
     evaluation = recipe.evaluation
     content = {
-        "format": 1,
+        "format": 2,
         "image_size": list(config.image_size),
         "crop": _CROP,
         "data": options if index is not None else {"type": recipe.tree["data"]["type"], **options},
         "poses": recipe.views.model_dump(include={"frame", "scale", "scale_factor"}),
         "views": _indexed(index) if index is not None else _drawn(recipe, scenes),
         "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
-        "metrics": {m: IMAGE_METRICS[m] for m in ("psnr", "ssim", *evaluation.metrics)},
-        "ssim_covariance": evaluation.ssim_covariance,
+        "metrics": _metrics(recipe),
         "tuning": _tuning(recipe),
     }
     return Protocol(evaluation.protocol or _name(evaluation.index), content)
@@ -113,6 +111,17 @@ def _drawn(recipe: Recipe, scenes: Sequence[str]) -> dict[str, Any]:
     views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
     rule = recipe.evaluation.model_dump(include={"scenes", "samples", "seed"})
     return {"drawn": {**views, **rule, "names": list(scenes)}}
+
+
+def _metrics(recipe: Recipe) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for path, chosen in recipe.parts.items():
+        if path[0] == "metrics" and issubclass(chosen.component, Metric):
+            left_out = set(chosen.component.not_in_protocol)
+            options = chosen.config.model_dump(mode="json", exclude=left_out)
+            what = {"type": chosen.type, "definition": chosen.component.definition}
+            found[path[1]] = {**what, **options}
+    return found
 
 
 def _tuning(recipe: Recipe) -> dict[str, Any] | None:

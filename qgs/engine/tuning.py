@@ -11,7 +11,7 @@ from torch import Tensor
 from qgs.composer import Recipe
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
-from qgs.types import Prediction, QueryState, Views
+from qgs.types import Prediction, Views, map_tensors, named_tensors
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ def tune(
     with torch.no_grad():
         memory = model.encoder(views)
         start = model.queries(views.images.shape[0])
-    state, leaves = _leaves(start)
+    state = map_tensors(_tuned_copy, start)
+    leaves = [tensor for _, tensor in named_tensors(state) if tensor.requires_grad]
     optimizer = torch.optim.Adam(leaves, lr=rate)
     losses = []
     with torch.enable_grad():
@@ -62,16 +63,9 @@ def tune(
     return Tuning(prediction, losses)
 
 
-def _leaves(start: QueryState) -> tuple[QueryState, list[Tensor]]:
-    """A copy of `start` whose floating tensors want gradients, and these."""
-
-    def leaf(tensor: Tensor) -> Tensor:
-        copy = tensor.detach().clone()
-        return copy.requires_grad_() if copy.is_floating_point() else copy
-
-    fields = {name: leaf(tensor) for name, tensor in start.fields.items()}
-    state = QueryState(leaf(start.features), fields)
-    return state, [t for t in (state.features, *fields.values()) if t.requires_grad]
+def _tuned_copy(tensor: Tensor) -> Tensor:
+    """A copy, which wants gradients if it is of floating-point numbers."""
+    return tensor.detach().clone().requires_grad_(tensor.is_floating_point())
 
 
 def _loss(

@@ -6,8 +6,8 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from qgs.contracts.settings import SsimCovariance
 from qgs.metrics import psnr, ssim
+from qgs.metrics.images import SsimCovariance
 
 
 def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, torch.Tensor]:
