@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import torch
 from qgs.composer import Recipe
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
-from qgs.data.sampling import Frames, Sample, stack_views
+from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore, value_name
 from qgs.engine.tuning import tune, tuning_loss
@@ -53,8 +52,7 @@ def evaluate(
     training = model.training
     model.eval()
     try:
-        results = _observed(judge.judged(plan.samples(), batch), plan.wanted, observe)
-        scores, missing = _by_scene(plan.wanted, results)
+        scores, missing = _by_scene(plan.wanted, judge.judged(plan.samples(), batch), observe)
     finally:
         model.train(training)
     missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
@@ -77,13 +75,6 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
-
-
-@dataclass(frozen=True)
-class _SampleScore:
-    scene: str
-    views: tuple[Frames, Frames]
-    values: Mapping[str, float]
 
 
 class _Judge:
@@ -114,14 +105,16 @@ class _Judge:
         for name, metric in self._owners.items():
             if metric.unavailable:
                 found[name] = metric.unavailable
-            elif any(value_name("model", name) not in score.values for score in scores):
+                continue
+            lacking = sum(value_name("model", name) not in score.values for score in scores)
+            if lacking:
                 needs = " and ".join(metric.needs).replace("_", " ")
-                found[name] = f"it needs {needs}, which the other scenes lack"
+                found[name] = f"it needs {needs}, not known for {lacking} of {len(scores)} scenes"
         return found
 
     def judged(
         self, samples: Iterable[Sample | SceneFailure], batch: int
-    ) -> Iterator[_SampleScore | SceneFailure]:
+    ) -> Iterator[SceneScore | SceneFailure]:
         """The score of every sample, up to `batch` with inputs of one shape at a time."""
         waiting: list[Sample] = []
         for sample in samples:
@@ -137,7 +130,7 @@ class _Judge:
         yield from self._together(waiting)
 
     @torch.no_grad()
-    def _together(self, samples: Sequence[Sample]) -> list[_SampleScore | SceneFailure]:
+    def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
         if len(samples) > 1 and not self._tune:
             try:
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
@@ -150,7 +143,7 @@ class _Judge:
 
     def _score(
         self, sample: Sample, gaussians: Gaussians | None = None
-    ) -> _SampleScore | SceneFailure:
+    ) -> SceneScore | SceneFailure:
         """The score of `sample`. gaussians: (1, G), None to predict them here."""
         values: dict[str, float] = {}
         try:
@@ -167,7 +160,7 @@ class _Judge:
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         if broken:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
-        return _SampleScore(sample.scene, (sample.input_frames, sample.target_frames), values)
+        return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
 
     def _values(self, sample: Sample, gaussians: Gaussians) -> dict[str, float]:
         """Everything measured on the Gaussians (1, G) of `sample`."""
@@ -205,41 +198,33 @@ def _name(metric: str, key: str) -> str:
 
 
 def _by_scene(
-    wanted: Sequence[str], results: Iterable[_SampleScore | SceneFailure]
+    wanted: Sequence[str],
+    results: Iterable[SceneScore | SceneFailure],
+    observe: Observer | None,
 ) -> tuple[list[SceneScore], list[SceneFailure]]:
     """Scores and failures in the order of `wanted`; one failed sample fails its scene."""
-    samples: dict[str, list[_SampleScore]] = {}
+    samples: dict[str, list[SceneScore]] = {}
     failures: dict[str, SceneFailure] = {}
     for result in results:
         if isinstance(result, SceneFailure):
             failures.setdefault(result.scene, result)
         else:
             samples.setdefault(result.scene, []).append(result)
+        if observe:
+            observe(len(samples.keys() | failures.keys()), len(wanted))
     scores = [_merged(samples[name]) for name in wanted if name in samples and name not in failures]
     return scores, [failures[name] for name in wanted if name in failures]
 
 
-def _merged(samples: Sequence[_SampleScore]) -> SceneScore:
-    """Means of the values that all samples of a scene have."""
+def _merged(samples: Sequence[SceneScore]) -> SceneScore:
+    """One scene's samples as one: means of the values that all of them have."""
     values = {
         name: sum(sample.values[name] for sample in samples) / len(samples)
         for name in samples[0].values
         if all(name in sample.values for sample in samples)
     }
-    return SceneScore(samples[0].scene, [sample.views for sample in samples], values)
-
-
-def _observed(
-    results: Iterable[_SampleScore | SceneFailure],
-    wanted: Sequence[str],
-    observe: Observer | None,
-) -> Iterator[_SampleScore | SceneFailure]:
-    seen: set[str] = set()
-    for result in results:
-        yield result
-        seen.add(result.scene)
-        if observe:
-            observe(len(seen), len(wanted))
+    views = [frames for sample in samples for frames in sample.views]
+    return SceneScore(samples[0].scene, views, values)
 
 
 def _held_out(source: SceneSource, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
