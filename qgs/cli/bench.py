@@ -54,9 +54,9 @@ def bench(
 
     from qgs.cli.bench_tables import bench_tables, headline
     from qgs.composer import resolve
-    from qgs.engine.bench import Measures, Subject, workload_of
-    from qgs.engine.bench import bench as measure
-    from qgs.engine.bench.run import refuse_other_file
+    from qgs.engine.bench.run import Measures, Subject, refuse_other_file
+    from qgs.engine.bench.run import bench as measure
+    from qgs.engine.bench.work import workload_of
     from qgs.engine.distributed import choose_device
 
     if json is not None:

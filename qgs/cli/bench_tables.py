@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from qgs.engine.bench import Report, Spread
+from qgs.engine.bench.run import Report, Spread
 from qgs.engine.bench.work import Operation
 
 MEBIBYTE = 2**20
@@ -79,7 +79,7 @@ def _models(report: Report, names: Sequence[str]) -> Table:
 
 def _seconds(report: Report, names: Sequence[str], operation: Operation) -> Table:
     base = report.results[0].times[operation]
-    unit, scale = ("s", 1.0) if base.median >= 10 else ("ms", 1000.0)
+    unit, scale = ("s", 1.0) if base.quartiles[1] >= 10 else ("ms", 1000.0)
     headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")
     table = _table(CALLED[operation], headers)
     for name, result in zip(names, report.results, strict=True):
