@@ -67,35 +67,36 @@ class MetricInput(TensorContainer):
 
 
 class Metric(Component, torch.nn.Module):
-    """MetricInput -> named values. Called without gradients, for every sample and every method.
-
-    A value is called as the recipe calls the metric; where there are several, or its key is not
-    "", with `_KEY` behind. Of a scene counts the mean over its samples.
+    """MetricInput -> values. Called without gradients, for every sample and every method.
 
     definition: what is measured, in words. It is part of the evaluation protocol, as the options
     are: change it when values change. not_in_protocol: options that change no value, such as where
     a file lies. needs: parts of the input that must not be None; where one is, there is no value.
-    unavailable: set by `__init__` to the reason why there are no values on this machine, such as a
-    missing file of weights; evaluations tell it.
+    column: how the value is shown. unavailable: set by `__init__` to the reason why there are no
+    values on this machine, such as a missing file of weights; evaluations tell it.
     """
 
     slot: ClassVar[str] = "metrics"
     definition: ClassVar[str] = ""
     not_in_protocol: ClassVar[frozenset[str]] = frozenset()
     needs: ClassVar[tuple[Need, ...]] = ()
+    column: ClassVar[Column]
     unavailable: str = ""
 
     def __init__(self, config: ComponentConfig) -> None:
         torch.nn.Module.__init__(self)
         self.config = config
 
-    @abstractmethod
     def columns(self) -> Mapping[str, Column]:
-        """Key of every value to how it is shown."""
+        """How values are shown, by key; for metrics with several, or with options that tell.
+
+        A value is called as the recipe calls the metric, with `_KEY` behind unless the key is "".
+        """
+        return {"": self.column}
 
     @abstractmethod
-    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        """Values by the keys of `columns`, such as (1, T), one for each view.
+    def forward(self, given: MetricInput) -> Tensor | Mapping[str, Tensor]:
+        """A tensor such as (1, T), one number for each view; several by the keys of `columns`.
 
-        The value of a sample is the mean of all numbers of a tensor, in float64.
+        The value of a sample is the mean of all numbers in float64, of a scene that of its samples.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -189,6 +189,7 @@ class _Judge:
             if metric.unavailable or any(getattr(given, need) is None for need in metric.needs):
                 continue
             found = metric(given)
+            found = found if isinstance(found, Mapping) else {"": found}
             for key in metric.columns():
                 yield _name(name, key), float(found[key].double().mean())
 

@@ -24,8 +24,8 @@ from qgs.metrics import OPACITY_USED
 
 METHODS = ("model", "nearest_input", "mean_colour")
 TUNING = ("tuning_loss_before", "tuning_loss_after")
-_NOT_VALUES = ("scene", "input_frames", "target_frames", "problem")
-"""Columns of scenes.csv beside the values."""
+_FRAMES = ("scene", "input_frames", "target_frames")
+"""Columns of scenes.csv before the values; `problem` stands behind them."""
 _NAMED = 10
 
 
@@ -102,19 +102,12 @@ class Evaluation:
         return not self.missing
 
     @property
-    def coverage(self) -> str:
-        """How many scenes have a score, "138 of 140" where some lack it."""
-        return self._of_wanted(len(self.scores))
-
-    @property
     def statement(self) -> str:
         """The model's first value, usually PSNR, and over how many scenes, in one line."""
-        scenes = "scene" if len(self.wanted) == 1 else "scenes"
-        line = f"over {self.coverage} {scenes}"
-        for name, value in self.means().items():
-            if value is not None:
-                line = f"{self.columns[name].heading} {self.columns[name].shown(value)} {line}"
-                break
+        line = f"over {self._of_wanted(len(self.scores))} scene{'s' * (len(self.wanted) != 1)}"
+        if known := [name for name, value in self.means().items() if value is not None]:
+            column = self.columns[known[0]]
+            line = f"{column.heading} {column.shown(self.mean(known[0]))} {line}"
         missing = [failure.scene for failure in self.missing]
         return f"{line}; missing: {listed(missing)}" if missing else line
 
@@ -188,7 +181,7 @@ class Evaluation:
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
-            rows.append([method.replace("_", " "), *cells, self.coverage])
+            rows.append([method.replace("_", " "), *cells, self._of_wanted(len(self.scores))])
         return rows
 
     def _rows_over_scenes(self) -> list[list[str]]:
@@ -212,23 +205,28 @@ class Evaluation:
         reasons = {failure.scene: failure.reason for failure in self.missing}
         columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        scene, *frames, problem = _NOT_VALUES
-        writer.writerow([scene, *frames, *columns, problem])
+        writer = csv.DictWriter(text, [*_FRAMES, *columns, "problem"], lineterminator="\n")
+        writer.writeheader()
         for name in self.wanted:
+            row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
             if name in judged:
                 sides = zip(*judged[name].views, strict=True)
                 shown = ["; ".join(" ".join(map(str, frames)) for frames in side) for side in sides]
-                values = [judged[name].values.get(column, "") for column in columns]
-                writer.writerow([name, *shown, *values, ""])
-            else:
-                writer.writerow([name, "", "", *("" for _ in columns), reasons[name]])
+                row |= {**dict(zip(_FRAMES[1:], shown, strict=True)), **judged[name].values}
+            writer.writerow(row)
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
         """What is to be known beside the tables, one line each."""
         yield self.statement
-        yield self._about_protocol()
+        protocol, poses = self.protocol, self.protocol.content["poses"]
+        height, width = protocol.content["image_size"]
+        counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
+        yield (
+            f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
+            f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
+            f"{poses['scale']} {poses['scale_factor']}"
+        )
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_NAMED])
         if len(self.missing) > _NAMED:
             yield f"{len(self.missing) - _NAMED} more missing scenes are in scenes.csv"
@@ -237,9 +235,8 @@ class Evaluation:
         if self.unlisted:
             count, names = len(self.unlisted), listed(self.unlisted)
             yield f"scenes of the data that the index lacks, not judged ({count}): {names}"
-        given = {score.scene: score.given for score in self.scores if score.given}
-        if given:
-            named = [f"{scene} ({' '.join(map(str, frames))})" for scene, frames in given.items()]
+        if given := [score for score in self.scores if score.given]:
+            named = [f"{score.scene} ({' '.join(map(str, score.given))})" for score in given]
             yield (
                 f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the "
                 f"nearest input view is perfect: {listed(named)}"
@@ -261,16 +258,6 @@ class Evaluation:
                 f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
                 f"{tuning['loss_after']:.4f}"
             )
-
-    def _about_protocol(self) -> str:
-        height, width = self.protocol.content["image_size"]
-        poses = self.protocol.content["poses"]
-        counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
-        return (
-            f"protocol {self.protocol.name}, sha256 {self.protocol.sha256}: "
-            f"{' or '.join(map(str, counts))} input views of {width} x {height} pixels, poses "
-            f"{poses['frame']}, scale {poses['scale']} {poses['scale_factor']}"
-        )
 
 
 def listed(names: Sequence[str], most: int = _NAMED) -> str:
@@ -374,7 +361,7 @@ def _read(folder: Path, name: str) -> StoredResults:
         protocol=json.loads((folder / "protocol.json").read_text(encoding="utf-8")),
         columns={name: Column(**column) for name, column in summary["columns"].items()},
         scenes={
-            scene: {k: float(v) for k, v in row.items() if k not in _NOT_VALUES and v != ""}
+            scene: {k: float(v) for k, v in row.items() if k not in _FRAMES and v}
             for scene, row in judged.items()
         },
         frames={s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()},

@@ -45,32 +45,25 @@ def tune(
     with torch.no_grad():
         memory = model.encoder(views)
         start = model.queries(views.images.shape[0])
-    state = map_tensors(_tuned_copy, start)
+    state = map_tensors(lambda x: x.detach().clone().requires_grad_(x.is_floating_point()), start)
     leaves = [tensor for _, tensor in named_tensors(state) if tensor.requires_grad]
     optimizer = torch.optim.Adam(leaves, lr=rate)
+
+    def predicted() -> tuple[Prediction, Tensor]:
+        prediction = model.predict(memory, state, ())
+        rendering = model.render(prediction.gaussians, views.cameras)
+        terms = loss(prediction.layers[model.depth], rendering, views)
+        return prediction, torch.stack(list(terms.values())).sum()
+
     losses = []
     with torch.enable_grad():
         for _ in range(steps):
-            value = _loss(model, model.predict(memory, state, ()), views, loss)
+            _, value = predicted()
             gradients = torch.autograd.grad(value, leaves, allow_unused=True)
             for leaf, gradient in zip(leaves, gradients, strict=True):
                 leaf.grad = gradient
             optimizer.step()
             losses.append(float(value.detach()))
     with torch.no_grad():
-        prediction = model.predict(memory, state, ())
-        losses.append(float(_loss(model, prediction, views, loss)))
-    return Tuning(prediction, losses)
-
-
-def _tuned_copy(tensor: Tensor) -> Tensor:
-    """A copy, which wants gradients if it is of floating-point numbers."""
-    return tensor.detach().clone().requires_grad_(tensor.is_floating_point())
-
-
-def _loss(
-    model: QueryGaussianModel, prediction: Prediction, views: Views, loss: Photometric
-) -> Tensor:
-    rendering = model.render(prediction.gaussians, views.cameras)
-    layer = prediction.layers[model.depth]
-    return torch.stack(list(loss(layer, rendering, views).values())).sum()
+        prediction, value = predicted()
+    return Tuning(prediction, [*losses, float(value)])

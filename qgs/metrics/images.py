@@ -23,22 +23,19 @@ _MSE_FLOOR = 1e-10
 
 
 class Psnr(Metric):
-    """Peak signal-to-noise ratio of a view."""
+    """Peak signal-to-noise ratio of each view."""
 
     name: ClassVar[str] = "psnr"
     definition: ClassVar[str] = "dB of images clipped to [0, 1], mean over views, then over scenes"
+    column: ClassVar[Column] = Column("PSNR", "higher", digits=2, unit="dB")
 
-    def columns(self) -> Mapping[str, Column]:
-        """In dB."""
-        return {"": Column("PSNR", "higher", digits=2, unit="dB")}
-
-    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
+    def forward(self, given: MetricInput) -> Tensor:
         """(1, T)."""
-        return {"": psnr(given.images, given.targets.images)}
+        return psnr(given.images, given.targets.images)
 
 
 class Ssim(Metric):
-    """Structural similarity of a view (Wang et al. 2004)."""
+    """Structural similarity of each view (Wang et al. 2004)."""
 
     name: ClassVar[str] = "ssim"
     definition: ClassVar[str] = (
@@ -61,9 +58,9 @@ class Ssim(Metric):
         form = "" if self.covariance == "population" else f" ({self.covariance} covariance)"
         return {"": Column(f"SSIM{form}", "higher")}
 
-    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
+    def forward(self, given: MetricInput) -> Tensor:
         """(1, T). Raises ValueError for images smaller than the window."""
-        return {"": ssim(given.images, given.targets.images, self.covariance)}
+        return ssim(given.images, given.targets.images, self.covariance)
 
 
 @full_precision

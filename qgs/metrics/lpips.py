@@ -32,7 +32,7 @@ _SMALLEST = 2 ** (len(_BLOCKS) - 1)
 
 
 class Lpips(Metric):
-    """Distance of two images in the features of VGG-16, weighted as people judge.
+    """Distance of each view to the truth in the features of VGG-16, weighted as people judge.
 
     Nothing is downloaded: `unavailable` says which package or file is missing, and how to get it.
     """
@@ -40,6 +40,7 @@ class Lpips(Metric):
     name: ClassVar[str] = "lpips"
     definition: ClassVar[str] = "VGG-16, version 0.1, images in [-1, 1]"
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"weights"})
+    column: ClassVar[Column] = Column("LPIPS", "lower")
 
     class Config(ComponentConfig):
         """Options of LPIPS."""
@@ -56,7 +57,34 @@ class Lpips(Metric):
         self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
         self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
         self.unavailable = self._load(config.weights)
-        self.eval()
+        self.requires_grad_(False)
+
+    def forward(self, given: MetricInput) -> Tensor:
+        """(1, T). Raises ValueError when a side is shorter than 16 pixels."""
+        return self.distance(given.images, given.targets.images)
+
+    @full_precision
+    @torch.no_grad()
+    def distance(self, images: Tensor, truth: Tensor) -> Tensor:
+        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones."""
+        if min(images.shape[-2:]) < _SMALLEST:
+            raise ValueError(
+                f"LPIPS needs images of at least {_SMALLEST} pixels a side, got "
+                f"{images.shape[-2]}x{images.shape[-1]}"
+            )
+        pairs = zip(images.flatten(0, -4), truth.flatten(0, -4), strict=True)
+        return torch.stack([self._pair(*pair) for pair in pairs]).reshape(images.shape[:-3])
+
+    def _pair(self, image: Tensor, truth: Tensor) -> Tensor:
+        x = torch.stack([image, truth]).clamp(0, 1) * 2 - 1
+        x = (x - self.shift) / self.scale
+        total = x.new_zeros(())
+        for index, (block, weight) in enumerate(zip(self.blocks, self.linear, strict=True)):
+            x = block(F.max_pool2d(x, 2) if index else x)
+            unit = x / (x.norm(dim=1, keepdim=True) + _EPS)
+            apart = (unit[:1] - unit[1:]).square()
+            total = total + F.conv2d(apart, weight).mean()
+        return total
 
     def _load(self, weights: str | None) -> str:
         """Read the weights; why they cannot be read, "" if they were."""
@@ -77,59 +105,24 @@ class Lpips(Metric):
         try:
             tensors, factors = _read(vgg), _read(linear)
             self.blocks = nn.ModuleList(
-                nn.Sequential(*(_convolution(tensors, number) for number in block))
+                nn.Sequential(*(layer for number in block for layer in _layers(tensors, number)))
                 for block in _BLOCKS
             )
-            layers = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
-            self.linear = nn.ParameterList([factors[name].float() for name in layers])
+            names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
+            self.linear = nn.ParameterList([factors[name].float() for name in names])
         except (KeyError, RuntimeError, ValueError, OSError) as error:
             return (
                 f"{vgg.name} or {linear.name} does not hold the weights of VGG-16 and LPIPS 0.1 "
                 f"({type(error).__name__}: {error})"
             )
-        self.requires_grad_(False)
         return ""
 
-    def columns(self) -> Mapping[str, Column]:
-        """No unit."""
-        return {"": Column("LPIPS", "lower")}
 
-    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        """(1, T). Raises ValueError when a side is shorter than 16 pixels."""
-        return {"": self.distance(given.images, given.targets.images)}
-
-    @full_precision
-    @torch.no_grad()
-    def distance(self, images: Tensor, truth: Tensor) -> Tensor:
-        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones.
-
-        Raises ValueError when a side is shorter than 16 pixels.
-        """
-        if min(images.shape[-2:]) < _SMALLEST:
-            raise ValueError(
-                f"LPIPS needs images of at least {_SMALLEST} pixels a side, got "
-                f"{images.shape[-2]}x{images.shape[-1]}"
-            )
-        pairs = zip(images.flatten(0, -4), truth.flatten(0, -4), strict=True)
-        return torch.stack([self._pair(*pair) for pair in pairs]).reshape(images.shape[:-3])
-
-    def _pair(self, image: Tensor, truth: Tensor) -> Tensor:
-        x = torch.stack([image, truth]).clamp(0, 1) * 2 - 1
-        x = (x - self.shift) / self.scale
-        total = x.new_zeros(())
-        for index, (block, weight) in enumerate(zip(self.blocks, self.linear, strict=True)):
-            x = block(F.max_pool2d(x, 2) if index else x)
-            unit = x / (x.norm(dim=1, keepdim=True) + _EPS)
-            apart = (unit[:1] - unit[1:]).square()
-            total = total + F.conv2d(apart, weight).mean()
-        return total
-
-
-def _convolution(vgg: Mapping[str, Tensor], number: int) -> nn.Sequential:
+def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]:
     weight, bias = vgg[f"features.{number}.weight"], vgg[f"features.{number}.bias"]
     convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
     convolution.load_state_dict({"weight": weight, "bias": bias})
-    return nn.Sequential(convolution.requires_grad_(False), nn.ReLU(inplace=True))
+    return convolution, nn.ReLU(inplace=True)
 
 
 def _read(path: Path) -> Mapping[str, Tensor]:

@@ -41,6 +41,7 @@ class MeanAbsoluteError(Metric):
 
     name: ClassVar[str] = "mae"
     definition: ClassVar[str] = "mean absolute error"
+    column: ClassVar[Column] = Column("MAE", "lower", digits=5)
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"log"})
 
     class Config(ComponentConfig):
@@ -51,12 +52,9 @@ class MeanAbsoluteError(Metric):
         log: str | None = None
         """File that changes no value."""
 
-    def columns(self) -> Mapping[str, Column]:
-        return {"": Column("MAE", "lower", digits=5)}
-
-    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
+    def forward(self, given: MetricInput) -> Tensor:
         error = (given.images - given.targets.images).abs() ** self.config.power
-        return {"": error.mean((-3, -2, -1))}
+        return error.mean((-3, -2, -1))
 
 
 class DepthError(Metric):
@@ -64,12 +62,10 @@ class DepthError(Metric):
 
     name: ClassVar[str] = "depth"
     needs = ("depth", "true_depth")
+    column: ClassVar[Column] = Column("depth error", "lower")
 
-    def columns(self) -> Mapping[str, Column]:
-        return {"": Column("depth error", "lower")}
-
-    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
-        return {"": given.depth - given.true_depth}
+    def forward(self, given: MetricInput) -> Tensor:
+        return given.depth - given.true_depth
 
 
 class Masked(Metric):
