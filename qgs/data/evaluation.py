@@ -16,6 +16,7 @@ from torch import Tensor
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
 from qgs.data.paths import opened_path
 from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, training_frames
+from qgs.geometry.poses import largest_distance
 
 FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
 
@@ -27,7 +28,6 @@ class IndexEntry(BaseModel):
 
     context: FrameList
     """The input frames, the first of which sets the model's frame."""
-
     target: FrameList
     """The frames that are judged."""
 
@@ -78,8 +78,7 @@ def read_index(path: str) -> EvaluationIndex:
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    repeated = [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]
-    if repeated:
+    if repeated := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
         raise ValueError(f"written twice: {', '.join(repeated[:_SHOWN])}")
     return dict(pairs)
 
@@ -152,17 +151,20 @@ class EvaluationPlan:
             except Exception as error:  # whatever a reader raises is told, and never ends the rest
                 yield SceneFailure(name, one_line(error))
 
-    def _choices(self, scene: Scene, place: int) -> Iterable[FrameChoice]:
-        if self._index is not None:
-            return [_listed(scene, self._index)]
+    def _choices(self, scene: Scene, place: int) -> Iterator[FrameChoice]:
         limit = self._evaluation.scenes
-        if scene.held_out:
+        if self._index is not None:
+            yield _named(scene, self._index)
+        elif scene.held_out:
             windows = held_out_windows(scene, self._views)
-            if len(windows) > limit:
-                kept = np.linspace(0, len(windows) - 1, limit).round().astype(int)
-                windows = [windows[i] for i in kept]
-            return windows
-        return _drawn(scene, place, self._views, self._evaluation)
+            kept = np.linspace(0, len(windows) - 1, min(limit, len(windows))).round().astype(int)
+            yield from (windows[i] for i in kept)
+        else:
+            for k in range(self._evaluation.samples):
+                rng = np.random.default_rng([self._evaluation.seed, place, k])
+                inputs, drawn = draw_frames(scene, self._views, rng)
+                between = tuple(f for f in range(inputs[0], inputs[-1] + 1) if f not in inputs)
+                yield inputs, between or tuple(sorted(set(drawn)))
 
 
 def evaluation_samples(
@@ -191,11 +193,7 @@ def true_depth(source: SceneSource, sample: Sample) -> Tensor | None:
         return None
     own = scene.cameras[[sample.input_frames[0], *sample.target_frames]].c2w
     ours = torch.cat([sample.inputs.cameras.c2w[0, :1], sample.targets.cameras.c2w[0]])
-    return depth * float(_extent(ours[:, :3, 3]) / _extent(own[:, :3, 3]))
-
-
-def _extent(centres: Tensor) -> Tensor:
-    return (centres - centres[0]).norm(dim=-1).amax()
+    return depth * float(largest_distance(ours) / largest_distance(own))
 
 
 def one_line(error: Exception) -> str:
@@ -234,7 +232,8 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
     return windows
 
 
-def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
+def _named(scene: Scene, index: EvaluationIndex) -> FrameChoice:
+    """The frames of `scene` that `index` names; raises ValueError where it lacks one."""
     entry = index[scene.name]
     assert entry is not None
     if scene.missing:
@@ -245,16 +244,6 @@ def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
         numbers = ", ".join(map(str, outside))
-        told = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
-        raise ValueError(f"{told} out of range, it has frames 0 to {len(scene) - 1}")
+        which = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
+        raise ValueError(f"{which} out of range, it has frames 0 to {len(scene) - 1}")
     return tuple(entry.context), tuple(entry.target)
-
-
-def _drawn(
-    scene: Scene, place: int, views: ViewsConfig, evaluation: EvaluationConfig
-) -> Iterator[FrameChoice]:
-    for k in range(evaluation.samples):
-        rng = np.random.default_rng([evaluation.seed, place, k])
-        inputs, drawn = draw_frames(scene, views, rng)
-        between = tuple(f for f in range(inputs[0], inputs[-1] + 1) if f not in inputs)
-        yield inputs, between or tuple(sorted(set(drawn)))

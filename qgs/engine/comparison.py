@@ -52,13 +52,12 @@ class Difference:
 
     def cells(self) -> list[str]:
         """A row of the table, one digit finer than an evaluation's."""
-        digits = self.column.digits + 1
-        interval = "–"
+        digits, interval = self.column.digits + 1, "–"
         if self.low is not None and self.high is not None:
             interval = f"[{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
-        means = f"{self.first:.{digits}f}", f"{self.second:.{digits}f}"
-        apart = f"{self.difference:+.{digits}f}"
-        return [self.column.title, *means, apart, interval, f"{self.wins} : {self.losses}"]
+        first, second = f"{self.first:.{digits}f}", f"{self.second:.{digits}f}"
+        apart, score = f"{self.difference:+.{digits}f}", f"{self.wins} : {self.losses}"
+        return [self.column.title, first, second, apart, interval, score]
 
 
 @dataclass(frozen=True)
@@ -80,13 +79,6 @@ class Comparison:
         """Shared scenes that were judged on different frames."""
         return [name for name in self.shared if self.first.frames[name] != self.second.frames[name]]
 
-    @property
-    def empty(self) -> list[str]:
-        """Headings of metrics that have no scene in both."""
-        compared = {difference.metric for difference in self.differences}
-        columns = {**self.first.columns, **self.second.columns}
-        return [column.heading for name, column in columns.items() if name not in compared]
-
     def record(self) -> dict[str, Any]:
         """Plain values for JSON. wanted: how many scenes the protocols name."""
         first, second = self.first, self.second
@@ -96,24 +88,24 @@ class Comparison:
             "same_protocol": self.same_protocol,
             "other_frames": self.other_frames,
             "differences": [asdict(difference) for difference in self.differences],
-            "wanted": max(first.wanted, second.wanted),
+            "wanted": self._wanted,
             "missing_first": list(first.missing),
             "missing_second": list(second.missing),
-            "null": self._null(),
+            "null": self._null,
             "only_first": self._only(first),
             "only_second": self._only(second),
-            "empty": self.empty,
+            "empty": self._empty,
         }
 
     @property
     def title(self) -> str:
         """Who is compared, over how many scenes."""
-        count, wanted = len(self.shared), max(self.first.wanted, self.second.wanted)
+        count = len(self.shared)
         scenes = f"{count} scene{'s' if count > 1 else ''}"
-        if count < wanted:
+        if count < self._wanted:
             missing = list(dict.fromkeys([*self.first.missing, *self.second.missing]))
             names = f" (missing: {listed(missing)})" if missing else ""
-            scenes = f"{count} of {wanted} scenes{names}"
+            scenes = f"{count} of {self._wanted} scenes{names}"
         return f"{self.first.name} against {self.second.name}, {scenes}"
 
     def rows(self) -> list[list[str]]:
@@ -124,19 +116,19 @@ class Comparison:
 
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
-        first, second, both = self.first, self.second, (self.first, self.second)
+        first, second = self.first, self.second
         yield (
             f"difference: {first.name} minus {second.name}, mean over scenes; interval: percentile "
             f"bootstrap over scenes, {RESAMPLES:,} resamples"
         )
         if len(self.shared) == 1:
             yield "one scene is too few for an interval"
-        yield from (
-            f"{r.name} is incomplete: no score of {listed(r.missing)}" for r in both if r.missing
-        )
-        if null := self._null():
-            yield null_entries(null)
-        for result in both:
+        for result in (first, second):
+            if result.missing:
+                yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
+        if self._null:
+            yield null_entries(self._null)
+        for result in (first, second):
             if only := self._only(result):
                 yield f"{len(only)} scenes only in {result.name}, left out: {listed(only)}"
         for d in self.differences:
@@ -144,15 +136,26 @@ class Comparison:
                 yield f"{d.column.heading}: over the {d.scenes} scenes that have it in both"
             if d.column.heading != (other := second.columns[d.metric].heading):
                 yield f"{d.column.heading} in {first.name} is {other} in {second.name}"
-        if self.empty:
-            yield f"not in both, left out: {', '.join(self.empty)}"
+        if self._empty:
+            yield f"not in both, left out: {', '.join(self._empty)}"
         if not self.same_protocol:
             yield "the protocols differ: the scores do not measure the same"
         if moved := self.other_frames:
             yield f"{len(moved)} scenes judged on different frames: {listed(moved)}"
 
+    @property
+    def _wanted(self) -> int:
+        return max(self.first.wanted, self.second.wanted)
+
+    @property
     def _null(self) -> list[str]:
         return list(dict.fromkeys([*self.first.null, *self.second.null]))
+
+    @property
+    def _empty(self) -> list[str]:
+        compared = {difference.metric for difference in self.differences}
+        columns = {**self.first.columns, **self.second.columns}
+        return [column.heading for name, column in columns.items() if name not in compared]
 
     def _only(self, result: StoredResults) -> list[str]:
         return [name for name in result.scenes if name not in self.shared]
@@ -212,7 +215,14 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
     pairs = []
     for other in others:
         if other.sha256 != first.sha256 and not across_protocols:
-            raise ValueError(_different_protocols(first, other))
+            keys = sorted({*first.protocol, *other.protocol})
+            unequal = [key for key in keys if first.protocol.get(key) != other.protocol.get(key)]
+            raise ValueError(
+                f"{first.name} was judged by {first.protocol_name} ({first.sha256[:12]}), "
+                f"{other.name} by {other.protocol_name} ({other.sha256[:12]}), which differ in "
+                f"{', '.join(unequal)}: evaluate both alike, or add --across-protocols to compare "
+                "them all the same"
+            )
         shared = [name for name in first.scenes if name in other.scenes]
         if not shared:
             raise ValueError(f"{first.name} and {other.name} have no scene in common")
@@ -263,26 +273,7 @@ def _difference(
     ours, theirs = (np.array([r.scenes[name][value] for name in both]) for r in (first, second))
     apart = ours - theirs
     better = apart if column.better == "higher" else -apart
+    wins, losses = int((better > 0).sum()), int((better < 0).sum())
+    means = (float(values.mean()) for values in (ours, theirs, apart))
     low, high = paired_interval(apart) or (None, None)
-    return Difference(
-        metric=metric,
-        column=column,
-        scenes=len(apart),
-        first=float(ours.mean()),
-        second=float(theirs.mean()),
-        difference=float(apart.mean()),
-        low=low,
-        high=high,
-        wins=int((better > 0).sum()),
-        losses=int((better < 0).sum()),
-    )
-
-
-def _different_protocols(first: StoredResults, other: StoredResults) -> str:
-    keys = sorted({*first.protocol, *other.protocol})
-    unequal = [key for key in keys if first.protocol.get(key) != other.protocol.get(key)]
-    return (
-        f"{first.name} was judged by {first.protocol_name} ({first.sha256[:12]}), {other.name} by "
-        f"{other.protocol_name} ({other.sha256[:12]}), which differ in {', '.join(unequal)}: "
-        "evaluate both alike, or add --across-protocols to compare them all the same"
-    )
+    return Difference(metric, column, len(both), *means, low, high, wins, losses)
