@@ -54,7 +54,7 @@ def bench(
 
     from qgs.cli.bench_tables import bench_tables, headline
     from qgs.composer import resolve
-    from qgs.engine.bench.run import Measures, Subject, refuse_other_file
+    from qgs.engine.bench.run import Subject, refuse_other_file
     from qgs.engine.bench.run import bench as measure
     from qgs.engine.bench.work import workload_of
     from qgs.engine.distributed import choose_device
@@ -70,9 +70,17 @@ def bench(
     work["device"] = choose_device(device, console.print)
     resolved = [(str(path), resolve(path, overrides or ())) for path in recipes]
     subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
-    measures = Measures(step, memory, renderer, rounds, warmup)
     with console.status("composing") as status:
-        report = measure(subjects, measures, overrides=overrides or (), say=status.update)
+        report = measure(
+            subjects,
+            step=step,
+            memory=memory,
+            renderer=renderer,
+            rounds=rounds,
+            warmup=warmup,
+            overrides=overrides or (),
+            say=status.update,
+        )
     console.print(headline(report), markup=False)
     for table in bench_tables(report):
         console.print(table)

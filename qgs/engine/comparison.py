@@ -273,7 +273,16 @@ def _difference(
     ours, theirs = (np.array([r.scenes[name][value] for name in both]) for r in (first, second))
     apart = ours - theirs
     better = apart if column.better == "higher" else -apart
-    wins, losses = int((better > 0).sum()), int((better < 0).sum())
-    means = (float(values.mean()) for values in (ours, theirs, apart))
     low, high = paired_interval(apart) or (None, None)
-    return Difference(metric, column, len(both), *means, low, high, wins, losses)
+    return Difference(
+        metric=metric,
+        column=column,
+        scenes=len(both),
+        first=float(ours.mean()),
+        second=float(theirs.mean()),
+        difference=float(apart.mean()),
+        low=low,
+        high=high,
+        wins=int((better > 0).sum()),
+        losses=int((better < 0).sum()),
+    )

@@ -18,7 +18,7 @@ from qgs.engine.results import TUNING, Evaluation, SceneScore, value_name
 from qgs.engine.tuning import tune, tuning_loss
 from qgs.metrics import gaussians_used, mean_colour, nearest_input
 from qgs.model import QueryGaussianModel
-from qgs.types import Gaussians
+from qgs.types import Gaussians, Views
 
 SECTIONS = ("data", "views", "evaluation", "metrics")
 """What of a recipe decides which views are judged, and how."""
@@ -147,13 +147,8 @@ class _Judge:
         """The score of `sample`. gaussians: (1, G), None to predict them here."""
         values: dict[str, float] = {}
         try:
-            inputs = sample.inputs.to(self._device)
-            if gaussians is None and self._tune:
-                tuning = self._tune(inputs)
-                gaussians = tuning.prediction.gaussians
-                values = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            elif gaussians is None:
-                gaussians = self._model(inputs).gaussians
+            if gaussians is None:
+                gaussians, values = self._predicted(sample.inputs.to(self._device))
             values = {**self._values(sample, gaussians), **values}
         except Exception as error:  # told, and never ends the other scenes
             return SceneFailure(sample.scene, one_line(error))
@@ -161,6 +156,14 @@ class _Judge:
         if broken:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
         return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
+
+    def _predicted(self, inputs: Views) -> tuple[Gaussians, dict[str, float]]:
+        """Gaussians (1, G), and TUNING where tokens are tuned before."""
+        if self._tune is None:
+            return self._model(inputs).gaussians, {}
+        tuning = self._tune(inputs)
+        ends = tuning.losses[0], tuning.losses[-1]
+        return tuning.prediction.gaussians, dict(zip(TUNING, ends, strict=True))
 
     def _values(self, sample: Sample, gaussians: Gaussians) -> dict[str, float]:
         """Everything measured on the Gaussians (1, G) of `sample`."""

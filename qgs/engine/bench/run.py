@@ -32,8 +32,7 @@ class Spread:
     @property
     def quartiles(self) -> tuple[float, float, float]:
         """Lower quartile, median, upper quartile."""
-        lower, median, upper = np.quantile(self.samples, (0.25, 0.5, 0.75)).tolist()
-        return lower, median, upper
+        return tuple(np.quantile(self.samples, (0.25, 0.5, 0.75)).tolist())
 
     def over(self, base: Spread) -> Spread:
         """Ratios to the samples that `base` has of the same rounds."""
@@ -42,22 +41,8 @@ class Spread:
 
     def as_json(self) -> dict[str, float]:
         """The quartiles by name."""
-        names = "lower_quartile", "median", "upper_quartile"
-        return dict(zip(names, self.quartiles, strict=True))
-
-
-@dataclass(frozen=True)
-class Measures:
-    """What is measured besides size and forward latency, and how often.
-
-    rounds: samples of each latency. warmup: calls before the first sample.
-    """
-
-    step: bool = False
-    memory: bool = False
-    renderer: bool = False
-    rounds: int = 10
-    warmup: int = 2
+        lower, median, upper = self.quartiles
+        return {"lower_quartile": lower, "median": median, "upper_quartile": upper}
 
 
 @dataclass(frozen=True)
@@ -141,54 +126,57 @@ def refuse_other_file(path: Path) -> None:
 
 def bench(
     subjects: Sequence[Subject],
-    measures: Measures,
     *,
+    step: bool = False,
+    memory: bool = False,
+    renderer: bool = False,
+    rounds: int = 10,
+    warmup: int = 2,
     overrides: Sequence[str] = (),
     say: Callable[[str], None] = lambda _: None,
 ) -> Report:
-    """Measure all `subjects`, which share device and precision.
+    """Measure size and forward latency of all `subjects`, which share device and precision.
 
     All models are in memory while latencies are measured, so that each round has all of them. They
-    have their initial weights. overrides: what the report says of them. `say` hears what is under
-    way. Raises ValueError as the models, losses and renderers do, ChildProcessError as
-    `peak_memory`.
+    have their initial weights. step, memory, renderer: what is measured besides. rounds: samples of
+    each latency. warmup: calls before the first sample. overrides: what the report says of them.
+    `say` hears what is under way. Raises ValueError as the models, losses and renderers do,
+    ChildProcessError as `peak_memory`.
     """
     threads = torch.get_num_threads()
-    remembered: list[Operation] = ["forward", "step"] if measures.step else ["forward"]
+    operations: list[Operation] = ["forward", "step"] if step else ["forward"]
     peaks: list[dict[Operation, Peak]] = [{} for _ in subjects]
     for subject, found in zip(subjects, peaks, strict=True):
-        for operation in remembered if measures.memory else ():
+        for operation in operations if memory else ():
             say(f"{subject.name}: memory of the {operation}")
             found[operation] = peak_memory(subject.recipe, operation, subject.workload, threads)
-
+    if renderer:
+        operations.insert(1, "render")  # the step is last, because it changes weights
     models = [subject.recipe.build_model(subject.workload.device) for subject in subjects]
-    weights = [[t.numel() * t.element_size() for t in m.state_dict().values()] for m in models]
-    wanted = {"forward": True, "render": measures.renderer, "step": measures.step}
     times: list[dict[Operation, Spread]] = [{} for _ in subjects]
-    for operation in (o for o, is_wanted in wanted.items() if is_wanted):  # step changes weights
+    for operation in operations:
         tasks = [
             make_task(operation, subject.recipe, model, subject.workload)
             for subject, model in zip(subjects, models, strict=True)
         ]
-        spreads = in_turn(tasks, measures.rounds, measures.warmup, say, f"{operation}: ")
+        spreads = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
         for column, spread in zip(times, spreads, strict=True):
             column[operation] = spread
-
     results = [
         Result(
             recipe=subject.name,
             workload=subject.workload,
             queries=model.queries.count,
             gaussians=model.queries.count * model.head.gaussians_per_query,
-            parameters=sum(parameter.numel() for parameter in model.parameters()),
-            weight_bytes=sum(weights[index]),
-            times=times[index],
-            peaks=peaks[index],
+            parameters=sum(p.numel() for p in model.parameters()),
+            weight_bytes=sum(t.numel() * t.element_size() for t in model.state_dict().values()),
+            times=seconds,
+            peaks=peak,
         )
-        for index, (subject, model) in enumerate(zip(subjects, models, strict=True))
+        for subject, model, seconds, peak in zip(subjects, models, times, peaks, strict=True)
     ]
     machine = describe(subjects[0].workload.device, threads)
-    return Report(results, machine, overrides, measures.rounds, measures.warmup)
+    return Report(results, machine, overrides, rounds, warmup)
 
 
 def in_turn(
