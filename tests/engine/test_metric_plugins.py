@@ -65,6 +65,8 @@ class DepthError(Metric):
     column: ClassVar[Column] = Column("depth error", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
+        assert given.depth is not None
+        assert given.true_depth is not None
         return given.depth - given.true_depth
 
 
