@@ -73,7 +73,7 @@ class Metric(Component, torch.nn.Module):
     are: change it when values change. not_in_protocol: options that change no value, such as where
     a file lies. needs: parts of the input that must not be None; where one is, there is no value.
     column: how the value is shown. unavailable: set by `__init__` to the reason why there are no
-    values on this machine, such as a missing file of weights; evaluations tell it.
+    values on this machine, such as a missing file of weights; evaluations show it.
     """
 
     slot: ClassVar[str] = "metrics"
@@ -88,7 +88,7 @@ class Metric(Component, torch.nn.Module):
         self.config = config
 
     def columns(self) -> Mapping[str, Column]:
-        """How values are shown, by key; for metrics with several, or with options that tell.
+        """How values are shown, by key. Override it for several values, or headings by option.
 
         A value is called as the recipe calls the metric, with `_KEY` behind unless the key is "".
         """

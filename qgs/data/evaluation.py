@@ -41,7 +41,7 @@ EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
 GIVEN = "frames as context and as target"
-"""What `given_targets` are, in words; no score tells anything about them."""
+"""What `given_targets` are, in words; a score on them means nothing."""
 
 
 def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
@@ -148,7 +148,7 @@ class EvaluationPlan:
                 scene = self._scenes[place]
                 for frames in self._choices(scene, place):
                     yield make_sample(scene, *frames, self._views, mirror=False)
-            except Exception as error:  # whatever a reader raises is told, and never ends the rest
+            except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 
     def _choices(self, scene: Scene, place: int) -> Iterator[FrameChoice]:

@@ -80,32 +80,38 @@ class Comparison:
         return [name for name in self.shared if self.first.frames[name] != self.second.frames[name]]
 
     def record(self) -> dict[str, Any]:
-        """Plain values for JSON. wanted: how many scenes the protocols name."""
+        """Plain values for JSON.
+
+        wanted: how many scenes the protocols name. null: scenes that an index lists without frames.
+        only: scenes that one alone judged. empty: headings of metrics that have no scene in both.
+        """
         first, second = self.first, self.second
+        compared = {difference.metric for difference in self.differences}
+        columns = {**first.columns, **second.columns}
         return {
             "first": first.name,
             "second": second.name,
             "same_protocol": self.same_protocol,
             "other_frames": self.other_frames,
             "differences": [asdict(difference) for difference in self.differences],
-            "wanted": self._wanted,
+            "wanted": max(first.wanted, second.wanted),
             "missing_first": list(first.missing),
             "missing_second": list(second.missing),
-            "null": self._null,
-            "only_first": self._only(first),
-            "only_second": self._only(second),
-            "empty": self._empty,
+            "null": list(dict.fromkeys([*first.null, *second.null])),
+            "only_first": [name for name in first.scenes if name not in self.shared],
+            "only_second": [name for name in second.scenes if name not in self.shared],
+            "empty": [column.heading for name, column in columns.items() if name not in compared],
         }
 
     @property
     def title(self) -> str:
         """Who is compared, over how many scenes."""
-        count = len(self.shared)
+        count, wanted = len(self.shared), max(self.first.wanted, self.second.wanted)
         scenes = f"{count} scene{'s' if count > 1 else ''}"
-        if count < self._wanted:
+        if count < wanted:
             missing = list(dict.fromkeys([*self.first.missing, *self.second.missing]))
             names = f" (missing: {listed(missing)})" if missing else ""
-            scenes = f"{count} of {self._wanted} scenes{names}"
+            scenes = f"{count} of {wanted} scenes{names}"
         return f"{self.first.name} against {self.second.name}, {scenes}"
 
     def rows(self) -> list[list[str]]:
@@ -116,7 +122,7 @@ class Comparison:
 
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
-        first, second = self.first, self.second
+        first, second, facts = self.first, self.second, self.record()
         yield (
             f"difference: {first.name} minus {second.name}, mean over scenes; interval: percentile "
             f"bootstrap over scenes, {RESAMPLES:,} resamples"
@@ -126,39 +132,22 @@ class Comparison:
         for result in (first, second):
             if result.missing:
                 yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
-        if self._null:
-            yield null_entries(self._null)
-        for result in (first, second):
-            if only := self._only(result):
+        if facts["null"]:
+            yield null_entries(facts["null"])
+        for result, only in ((first, facts["only_first"]), (second, facts["only_second"])):
+            if only:
                 yield f"{len(only)} scenes only in {result.name}, left out: {listed(only)}"
         for d in self.differences:
             if d.scenes < len(self.shared):
                 yield f"{d.column.heading}: over the {d.scenes} scenes that have it in both"
             if d.column.heading != (other := second.columns[d.metric].heading):
                 yield f"{d.column.heading} in {first.name} is {other} in {second.name}"
-        if self._empty:
-            yield f"not in both, left out: {', '.join(self._empty)}"
+        if facts["empty"]:
+            yield f"not in both, left out: {', '.join(facts['empty'])}"
         if not self.same_protocol:
             yield "the protocols differ: the scores do not measure the same"
         if moved := self.other_frames:
             yield f"{len(moved)} scenes judged on different frames: {listed(moved)}"
-
-    @property
-    def _wanted(self) -> int:
-        return max(self.first.wanted, self.second.wanted)
-
-    @property
-    def _null(self) -> list[str]:
-        return list(dict.fromkeys([*self.first.null, *self.second.null]))
-
-    @property
-    def _empty(self) -> list[str]:
-        compared = {difference.metric for difference in self.differences}
-        columns = {**self.first.columns, **self.second.columns}
-        return [column.heading for name, column in columns.items() if name not in compared]
-
-    def _only(self, result: StoredResults) -> list[str]:
-        return [name for name in result.scenes if name not in self.shared]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ SECTIONS = ("data", "views", "evaluation", "metrics")
 """What of a recipe decides which views are judged, and how."""
 
 Observer = Callable[[int, int], None]
-"""Told how many scenes are done, and how many there are."""
+"""Called with how many scenes are done, and how many there are."""
 
 
 def evaluate(
@@ -36,11 +36,11 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
-    A scene that fails is told in the result and does not end the evaluation. Samples are decoded
-    one at a time. Leaves the model in the mode it was in.
+    A scene that fails is named in the result with the reason, and the others go on. Samples are
+    decoded one at a time. Leaves the model in the mode it was in.
 
     step: optimiser steps behind the weights. batch: scenes that pass through the model together;
-    tuned tokens pass alone. observe: see `Observer`.
+    with tuned tokens each passes alone. observe: see `Observer`.
     Raises what opening the data source or the index raises, and ValueError when no scene at all
     could be judged, `batch` is less than 1, or two values of metrics have one name.
     """
@@ -135,7 +135,7 @@ class _Judge:
             try:
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
                 gaussians = self._model(inputs).gaussians
-            except Exception:  # one of them is to blame: each again by itself tells whose
+            except Exception:  # run each by itself, to see which one fails
                 pass
             else:
                 return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
@@ -150,7 +150,7 @@ class _Judge:
             if gaussians is None:
                 gaussians, values = self._predicted(sample.inputs.to(self._device))
             values = {**self._values(sample, gaussians), **values}
-        except Exception as error:  # told, and never ends the other scenes
+        except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         if broken:
@@ -233,20 +233,16 @@ def _merged(samples: Sequence[SceneScore]) -> SceneScore:
 
 def _held_out(source: SceneSource, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
     """Held-out frames that were targets, and all of them, over the scenes that were judged."""
-    judged = {
-        score.scene: {frame for _, targets in score.views for frame in targets} for score in scores
-    }
-    scenes, count, total = source.scenes("test"), 0, 0
-    for place, name in enumerate(source.names("test")):
-        if name in judged:
-            held_out = set(scenes[place].held_out)
-            count += len(judged[name] & held_out)
-            total += len(held_out)
+    judged = {score.scene: {f for _, targets in score.views for f in targets} for score in scores}
+    scenes, names = source.scenes("test"), enumerate(source.names("test"))
+    held_out = {name: set(scenes[place].held_out) for place, name in names if name in judged}
+    count = sum(len(judged[name] & frames) for name, frames in held_out.items())
+    total = sum(map(len, held_out.values()))
     return (count, total) if total else None
 
 
 def _without_folder(reason: str, recipe: Recipe) -> str:
-    """`reason` with files told below the data's folder, so that results do not depend on it."""
+    """`reason` with paths relative to the data's folder, so that results do not depend on it."""
     path = recipe.tree["data"].get("path")
     folders = [path, str(Path(path).expanduser().resolve())] if isinstance(path, str) else []
     for folder in folders:

@@ -43,7 +43,7 @@ class Protocol:
         return f"{self.name} ({self.sha256[:12]})"
 
     def settings(self) -> dict[str, Any]:
-        """`content` with the index, which may be long, told by its size and hash."""
+        """`content` with size and hash in place of the index, which may be long."""
         index = self.content["views"].get("index")
         if index is None:
             return dict(self.content)
@@ -63,7 +63,7 @@ def protocol_of(
 ) -> Protocol:
     """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
 
-    With an index the kind of data, how it is split, and options at their defaults say nothing, so
+    With an index the kind of data, how it is split, and options at their defaults are left out, so
     that one data set in two formats has one protocol.
     """
     evaluation, config = recipe.evaluation, recipe.parts["data",].config

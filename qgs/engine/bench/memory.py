@@ -26,7 +26,7 @@ class Peak:
 
 
 def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
-    """Build the model in a fresh process, run `operation` there, and tell the peak.
+    """Build the model in a fresh process, run `operation` there, and return the peak.
 
     Raises ChildProcessError, with what the process said last, when it failed or was killed.
     """
