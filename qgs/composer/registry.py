@@ -10,7 +10,7 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -31,163 +31,6 @@ from qgs.contracts import (
     WeightLayout,
 )
 
-
-def file_of(component: type) -> str | None:
-    """The file that defines a class; None for one that was defined in no file."""
-    return getattr(sys.modules.get(component.__module__), "__file__", None)
-
-
-def package_of(file: str) -> Path:
-    """The outermost package folder that holds the module `file`, or the file itself."""
-    path = Path(file).resolve()
-    while (path.parent / "__init__.py").exists():
-        path = path.parent
-    return path
-
-
-def package_named(module: str) -> list[Path]:
-    """The folder, or the file, of the outermost package of `module`, which need not import."""
-    try:
-        spec = find_spec(module.partition(".")[0])
-    except (ImportError, ValueError):
-        return []
-    return [package_of(spec.origin)] if spec and spec.origin else []
-
-
-def lies_in(file: str, root: Path) -> bool:
-    """Whether `file` is `root` or below it."""
-    path = Path(file).resolve()
-    return path == root or root in path.parents
-
-
-def place_of(function: Callable[..., Any]) -> str:
-    """FILE:LINE where a function starts; "" for one that is not written in Python."""
-    code = getattr(inspect.unwrap(function), "__code__", None)
-    return f"{code.co_filename}:{code.co_firstlineno}" if code else ""
-
-
-def place_in(error: BaseException, roots: Iterable[Path]) -> str:
-    """FILE:LINE of the last place below one of `roots` that `error` passed; "" for none."""
-    frames = traceback.extract_tb(error.__traceback__)
-    passed = [(frame.filename, frame.lineno) for frame in frames]
-    if isinstance(error, SyntaxError) and error.filename:
-        passed.append((error.filename, error.lineno))
-    roots = list(roots)
-    own = [place for place in passed if any(lies_in(place[0], root) for root in roots)]
-    return "{}:{}".format(*own[-1]) if own else ""
-
-
-NAME = re.compile(r"[^\s/]+")
-"""Of a component: `type: PLUGIN/NAME` must be read as it was written."""
-
-DEVICES = ("cpu", "cuda")
-"""Types of the devices that a renderer can render on."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """reason: what a plugin does wrong, as the rest of "the plugin X ...".
-
-    fix: what its user can do, "" for no more than to update it.
-    """
-
-    reason: str
-    fix: str = ""
-
-
-def plugin_fault(plugin: object, name: str) -> Fault | None:
-    """The first fault of what the entry point `name` leads to; None for a sound plugin."""
-    if not isinstance(plugin, Plugin):
-        kind = type(plugin).__name__
-        return Fault(f"is no qgs.Plugin: its entry point leads to an object of type {kind}")
-    return next(_faults(plugin, name), None)
-
-
-def _faults(plugin: Plugin, name: str) -> Iterator[Fault]:
-    version: object = plugin.contract_version
-    if type(version) is not int:
-        yield Fault(f"must give `contract_version` as a whole number, not {version!r}")
-    elif version != CONTRACT_VERSION:
-        yield _other_contracts(version)
-    if plugin.name != name:
-        yield Fault(f"calls itself `{plugin.name}`; the two names must be one")
-    for attribute in ("components", "layouts", "examples"):
-        value = getattr(plugin, attribute)
-        if not isinstance(value, Sequence):
-            comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
-            yield Fault(f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}")
-            return
-    if not plugin.components and not plugin.layouts:
-        yield Fault("is empty: it lists neither `components` nor `layouts`")
-    if not isinstance(plugin.exemptions, Mapping):
-        yield Fault(f"must give `exemptions` as a mapping, not {plugin.exemptions!r}")
-    yield from _component_faults(plugin.components)
-    for layout in plugin.layouts:
-        if not isinstance(layout, WeightLayout):
-            yield Fault(f"lists {layout!r}, which is no WeightLayout")
-
-
-def _other_contracts(version: int) -> Fault:
-    reason = f"was written for contract version {version}; this qgs has version {CONTRACT_VERSION}"
-    newer = version > CONTRACT_VERSION
-    return Fault(reason, "update qgs, or do without the plugin" if newer else "")
-
-
-def _component_faults(components: Sequence[object]) -> Iterator[Fault]:
-    taken: set[tuple[str, str]] = set()
-    for component in components:
-        reason = component_fault(component)
-        if reason:
-            yield Fault(f"lists {getattr(component, '__qualname__', repr(component))}, {reason}")
-            return
-        assert inspect.isclass(component)
-        assert issubclass(component, Component)
-        if (component.slot, component.name) in taken:
-            yield Fault(f"registers `{component.name}` twice in the slot `{component.slot}`")
-        taken.add((component.slot, component.name))
-
-
-def component_fault(component: object) -> str:
-    """Why nothing can be built of `component`; "" if it can."""
-    if not (inspect.isclass(component) and issubclass(component, Component)):
-        return "which is no qgs component"
-    slot = SLOTS.get(getattr(component, "slot", ""))
-    if slot is None or not issubclass(component, slot.contract):
-        return "which implements no slot's contract"
-    name = getattr(component, "name", None)
-    if not isinstance(name, str):
-        return "which has no `name`"
-    if not NAME.fullmatch(name):
-        return f"whose name {name!r} is empty or has a slash or a blank"
-    if inspect.isabstract(component):
-        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
-    if issubclass(component, Renderer) and not _are_devices(component.devices):
-        return f"whose `devices` is {component.devices!r}; give some of {DEVICES} as a tuple"
-    return _config_fault(component.Config)
-
-
-def _are_devices(given: object) -> bool:
-    return isinstance(given, tuple) and bool(given) and all(name in DEVICES for name in given)
-
-
-def _config_fault(config: object) -> str:
-    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
-        return "whose Config is no ComponentConfig"
-    if "type" in config.model_fields:
-        return "whose Config has an option `type`, which names the component itself"
-    return _schema_fault(config)
-
-
-@cache
-def _schema_fault(config: type[ComponentConfig]) -> str:
-    try:
-        config.model_json_schema()
-    except Exception as error:
-        told = str(error).splitlines()[0]
-        return f"whose Config has options that YAML cannot express: {told}"
-    return ""
-
-
 BUILTIN = Plugin(
     name="qgs",
     contract_version=CONTRACT_VERSION,
@@ -205,6 +48,10 @@ BUILTIN = Plugin(
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
     ),
 )
+NAME = re.compile(r"[^\s/]+")
+"""Of a component: `type: PLUGIN/NAME` must be read as it was written."""
+DEVICES = ("cpu", "cuda")
+"""Types of the devices that a renderer can render on."""
 
 
 class PluginError(ValueError):
@@ -254,14 +101,203 @@ class Registry:
         }
 
 
+def builtin() -> InstalledPlugin:
+    """The plugin `qgs`."""
+    return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
+
+
+def not_installed(plugin: Plugin) -> InstalledPlugin:
+    """A plugin that came with no distribution."""
+    return InstalledPlugin(plugin, "", "0")
+
+
+def available_plugins() -> dict[str, list[EntryPoint]]:
+    """Name to entry points of every installed plugin, by metadata alone."""
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        found.setdefault(entry.name, []).append(entry)
+    return found
+
+
+def load_registry(names: Iterable[str]) -> Registry:
+    """The built-in components and those of the plugins `names`; raises PluginError."""
+    return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
+
+
+def load_sound_plugins() -> tuple[Registry, list[str]]:
+    """The components of every installed plugin that can be used, and why the others cannot."""
+    plugins, broken = {"qgs": builtin()}, []
+    available = available_plugins()
+    for entry in available.pop(BUILTIN.name, []):
+        reason = f"{_release(entry)} offers a plugin `qgs`, the framework's own name"
+        broken.append(f"{reason}; uninstall {_release(entry)}")
+    for name in sorted(available):
+        try:
+            plugins[name] = load_plugin(name)
+        except PluginError as error:
+            broken.append(str(error))
+    return Registry(plugins), broken
+
+
+def plugin_versions(names: Iterable[str]) -> dict[str, str]:
+    """Plugin name to the version of its distribution, `qgs` included; raises PluginError."""
+    return {name: plugin.version for name, plugin in load_registry(names).plugins.items()}
+
+
+def load_plugin(name: str) -> InstalledPlugin:
+    """Import and check the plugin `name`; raises PluginError."""
+    if name == BUILTIN.name:
+        return builtin()
+    available = available_plugins()
+    entries = available.get(name, [])
+    if not entries:
+        installed = ", ".join(sorted(available)) or "none"
+        raise PluginError(
+            f"no installed distribution offers a plugin `{name}`",
+            f"install the one that does; installed plugins: {installed}",
+        )
+    if len(entries) > 1:
+        releases = ", ".join(sorted(map(_release, entries)))
+        raise PluginError(
+            f"several distributions offer a plugin `{name}`: {releases}",
+            "uninstall all of them but one",
+        )
+    entry = entries[0]
+    try:
+        plugin = entry.load()
+    except (Exception, SystemExit) as error:
+        place = place_in(error, package_named(entry.module))
+        raise PluginError(
+            f"the plugin `{name}` of {_release(entry)} cannot be imported from "
+            f"`{entry.value}`: {type(error).__name__}: {error}{f' (at {place})' if place else ''}",
+            f"{_import_fix(entry, error, place)}, or do without the plugin",
+        ) from error
+    fault = next(_plugin_faults(plugin, name), "")
+    if fault:
+        newer = isinstance(plugin, Plugin) and _is_newer(plugin.contract_version)
+        fix = "update qgs" if newer else _repair(entry)
+        raise PluginError(
+            f"the plugin `{name}` of {_release(entry)} {fault}", f"{fix}, or do without the plugin"
+        )
+    assert entry.dist is not None
+    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, _is_editable(entry))
+
+
+def _import_fix(entry: EntryPoint, error: BaseException, place: str) -> str:
+    missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+    if missing == entry.module:
+        return f"install {_release(entry)} again, its files are gone"
+    package = missing.partition(".")[0]
+    if package not in ("", "qgs", entry.module.partition(".")[0]):
+        return f"install `{package}`, which {_release(entry)} needs"
+    return _repair(entry, place)
+
+
+def _repair(entry: EntryPoint, place: str = "") -> str:
+    """place: FILE:LINE of what is wrong, "" where only the entry point leads there."""
+    return (
+        f"mend {place or f'`{entry.value}`'}"
+        if _is_editable(entry)
+        else f"update {_release(entry)}"
+    )
+
+
+def _is_editable(entry: EntryPoint) -> bool:
+    """Whether it was installed with `pip install -e`: the record of its origin (PEP 610)."""
+    record = entry.dist.read_text("direct_url.json") if entry.dist else None
+    return bool(json.loads(record or "{}").get("dir_info", {}).get("editable"))
+
+
+def _release(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
+
+
+def _is_newer(version: object) -> bool:
+    return type(version) is int and version > CONTRACT_VERSION
+
+
+def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
+    """What is wrong with what the entry point `name` leads to, as the rest of "the plugin X ..."."""
+    if not isinstance(plugin, Plugin):
+        kind = type(plugin).__name__
+        yield f"is no qgs.Plugin: its entry point leads to an object of type {kind}"
+        return
+    version: object = plugin.contract_version
+    if type(version) is not int:
+        yield f"must give `contract_version` as a whole number, not {version!r}"
+    elif version != CONTRACT_VERSION:
+        known = f"this qgs has version {CONTRACT_VERSION}"
+        yield f"was written for contract version {version}; {known}"
+    if plugin.name != name:
+        yield f"calls itself `{plugin.name}`; the two names must be one"
+    for attribute in ("components", "layouts", "examples"):
+        value = getattr(plugin, attribute)
+        if not isinstance(value, Sequence):
+            comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
+            yield f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}"
+            return
+    if not plugin.components and not plugin.layouts:
+        yield "is empty: it lists neither `components` nor `layouts`"
+    if not isinstance(plugin.exemptions, Mapping):
+        yield f"must give `exemptions` as a mapping, not {plugin.exemptions!r}"
+    taken: set[tuple[str, str]] = set()
+    for component in plugin.components:
+        fault = component_fault(component)
+        if fault:
+            yield f"lists {getattr(component, '__qualname__', repr(component))}, {fault}"
+            return
+        if (component.slot, component.name) in taken:
+            yield f"registers `{component.name}` twice in the slot `{component.slot}`"
+        taken.add((component.slot, component.name))
+    for layout in plugin.layouts:
+        if not isinstance(layout, WeightLayout):
+            yield f"lists {layout!r}, which is no WeightLayout"
+
+
+def component_fault(component: object) -> str:
+    """Why nothing can be built of `component`; "" if it can."""
+    if not (inspect.isclass(component) and issubclass(component, Component)):
+        return "which is no qgs component"
+    slot = SLOTS.get(getattr(component, "slot", ""))
+    if slot is None or not issubclass(component, slot.contract):
+        return "which implements no slot's contract"
+    name = getattr(component, "name", None)
+    if not isinstance(name, str):
+        return "which has no `name`"
+    if not NAME.fullmatch(name):
+        return f"whose name {name!r} is empty or has a slash or a blank"
+    if inspect.isabstract(component):
+        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
+    if issubclass(component, Renderer):
+        given: object = component.devices
+        if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
+            return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
+    config: object = component.Config
+    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
+        return "whose Config is no ComponentConfig"
+    if "type" in config.model_fields:
+        return "whose Config has an option `type`, which names the component itself"
+    return _schema_fault(config)
+
+
+@cache
+def _schema_fault(config: type[ComponentConfig]) -> str:
+    try:
+        config.model_json_schema()
+    except Exception as error:
+        first_line = str(error).splitlines()[0]
+        return f"whose Config has options that YAML cannot express: {first_line}"
+    return ""
+
+
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """The options that `component` has by default; None if they do not make a Config."""
+    """The options that `component` has by default.
+
+    None if an option must be given, or if a plugin's own validator fails.
+    """
     try:
         return component.Config()
-    except (
-        Exception,
-        SystemExit,
-    ):  # an option must be given, or the code of a stranger's validator fails
+    except (Exception, SystemExit):
         return None
 
 
@@ -291,116 +327,45 @@ def component_failure(
     return component_error(installed, fault, place_in(error, roots))
 
 
-def builtin() -> InstalledPlugin:
-    """The plugin `qgs`."""
-    return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
+def file_of(component: type) -> str | None:
+    """The file that defines a class; None for one that was defined in no file."""
+    return getattr(sys.modules.get(component.__module__), "__file__", None)
 
 
-def not_installed(plugin: Plugin) -> InstalledPlugin:
-    """A plugin that came with no distribution."""
-    return InstalledPlugin(plugin, "", "0")
+def package_of(file: str) -> Path:
+    """The outermost package folder that holds the module `file`, or the file itself."""
+    path = Path(file).resolve()
+    while (path.parent / "__init__.py").exists():
+        path = path.parent
+    return path
 
 
-def available_plugins() -> dict[str, list[EntryPoint]]:
-    """Name to entry points of every installed plugin, by metadata alone."""
-    found: dict[str, list[EntryPoint]] = {}
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        found.setdefault(entry.name, []).append(entry)
-    return found
-
-
-def load_plugin(name: str) -> InstalledPlugin:
-    """Import and check the plugin `name`; raises PluginError."""
-    if name == BUILTIN.name:
-        return builtin()
-    entries = available_plugins().get(name, [])
-    if not entries:
-        raise PluginError(
-            f"no installed distribution offers a plugin `{name}`",
-            f"install the one that does; installed plugins: {_names(available_plugins())}",
-        )
-    if len(entries) > 1:
-        raise PluginError(
-            f"several distributions offer a plugin `{name}`: "
-            f"{', '.join(sorted(map(_release, entries)))}",
-            "uninstall all of them but one",
-        )
-    return _load(entries[0])
-
-
-def load_registry(names: Iterable[str]) -> Registry:
-    """The built-in components and those of the plugins `names`; raises PluginError."""
-    return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
-
-
-def load_sound_plugins() -> tuple[Registry, list[str]]:
-    """The components of every installed plugin that can be used, and why the others cannot."""
-    plugins, broken = {"qgs": builtin()}, []
-    available = available_plugins()
-    for entry in available.pop(BUILTIN.name, []):
-        broken.append(
-            f"{_release(entry)} offers a plugin `qgs`, the framework's own name; "
-            f"uninstall {_release(entry)}"
-        )
-    for name in sorted(available):
-        try:
-            plugins[name] = load_plugin(name)
-        except PluginError as error:
-            broken.append(str(error))
-    return Registry(plugins), broken
-
-
-def plugin_versions(names: Iterable[str]) -> dict[str, str]:
-    """Plugin name to the version of its distribution, `qgs` included; raises PluginError."""
-    return {name: plugin.version for name, plugin in load_registry(names).plugins.items()}
-
-
-def _load(entry: EntryPoint) -> InstalledPlugin:
-    distribution = _release(entry)
+def package_named(module: str) -> list[Path]:
+    """The folder, or the file, of the outermost package of `module`, which need not import."""
     try:
-        plugin = entry.load()
-    except (Exception, SystemExit) as error:
-        place = place_in(error, package_named(entry.module))
-        raise PluginError(
-            f"the plugin `{entry.name}` of {distribution} cannot be imported from "
-            f"`{entry.value}`: {type(error).__name__}: {error}{f' (at {place})' if place else ''}",
-            _import_fix(entry, error, place),
-        ) from error
-    fault = plugin_fault(plugin, entry.name)
-    if fault:
-        reason = f"the plugin `{entry.name}` of {distribution} {fault.reason}"
-        raise PluginError(reason, fault.fix or _repair(entry))
-    assert entry.dist is not None
-    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, _is_editable(entry.dist))
+        spec = find_spec(module.partition(".")[0])
+    except (ImportError, ValueError):
+        return []
+    return [package_of(spec.origin)] if spec and spec.origin else []
 
 
-def _import_fix(entry: EntryPoint, error: BaseException, place: str) -> str:
-    release = _release(entry)
-    missing = error.name if isinstance(error, ModuleNotFoundError) else None
-    if missing == entry.module:
-        return f"install {release} again, its files are gone; or do without the plugin"
-    package = (missing or "").partition(".")[0]
-    if package and package not in ("qgs", entry.module.partition(".")[0]):
-        return f"install `{package}`, which {release} needs, or do without the plugin"
-    return _repair(entry, place)
+def lies_in(file: str, root: Path) -> bool:
+    """Whether `file` is `root` or below it."""
+    return Path(file).resolve().is_relative_to(root)
 
 
-def _repair(entry: EntryPoint, place: str = "") -> str:
-    """place: FILE:LINE of what is wrong, "" where only the entry point leads there."""
-    if entry.dist and _is_editable(entry.dist):
-        return f"mend {place or f'`{entry.value}`'}, or do without the plugin"
-    return f"update {_release(entry)}, or do without the plugin"
+def place_of(function: Callable[..., Any]) -> str:
+    """FILE:LINE where a function starts; "" for one that is not written in Python."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    return f"{code.co_filename}:{code.co_firstlineno}" if code else ""
 
 
-def _is_editable(distribution: Distribution) -> bool:
-    """Whether it was installed with `pip install -e`: the record of its origin (PEP 610)."""
-    origin = json.loads(distribution.read_text("direct_url.json") or "{}")
-    return bool(origin.get("dir_info", {}).get("editable"))
-
-
-def _release(entry: EntryPoint) -> str:
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
-
-
-def _names(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names)) or "none"
+def place_in(error: BaseException, roots: Iterable[Path]) -> str:
+    """FILE:LINE of the last place below one of `roots` that `error` passed; "" for none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    passed = [(frame.filename, frame.lineno) for frame in frames]
+    if isinstance(error, SyntaxError) and error.filename:
+        passed.append((error.filename, error.lineno))
+    roots = list(roots)
+    own = [place for place in passed if any(lies_in(place[0], root) for root in roots)]
+    return "{}:{}".format(*own[-1]) if own else ""

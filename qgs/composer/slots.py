@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from qgs.composer.nodes import KeyPath, MapNode, Node, ScalarNode, is_null
+from qgs.composer.nodes import KeyPath, MapNode
 from qgs.contracts import (
     Centers,
     Component,
@@ -75,11 +75,24 @@ class Section:
 
 
 DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
-
 SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
 }
+
+
+_SCHEDULE = ("learning_rate", "warmup", "initial_divisor", "final_divisor")
+MOVED = {
+    "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
+    "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",
+    "evaluation.lpips_weights": "metrics: {lpips: {type: qgs/lpips, weights: ...}}",
+    **{
+        f"training.{name}": f"optimizer: {{{name}: ...}}"
+        for name in (*_SCHEDULE, "betas", "weight_decay")
+    },
+    "qgs/rooms": "type: rooms/procedural` and, at the top, `plugins: [rooms]",
+}
+"""Keys and types that older recipes have, and what to write in their place."""
 
 
 def slot_at(path: KeyPath) -> Slot | None:
@@ -87,24 +100,19 @@ def slot_at(path: KeyPath) -> Slot | None:
     match path:
         case ("model", name) if name in MODEL_SLOTS:
             return SLOTS[name]
-        case ("model", "decoder", name) if name in LAYER_SLOTS:
-            return SLOTS[name]
-        case ("model", "decoder", "layers", _, name) if name in LAYER_SLOTS:
-            return SLOTS[name]
-        case (name,) if name in SECTIONS and not SECTIONS[name].named:
-            return SLOTS[name]
-        case (name, _) if name in SECTIONS and SECTIONS[name].named:
+        case ("model", "decoder", name) | ("model", "decoder", "layers", _, name):
+            return SLOTS[name] if name in LAYER_SLOTS else None
+        case (name, *below) if name in SECTIONS and len(below) == SECTIONS[name].named:
             return SLOTS[name]
     return None
 
 
-def type_at(node: Node | None, path: KeyPath) -> Any:
+def type_at(node: Any, path: KeyPath) -> Any:
     """The `type` of the component written as `node` at `path`: its own, or the slot's default.
 
     `type: null` leaves the default, as `null` does in place of a component.
     """
-    if isinstance(node, MapNode) and not is_null(node.items.get("type")):
-        written = node.items["type"]
-        return written.value if isinstance(written, ScalarNode) else written
+    if isinstance(node, MapNode) and node.get("type") is not None:
+        return node["type"]
     slot = slot_at(path)
     return slot.default if slot else None

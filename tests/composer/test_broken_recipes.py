@@ -264,7 +264,7 @@ def test_one_message_says_it_all(name, write, spatial):
     with pytest.raises(RecipeError) as caught:
         resolve(write(text))
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", line, path)
+    assert (problem.file, problem.line, problem.option) == ("recipe.yaml", line, path)
     assert reason in problem.reason
     assert fix in problem.fix
     for words in (f"recipe.yaml:{line}", path, problem.reason, problem.fix):
@@ -284,7 +284,7 @@ def test_all_errors_come_together_sorted_by_line(write, spatial):
     """)
     with pytest.raises(RecipeError) as caught:
         resolve(recipe, ["model.head.norm=3"])
-    found = [(problem.file, problem.line, problem.path) for problem in caught.value.problems]
+    found = [(problem.file, problem.line, problem.option) for problem in caught.value.problems]
     assert found == [
         ("--set #1", 0, "model.head.norm"),
         ("recipe.yaml", 2, "plugins.0"),
