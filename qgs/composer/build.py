@@ -82,7 +82,7 @@ def _assemble(
         for known, built in shared:
             if known.component is chosen.component and known.config == chosen.config:
                 return built
-        built = build(chosen, dims)
+        built = build(chosen, *(dims,) if issubclass(chosen.component, ModelComponent) else ())
         if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
             shared.append((chosen, built))
         return built
@@ -113,16 +113,15 @@ def _assemble(
     )
 
 
-def build(chosen: Chosen, dims: ModelDims | None = None) -> Any:
-    """The component itself. dims: for components of the model; its state is checked once.
+def build(chosen: Chosen, *arguments: Any) -> Any:
+    """The component itself. arguments: what its constructor takes besides its Config.
 
     What a plugin's constructor raises is reported with its distribution. Missing packages, and
     data that cannot be opened, are for the user to put right, and raised as they are.
     """
     component: Any = chosen.component
-    sizes = (dims,) if issubclass(component, ModelComponent) else ()
     try:
-        built = component(chosen.config, *sizes)
+        built = component(chosen.config, *arguments)
     except MissingExtraError:
         raise
     except Exception as error:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Literal, TypeAlias, get_args, get_origin
+from contextlib import suppress
+from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
@@ -17,19 +18,14 @@ from qgs.composer.registry import (
 )
 from qgs.composer.slots import LAYER_SLOTS
 from qgs.composer.yaml_text import inline
-from qgs.contracts import (
-    MEMORY_FIELDS,
+from qgs.contracts import MEMORY_FIELDS, Encoder, Queries, Refinement, Renderer, Supervision
+from qgs.contracts.component import (
     Component,
     ComponentConfig,
-    Encoder,
     Fields,
     FieldSpec,
     Problem,
-    Queries,
     RecipeContext,
-    Refinement,
-    Renderer,
-    Supervision,
 )
 
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
@@ -105,23 +101,27 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
     """
     steps = list(_execution_order(parts, depth))
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
-    branch, branch_layer, uncertain = dict(state), None, False
+    branch, branch_layer = dict(state), None
     for position, (chosen, layer) in enumerate(steps):
         if layer is not None and layer != branch_layer:
             branch, branch_layer = dict(state), layer
         if chosen is None:
-            uncertain = True
             continue
         fields = state if layer is None else branch
         origin, needed = chosen.place.origin, chosen.component.requires(chosen.config)
         missing = {name: spec for name, spec in needed.items() if name not in fields}
-        if missing and not uncertain:
-            before = [step for step, _ in steps[:position] if step]
+        before = [step for step, _ in steps[:position] if step]
+        if missing and len(before) == position:
             after = [step for step, _ in steps[position + 1 :] if step]
-            problems.add(origin, chosen.path, *_unmet(missing, chosen, before, after, registry))
-        for name, spec in needed.items():
-            if name in fields and fields[name][0] != spec:
-                problems.add(origin, chosen.path, *_mismatch(name, spec, chosen, *fields[name]))
+            # One change that meets them all, or changes for each of them.
+            joint = _fixes(missing, chosen, before, registry)
+            for group in [missing] if joint else [{name: missing[name]} for name in missing]:
+                fixes = joint or _fixes(group, chosen, before, registry)
+                problems.add(origin, chosen.path, *_unmet(group, chosen, fixes, after))
+        for name in needed.keys() - missing.keys():
+            if fields[name][0] != needed[name]:
+                told = _mismatch(name, needed[name], chosen, *fields[name])
+                problems.add(origin, chosen.path, *told)
         provided = chosen.component.provides(chosen.config)
         fields |= {name: (spec, chosen) for name, spec in provided.items() if name not in missing}
 
@@ -132,55 +132,45 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, 
     The layer is None while the decoder runs. A decoded layer has a branch of its own: what its
     head writes is not there for the decoder.
     """
-    chosen = parts["model", "supervision"]
-    decoded = {depth}
+    decoded, chosen = {depth}, parts["model", "supervision"]
     if chosen is not None:
-        supervision = chosen.component(chosen.config)  # type: ignore[call-arg]
-        assert isinstance(supervision, Supervision)
-        decoded |= supervision.weights().keys()
+        supervision: Any = chosen.component
+        decoded |= supervision(chosen.config).weights().keys()
     yield parts["model", "encoder"], None
     yield parts["model", "queries"], None
-    for index in range(depth):
+    for layer in range(1, depth + 1):
         for name in LAYER_SLOTS:
-            yield parts["model", "decoder", "layers", str(index), name], None
-        if index + 1 in decoded:
+            yield parts["model", "decoder", "layers", str(layer - 1), name], None
+        if layer in decoded:
             for name in ("head", "centers", "renderer"):
-                yield parts["model", name], index + 1
-            for path, loss in parts.items():
-                if path[0] == "losses":
-                    yield loss, index + 1
+                yield parts["model", name], layer
+            yield from ((loss, layer) for path, loss in parts.items() if path[0] == "losses")
 
 
 def _unmet(
-    missing: Fields,
-    reader: Chosen,
-    before: Sequence[Chosen],
-    after: Sequence[Chosen],
-    registry: Registry,
+    missing: Fields, reader: Chosen, fixes: Mapping[str, Chosen | None], after: Sequence[Chosen]
 ) -> tuple[str, str]:
-    """Reason and fix where `reader` needs fields that nothing `before` it provides."""
-    fixes, instead = _suggestions(missing, reader, before, registry)
+    """Reason and fix where nothing before `reader` provides what it needs.
+
+    fixes: changes that would help, and the component that each would change or replace.
+    """
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
     reason = f"`{reader.type}` needs {named}, which nothing before it provides"
-    for other in instead:
+    for other in {other.path: other for other in fixes.values() if other}.values():
         reason += f"; {other.path} is `{other.type}` ({other.chosen_at})"
     for name in missing:
-        later = next((c for c in after if name in _offers(c.component, c.config)), None)
-        if later:
+        late = next((c for c in after if name in _offers(c.component, c.config)), None)
+        if late:
             what = "it" if len(missing) == 1 else name
-            reason += (
-                f"; `{later.type}` at {later.path} ({later.chosen_at}) provides {what} too late"
-            )
-    return reason, fixes
+            reason += f"; `{late.type}` at {late.path} ({late.chosen_at}) provides {what} too late"
+    install = f"install a plugin with a component that provides {next(iter(missing))}"
+    return reason, ", or ".join(fixes) or install
 
 
-def _suggestions(
+def _fixes(
     missing: Fields, reader: Chosen, before: Sequence[Chosen], registry: Registry
-) -> tuple[str, list[Chosen]]:
-    """What to change so that `missing` is provided, and the components to change or replace.
-
-    One change that meets all of `missing`, or changes for each of them.
-    """
+) -> dict[str, Chosen | None]:
+    """Changes that provide all of `missing`, and the component that each changes or replaces."""
     fixes: dict[str, Chosen | None] = {}
     for earlier in before:
         for option, value, config in variants(earlier.config):
@@ -188,42 +178,26 @@ def _suggestions(
                 fixes[f"set `{earlier.path}.{option}: {value}` on `{earlier.type}`"] = earlier
     if not fixes:
         standing = {chosen.place.slot.name: chosen for chosen in before}
-        for slot, words in _installed_providers(missing, reader.place.slot.name, registry):
-            fixes[f"use {words} in the slot `{slot}`"] = standing.get(slot)
+        for slot in _FLOW[: _FLOW.index(reader.place.slot.name)]:
+            for kind, component in registry.components(slot).items():
+                for words, config in _default_and_variants(component):
+                    if missing.keys() <= _offers(component, config).keys():
+                        fixes[f"use `{kind}`{words} in the slot `{slot}`"] = standing.get(slot)
+                        break
     for option, value, config in variants(reader.config):
-        try:
-            needed = reader.component.requires(config)
-        except Exception:
-            continue
-        if not missing.keys() & needed.keys():
-            names = " and no ".join(missing)
-            fixes[f"set `{reader.path}.{option}: {value}`, which needs no {names}"] = None
-    others = list({other.path: other for other in fixes.values() if other}.values())
-    if fixes:
-        return ", or ".join(fixes), others
-    if len(missing) == 1:
-        return f"install a plugin with a component that provides {next(iter(missing))}", []
-    single = {n: _suggestions({n: spec}, reader, before, registry) for n, spec in missing.items()}
-    fix = "; ".join(f"for {name}: {fix}" for name, (fix, _) in single.items())
-    return fix, list({c.path: c for _, others in single.values() for c in others}.values())
+        with suppress(Exception):  # what fails with this option is not suggested
+            if not missing.keys() & reader.component.requires(config).keys():
+                names = " and no ".join(missing)
+                fixes[f"set `{reader.path}.{option}: {value}`, which needs no {names}"] = None
+    return fixes
 
 
-def _installed_providers(
-    missing: Fields, reader: str, registry: Registry
-) -> Iterator[tuple[str, str]]:
-    """Slots that run before the slot `reader`, and components for them that provide `missing`."""
-    for slot in _FLOW[: _FLOW.index(reader)]:
-        for kind, component in registry.components(slot).items():
-            default = default_config(component)
-            if default is None:
-                continue
-            if missing.keys() <= _offers(component, default).keys():
-                yield slot, f"`{kind}`"
-                continue
-            for option, value, config in variants(default):
-                if missing.keys() <= _offers(component, config).keys():
-                    yield slot, f"`{kind}` with `{option}: {value}`"
-                    break
+def _default_and_variants(component: type[Component]) -> Iterator[tuple[str, ComponentConfig]]:
+    default = default_config(component)
+    if default is not None:
+        yield "", default
+        for option, value, config in variants(default):
+            yield f" with `{option}: {value}`", config
 
 
 def _offers(component: type[Component], config: ComponentConfig) -> Fields:
@@ -231,11 +205,10 @@ def _offers(component: type[Component], config: ComponentConfig) -> Fields:
 
     Nothing for options with which its code fails: nothing is suggested that may not work.
     """
-    try:
+    with suppress(Exception):
         given = component.requires(config)
         return {n: spec for n, spec in component.provides(config).items() if n not in given}
-    except Exception:
-        return {}
+    return {}
 
 
 def _mismatch(

@@ -17,10 +17,11 @@ from qgs.composer.flow import Parts, check_flow, check_options
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.registry import Registry
-from qgs.composer.sections import Settings, check_tree, decode_settings, load_plugins
+from qgs.composer.sections import check_tree, decode_settings, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import (
+    ComponentConfig,
     EvaluationConfig,
     Loss,
     ModelDims,
@@ -97,13 +98,13 @@ def resolve(
     tree = check_tree(tree, problems)
     problems.raise_if_stopped()
     tree = _with_defaults(tree)
-    settings = decode_settings(tree, problems)
+    settings, sizes_known = decode_settings(tree, problems)
+    model, decoder = settings["model",], settings["model", "decoder"]
+    dims = ModelDims(model.width, model.heads, decoder.depth)
     registry = load_plugins(tree, problems, plugins)
-    places = expand(tree, settings.decoder.depth, problems)
-    places = apply_swaps(tree.child("swap"), places, problems)
+    places = apply_swaps(tree.child("swap"), expand(tree, dims.depth, problems), problems)
     parts = decode_places(places, registry, problems)
-    dims = ModelDims(settings.model.width, settings.model.heads, settings.decoder.depth)
-    if settings.sizes_known:
+    if sizes_known:
         _check_components(parts, dims, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
@@ -113,12 +114,12 @@ def resolve(
         provenance=resolved.provenance,
         parts=chosen,
         dims=dims,
-        layer_scale=settings.decoder.layer_scale,
-        seed=settings.recipe.seed,
-        init_from=settings.recipe.init_from,
-        views=settings.views,
-        training=settings.training,
-        evaluation=settings.evaluation,
+        layer_scale=decoder.layer_scale,
+        seed=settings[()].seed,
+        init_from=settings[()].init_from,
+        views=settings["views",],
+        training=settings["training",],
+        evaluation=settings["evaluation",],
         plugin_versions={name: plugin.version for name, plugin in registry.plugins.items()},
     )
 
@@ -167,10 +168,10 @@ class _Resolved:
         for name, value in values.items():
             if isinstance(value, dict) and value and isinstance(written.get(name), MapNode):
                 self.put((*path, name), value, written[name], default)
-                continue
-            below[name] = value
-            origin = str(written.origins.get(name, default))
-            self.provenance |= dict.fromkeys(flat({name: value}, path), origin)
+            else:
+                below[name] = value
+                origin = str(written.origins.get(name, default))
+                self.provenance |= dict.fromkeys(flat({name: value}, path), origin)
 
     def put_component(self, path: KeyPath, chosen: Chosen) -> None:
         self.put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
@@ -179,25 +180,28 @@ class _Resolved:
 
 
 def _resolved(
-    source: MapNode, settings: Settings, registry: Registry, parts: Mapping[KeyPath, Chosen]
+    source: MapNode,
+    settings: Mapping[KeyPath, ComponentConfig],
+    registry: Registry,
+    parts: Mapping[KeyPath, Chosen],
 ) -> _Resolved:
     resolved = _Resolved()
 
-    def put_settings(name: str, *path: str) -> None:
-        values = getattr(settings, name).model_dump(mode="json")
+    def put_settings(*path: str) -> None:
+        values = settings[path].model_dump(mode="json")
         resolved.put(path, values, source.child(*path), "default")
 
-    put_settings("recipe")
+    put_settings()
     plugins = [name for name in registry.plugins if name != "qgs"]
     resolved.put((), {"plugins": plugins}, source, "default")
     written = source.get("plugins")
     if isinstance(written, ListNode) and written:
         resolved.provenance["plugins"] = ", ".join(dict.fromkeys(map(str, written.origins)))
-    put_settings("model", "model")
+    put_settings("model")
     for name in MODEL_SLOTS[:2]:
         resolved.put_component(("model", name), parts["model", name])
-    put_settings("decoder", "model", "decoder")
-    _put_layers(resolved, settings.decoder.depth, parts)
+    put_settings("model", "decoder")
+    _put_layers(resolved, parts)
     for name in MODEL_SLOTS[2:]:
         resolved.put_component(("model", name), parts["model", name])
     for name, section in SECTIONS.items():
@@ -209,23 +213,22 @@ def _resolved(
             dropped = {key: None for key in section.defaults if (name, key) not in parts}
             resolved.put((name,), dropped, source.child(name), "default")
     for name in ("views", "training", "evaluation"):
-        put_settings(name, name)
+        put_settings(name)
     return resolved
 
 
-def _put_layers(resolved: _Resolved, depth: int, parts: Mapping[KeyPath, Chosen]) -> None:
+def _put_layers(resolved: _Resolved, parts: Mapping[KeyPath, Chosen]) -> None:
     """The template, then every layer that differs; a template that no layer uses gives way."""
     decoder = ("model", "decoder")
-    differing: list[tuple[int, str, Chosen]] = []
+    templates = {}
     for name in LAYER_SLOTS:
-        template = parts[*decoder, name]
-        layers = [parts[*decoder, "layers", str(index), name] for index in range(depth)]
-        if all(_same(layer, layers[0]) for layer in layers):
-            template = layers[0]
-        resolved.put_component((*decoder, name), template)
-        differing += [(i, name, x) for i, x in enumerate(layers) if not _same(x, template)]
-    for index, name, layer in sorted(differing, key=lambda item: item[0]):
-        resolved.put_component((*decoder, "layers", str(index), name), layer)
+        layers = [part for path, part in parts.items() if len(path) == 5 and path[-1] == name]
+        same = all(_same(layer, layers[0]) for layer in layers)
+        templates[name] = layers[0] if same else parts[*decoder, name]
+        resolved.put_component((*decoder, name), templates[name])
+    for path, part in parts.items():
+        if len(path) == 5 and not _same(part, templates[path[-1]]):
+            resolved.put_component(path, part)
 
 
 def _same(a: Chosen, b: Chosen) -> bool:

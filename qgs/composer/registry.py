@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -79,6 +79,11 @@ class InstalledPlugin:
     def released_as(self) -> str:
         """Name and version of the distribution, as messages give them; "" for none."""
         return f"{self.distribution} {self.version}" if self.distribution else ""
+
+    def repair(self, place: str) -> str:
+        """What its user can do about a fault. place: FILE:LINE of it."""
+        own = self.editable or not self.distribution
+        return f"mend {place}" if own else f"update {self.released_as}"
 
 
 @dataclass(frozen=True)
@@ -163,61 +168,42 @@ def load_plugin(name: str) -> InstalledPlugin:
             "uninstall all of them but one",
         )
     entry = entries[0]
+    assert entry.dist is not None
+    # The record of where a distribution came from (PEP 610): whether by `pip install -e`.
+    record = json.loads(entry.dist.read_text("direct_url.json") or "{}")
+    editable = bool(record.get("dir_info", {}).get("editable"))
+    empty = Plugin(name, CONTRACT_VERSION, ())
+    installed = InstalledPlugin(empty, entry.dist.name, entry.dist.version, editable)
+    named = f"the plugin `{name}` of {installed.released_as}"
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:
         place = place_in(error, package_named(entry.module))
-        raise PluginError(
-            f"the plugin `{name}` of {_release(entry)} cannot be imported from "
-            f"`{entry.value}`: {type(error).__name__}: {error}{f' (at {place})' if place else ''}",
-            f"{_import_fix(entry, error, place)}, or do without the plugin",
-        ) from error
-    fault = next(_plugin_faults(plugin, name), "")
-    if fault:
-        newer = isinstance(plugin, Plugin) and _is_newer(plugin.contract_version)
-        fix = "update qgs" if newer else _repair(entry)
-        raise PluginError(
-            f"the plugin `{name}` of {_release(entry)} {fault}", f"{fix}, or do without the plugin"
-        )
-    assert entry.dist is not None
-    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, _is_editable(entry))
-
-
-def _import_fix(entry: EntryPoint, error: BaseException, place: str) -> str:
-    missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
-    if missing == entry.module:
-        return f"install {_release(entry)} again, its files are gone"
-    package = missing.partition(".")[0]
-    if package not in ("", "qgs", entry.module.partition(".")[0]):
-        return f"install `{package}`, which {_release(entry)} needs"
-    return _repair(entry, place)
-
-
-def _repair(entry: EntryPoint, place: str = "") -> str:
-    """place: FILE:LINE of what is wrong, "" where only the entry point leads there."""
-    return (
-        f"mend {place or f'`{entry.value}`'}"
-        if _is_editable(entry)
-        else f"update {_release(entry)}"
-    )
-
-
-def _is_editable(entry: EntryPoint) -> bool:
-    """Whether it was installed with `pip install -e`: the record of its origin (PEP 610)."""
-    record = entry.dist.read_text("direct_url.json") if entry.dist else None
-    return bool(json.loads(record or "{}").get("dir_info", {}).get("editable"))
+        at = f" (at {place})" if place else ""
+        told = f"{type(error).__name__}: {error}{at}"
+        reason = f"{named} cannot be imported from `{entry.value}`: {told}"
+        fix = installed.repair(place or f"`{entry.value}`")
+        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+        package = missing.partition(".")[0]
+        if missing == entry.module:
+            fix = f"install {installed.released_as} again, its files are gone"
+        elif package not in ("", "qgs", entry.module.partition(".")[0]):
+            fix = f"install `{package}`, which {installed.released_as} needs"
+        raise PluginError(reason, f"{fix}, or do without the plugin") from error
+    for fault in _plugin_faults(plugin, name):
+        version = getattr(plugin, "contract_version", None)
+        newer = type(version) is int and version > CONTRACT_VERSION
+        fix = "update qgs" if newer else installed.repair(f"`{entry.value}`")
+        raise PluginError(f"{named} {fault}", f"{fix}, or do without the plugin")
+    return replace(installed, plugin=plugin)
 
 
 def _release(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
 
 
-def _is_newer(version: object) -> bool:
-    return type(version) is int and version > CONTRACT_VERSION
-
-
 def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
-    """What is wrong with what the entry point `name` leads to, as the rest of "the plugin X ..."."""
+    """Faults of what the entry point `name` leads to, each the rest of "the plugin X ..."."""
     if not isinstance(plugin, Plugin):
         kind = type(plugin).__name__
         yield f"is no qgs.Plugin: its entry point leads to an object of type {kind}"
@@ -306,15 +292,10 @@ def component_error(installed: InstalledPlugin, fault: str, place: str = "") -> 
 
     place: FILE:LINE in its code, "" for none.
     """
-    release = installed.released_as
-    origin = f" of {release}" if release else ""
+    origin = f" of {installed.released_as}" if installed.distribution else ""
     at = f" (at {place})" if place else ""
-    own = installed.editable or not release
-    fix = f"mend {place or 'it'}" if own else f"update {release}"
-    return PluginError(
-        f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}",
-        f"{fix}, or choose another component",
-    )
+    reason = f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}"
+    return PluginError(reason, f"{installed.repair(place or 'it')}, or choose another component")
 
 
 def component_failure(

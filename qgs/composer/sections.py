@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
-from qgs.composer.decode import ConfigT, decode_config
+from qgs.composer.decode import decode_config
 from qgs.composer.errors import Problems, did_you_mean
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, kind_of
 from qgs.composer.registry import PluginError, Registry, builtin, load_plugin, not_installed
@@ -46,40 +45,25 @@ class RecipeSettings(ComponentConfig):
     (LocusGS release: finetuning); null to start from the initial parameters."""
 
 
-_SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
+SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
     (): RecipeSettings,
     ("model",): ModelSettings,
     ("model", "decoder"): DecoderSettings,
+    ("views",): ViewsConfig,
+    ("training",): TrainingConfig,
+    ("evaluation",): EvaluationConfig,
 }
-_COMPONENTS: dict[KeyPath, tuple[str, ...]] = {
+_BESIDE: dict[KeyPath, tuple[str, ...]] = {
     (): ("plugins", "swap", "model", *SECTIONS, "views", "training", "evaluation"),
     ("model",): (*MODEL_SLOTS, "decoder"),
     ("model", "decoder"): (*LAYER_SLOTS, "layers"),
 }
-"""Keys that stand beside the `_SETTINGS` of a section."""
-
-_KEYS = {path: {*_SETTINGS[path].model_fields, *names} for path, names in _COMPONENTS.items()}
+"""Keys that stand beside the settings of a section."""
+_KEYS = {path: {*SETTINGS[path].model_fields, *keys} for path, keys in _BESIDE.items()}
 _MAPPINGS: set[KeyPath] = {
-    *(("model",), ("model", "decoder"), ("model", "decoder", "layers"), ("swap",)),
+    *(("swap",), ("model", "decoder", "layers"), *SETTINGS),
     *((name,) for name, section in SECTIONS.items() if section.named),
-    *(("views",), ("training",), ("evaluation",)),
 }
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Decoded settings; defaults stand in for a section that has problems.
-
-    sizes_known: whether `model` and `decoder` are what the recipe says.
-    """
-
-    recipe: RecipeSettings
-    model: ModelSettings
-    decoder: DecoderSettings
-    views: ViewsConfig
-    training: TrainingConfig
-    evaluation: EvaluationConfig
-    sizes_known: bool
 
 
 def check_tree(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode:
@@ -109,29 +93,19 @@ def _right_key(key: str, path: KeyPath, known: set[str]) -> str:
     return did_you_mean(key, known, "keys")
 
 
-def decode_settings(tree: MapNode, problems: Problems) -> Settings:
-    """All settings of a checked tree; defaults where nothing is written."""
+def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, Any], bool]:
+    """Settings by section, and whether the model's sizes are what the recipe says.
 
-    def read(config: type[ConfigT], *path: str) -> ConfigT | None:
-        node = tree.child(*path).without(*_COMPONENTS.get(path, ()))
-        return decode_config(config, node, path, problems)
-
-    recipe = read(RecipeSettings)
-    model, decoder = read(ModelSettings, "model"), read(DecoderSettings, "model", "decoder")
-    if model is not None:
-        _check_heads(tree.child("model"), model, problems)
-    return Settings(
-        recipe or RecipeSettings(recipe=1),
-        model or ModelSettings(),
-        decoder or DecoderSettings(),
-        read(ViewsConfig, "views") or ViewsConfig(),
-        read(TrainingConfig, "training") or TrainingConfig(),
-        read(EvaluationConfig, "evaluation") or EvaluationConfig(),
-        sizes_known=model is not None and decoder is not None,
-    )
-
-
-def _check_heads(node: MapNode, model: ModelSettings, problems: Problems) -> None:
+    Defaults stand in for a section that has problems.
+    """
+    settings: dict[KeyPath, Any] = {}
+    for path, config in SETTINGS.items():
+        node = tree.child(*path).without(*_BESIDE.get(path, ()))
+        settings[path] = decode_config(config, node, path, problems)
+    sizes_known = all(settings[path] for path in (("model",), ("model", "decoder")))
+    defaults = {path: config.model_construct() for path, config in SETTINGS.items()}
+    settings = {path: found or defaults[path] for path, found in settings.items()}
+    model, node = settings["model",], tree.child("model")
     if model.width % model.heads:
         fitting = [n for n in range(1, model.width + 1) if model.width % n == 0]
         near = min(fitting, key=lambda n: abs(n - model.heads))
@@ -141,6 +115,7 @@ def _check_heads(node: MapNode, model: ModelSettings, problems: Problems) -> Non
             f"{model.heads} heads do not divide the width {model.width}",
             f"set model.heads to {near}, or make model.width a multiple of {model.heads}",
         )
+    return settings, sizes_known
 
 
 def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:

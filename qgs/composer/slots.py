@@ -6,29 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from qgs import contracts
 from qgs.composer.nodes import KeyPath, MapNode
-from qgs.contracts import (
-    Centers,
-    Component,
-    CrossAttention,
-    Encoder,
-    FeedForward,
-    Head,
-    Loss,
-    Queries,
-    Refinement,
-    Renderer,
-    SceneSource,
-    SelfAttention,
-    Supervision,
-)
 
 
 @dataclass(frozen=True)
 class Slot:
     """One kind of place. default: the `type` of a place that names none; None if it must."""
 
-    contract: type[Component]
+    contract: type[contracts.Component]
     default: str | None
 
     @property
@@ -40,18 +26,18 @@ class Slot:
 SLOTS = {
     slot.name: slot
     for slot in (
-        Slot(Encoder, "qgs/multiview_vit"),
-        Slot(Queries, "qgs/latent"),
-        Slot(CrossAttention, "qgs/content"),
-        Slot(SelfAttention, "qgs/content"),
-        Slot(FeedForward, "qgs/mlp"),
-        Slot(Refinement, "qgs/none"),
-        Slot(Head, "qgs/gaussian_head"),
-        Slot(Centers, "qgs/free"),
-        Slot(Supervision, "qgs/layers"),
-        Slot(Renderer, "qgs/auto"),
-        Slot(Loss, None),
-        Slot(SceneSource, None),
+        Slot(contracts.Encoder, "qgs/multiview_vit"),
+        Slot(contracts.Queries, "qgs/latent"),
+        Slot(contracts.CrossAttention, "qgs/content"),
+        Slot(contracts.SelfAttention, "qgs/content"),
+        Slot(contracts.FeedForward, "qgs/mlp"),
+        Slot(contracts.Refinement, "qgs/none"),
+        Slot(contracts.Head, "qgs/gaussian_head"),
+        Slot(contracts.Centers, "qgs/free"),
+        Slot(contracts.Supervision, "qgs/layers"),
+        Slot(contracts.Renderer, "qgs/auto"),
+        Slot(contracts.Loss, None),
+        Slot(contracts.SceneSource, None),
     )
 }
 
@@ -81,18 +67,19 @@ SECTIONS = {
 }
 
 
-_SCHEDULE = ("learning_rate", "warmup", "initial_divisor", "final_divisor")
 MOVED = {
     "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
     "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",
     "evaluation.lpips_weights": "metrics: {lpips: {type: qgs/lpips, weights: ...}}",
-    **{
-        f"training.{name}": f"optimizer: {{{name}: ...}}"
-        for name in (*_SCHEDULE, "betas", "weight_decay")
-    },
+    "training.learning_rate": "optimizer: {learning_rate: ...}",
+    "training.warmup": "optimizer: {warmup: ...}",
+    "training.initial_divisor": "optimizer: {initial_divisor: ...}",
+    "training.final_divisor": "optimizer: {final_divisor: ...}",
+    "training.betas": "optimizer: {betas: ...}",
+    "training.weight_decay": "optimizer: {weight_decay: ...}",
     "qgs/rooms": "type: rooms/procedural` and, at the top, `plugins: [rooms]",
 }
-"""Keys and types that older recipes have, and what to write in their place."""
+"""Keys and types of older recipes, and what to write in their place."""
 
 
 def slot_at(path: KeyPath) -> Slot | None:

@@ -26,7 +26,7 @@ def test_missing_base_suggests_neither_its_reader_nor_something_else(write):
         resolve(recipe)
     base, key = caught.value.problems
     assert base.fix.startswith("check the path")
-    assert key.path == "modle"
+    assert key.option == "modle"
 
 
 def test_missing_base_of_a_mapping(write):
@@ -66,7 +66,7 @@ def test_mistake_in_an_extended_file_is_found_there(write):
         ("model.queries.count", "model.queries.count", "is no override"),
         ("model..count=3", "model..count", "is no override"),
         ("model.queries.count=[1", "model.queries.count", "no valid YAML"),
-        ("model.queries.count=x", "model.queries.count", "must be an integer"),
+        ("model.queries.count=x", "model.queries.count", "must be a valid integer"),
         ("extends=a.yaml", "extends", "cannot set"),
     ],
 )
