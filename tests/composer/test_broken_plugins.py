@@ -168,7 +168,7 @@ def test_broken_plugin_is_reported_by_distribution(name, write, install):
     with pytest.raises(RecipeError) as caught:
         resolve(write("recipe: 1\nplugins: [bad]\nmodel: {queries: {type: bad/any}}\n"))
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", 2, "plugins.0")
+    assert (problem.file, problem.line, problem.option) == ("recipe.yaml", 2, "plugins.0")
     assert "qgs-bad 0.7" in problem.reason
     assert reason in problem.reason
     assert "qgs-bad 0.7" in problem.fix

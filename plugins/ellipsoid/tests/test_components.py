@@ -185,7 +185,7 @@ def test_options_without_effect_are_refused(options: dict, path: str, why: str) 
     with pytest.raises(RecipeError) as caught:
         resolve({**ELLIPSOID, "model": {**ANCHORED, "decoder": decoder}})
     (problem,) = caught.value.problems
-    assert problem.path.endswith(path)
+    assert problem.option.endswith(path)
     assert why in problem.reason
 
 

@@ -20,7 +20,6 @@ from qgs.data.lazy import LazyScenes
 from qgs.types import Cameras
 from qgs_rooms.draws import Draws
 from qgs_rooms.path import camera_path
-from qgs_rooms.plan import furnish
 from qgs_rooms.shapes import Room
 
 _BAND = 64  # rows of an image that one thread casts at a time
@@ -103,6 +102,8 @@ class RoomScene(Scene):
     @cached_property
     def room(self) -> Room:
         """The furnished room."""
+        from qgs_rooms.plan import furnish
+
         return furnish(Draws(self._layout_seed), self.size, self._c2w[:, :3, 3])
 
     @cached_property
