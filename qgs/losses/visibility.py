@@ -1,4 +1,4 @@
-"""`qgs/visibility`: points that no supervised view sees are drawn towards one (TokenGS)."""
+"""`qgs/visibility`: moves points that no target view sees towards the nearest one (TokenGS)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class VisibilityOptions(ComponentConfig):
         return self.near if self.behind_camera == "invisible" else None
 
     def conflicts(self) -> Iterator[Problem]:
-        """Options that do not go together, or that nothing reads."""
+        """Options that contradict each other or have no effect."""
         if self.behind_camera == "published":
             yield from without_effect(self, ("near",), "`behind_camera` is published")
         elif self.clamp is None:
@@ -71,7 +71,7 @@ class Visibility(Loss):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options must go together, and each must matter."""
+        """Options that contradict each other or have no effect."""
         yield from config.conflicts()
         if config.clamp is not None:
             yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
@@ -99,17 +99,17 @@ def view_visibility(
     z_guard: float | None = None,
     infinite_pixel: float = INFINITE_PIXEL,
 ) -> Tensor:
-    """How far each point is from the nearest view that would see it, 0 if one does (B, P).
+    """Distance (B, P) of each point to the nearest view's image, 0 if a view sees it.
 
-    points: (B, P, 3) world. cameras: (B, V). Per view, with u and v scaled to [-1, 1] over the
-    image: relu(|u| - 1) + relu(|v| - 1); then the minimum over views, at most `clamp` (TokenGS,
-    LocusGS releases). behind: z at or below which a point is infinitely far from a view's image;
-    None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard (LocusGS anchors);
-    None leaves z alone, where x / 0 is at `infinite_pixel` and 0 / 0 visible (TokenGS).
+    Per view, with u and v scaled to [-1, 1] over the image: relu(|u| - 1) + relu(|v| - 1); then the
+    minimum over views, at most `clamp` (TokenGS, LocusGS releases).
 
-    Gradients go to the nearest view alone (of several, the first), so that memory does not grow
-    with the views. Values and gradients are finite everywhere, as long as `clamp` is set whenever
-    `behind` is.
+    points: (B, P, 3) world. cameras: (B, V). behind: z at or below which a point is infinitely far
+    from a view's image; None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard
+    (LocusGS anchors); None leaves z, where x / 0 is `infinite_pixel` and 0 / 0 visible (TokenGS).
+
+    The gradient goes to the nearest view alone (the first of several), so that memory does not grow
+    with the views. Values and gradients are finite if `clamp` is set whenever `behind` is.
     """
     options = (behind, z_guard, infinite_pixel)
     with torch.no_grad():

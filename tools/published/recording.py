@@ -26,7 +26,7 @@ from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
 @torch.no_grad()
 def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
     """Run `model` and return every tensor that a file can hold."""
-    found = ray_tensors(views.cameras) | {"images": _imagenet_normalised(views.images)}
+    found = ray_tensors(views.cameras) | {"images": imagenet_normalised(views.images)}
     with _recording(model, found):
         prediction = model(views, layers=range(1, model.depth + 1))
     found["gaussians"] = _packed(prediction.gaussians)
@@ -45,7 +45,7 @@ def ray_tensors(cameras: Cameras) -> dict[str, Tensor]:
     }
 
 
-def _imagenet_normalised(rgb: Tensor) -> Tensor:
+def imagenet_normalised(rgb: Tensor) -> Tensor:
     mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
     return (rgb - mean) / std
 

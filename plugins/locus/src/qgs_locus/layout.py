@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from qgs.components.weights import BACKBONE_RENAMES, DECODER, LEGIBLE, backbone
+from qgs.components.weights import BACKBONE_RENAMES, DECODER, READ_OPTIONS, backbone
 from qgs.contracts.weights import Rename, Shapes, Unused, WeightLayout
 
 _CROSS = DECODER + "{}.gs_cross_attn."
@@ -60,7 +60,7 @@ LOCUSGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_content_proj.weight",),
     read=_read,
-    legible=(*LEGIBLE, "model.queries.radius", "model.decoder.refinement.radius"),
+    read_options=(*READ_OPTIONS, "model.queries.radius", "model.decoder.refinement.radius"),
     unused=(
         Unused(_CROSS + "anchor_norm.", _Q_NORM),
         Unused(_CROSS + "plucker_norm.", _Q_NORM),
