@@ -77,4 +77,4 @@ LOCUSGS = WeightLayout(
         "scale and frame of the world, renderer, training: the framework's defaults",
     ),
 )
-"""The released LocusGS and its structural ablations."""
+"""The released LocusGS, and its ablations that change parameters."""
