@@ -80,7 +80,7 @@ def place_in(error: BaseException, roots: Iterable[Path]) -> str:
 NAME = re.compile(r"[^\s/]+")
 """Of a component: `type: PLUGIN/NAME` must be read as it was written."""
 
-DEVICES = ("cpu", "cuda")
+DEVICES = ("cpu", "cuda", "mps")
 """Types of the devices that a renderer can render on."""
 
 

@@ -90,6 +90,7 @@ class Visibility(Loss):
         return {"visibility": self.config.weight * per_point.mean()}
 
 
+@full_precision
 def view_visibility(
     points: Tensor,
     cameras: Cameras,
@@ -130,34 +131,20 @@ def _image_excess(
 ) -> Tensor:
     """relu(|u| - 1) + relu(|v| - 1) of world points (B, P, 3) -> (B, P).
 
-    cameras: (B, P), one for each point, or (B, 1).
+    cameras: (B, P), one for each point, or (B, 1); both give the same bits.
     """
-    camera_points = _into_camera(points, cameras.c2w)
-    pixels = _guarded_pixels(camera_points, cameras.intrinsics, z_guard, infinite_pixel)
+    from_camera = points - cameras.c2w[..., :3, 3]
+    camera_points = (from_camera[..., None] * cameras.c2w[..., :3, :3]).sum(-2)
+    xy, z = camera_points[..., :2], camera_points[..., 2:]
+    if z_guard is not None:
+        z = torch.where(z.abs() < z_guard, z_guard, z)
+    at_zero = z.abs() < _TINY_Z
+    focal, principal = cameras.intrinsics[..., :2], cameras.intrinsics[..., 2:]
+    pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
+    pixels = torch.where(at_zero, torch.where(xy == 0, 0.0, infinite_pixel * xy.sign()), pixels)
     height, width = cameras.size
     normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1
     excess = (normalised.abs() - 1).relu().sum(-1)
     if behind is None:
         return excess
     return torch.where(camera_points[..., 2] <= behind, torch.inf, excess)
-
-
-@full_precision
-def _into_camera(points: Tensor, c2w: Tensor) -> Tensor:
-    """Camera-frame points (B, P, 3), to the bit alike for c2w (B, 1, 4, 4) and (B, P, 4, 4)."""
-    from_camera = points - c2w[..., :3, 3]
-    return (from_camera[..., None] * c2w[..., :3, :3]).sum(-2)
-
-
-@full_precision
-def _guarded_pixels(
-    camera_points: Tensor, intrinsics: Tensor, z_guard: float | None, infinite_pixel: float
-) -> Tensor:
-    """Pixels (B, P, 2) of camera-frame points (B, P, 3), finite at z = 0."""
-    xy, z = camera_points[..., :2], camera_points[..., 2:]
-    if z_guard is not None:
-        z = torch.where(z.abs() < z_guard, z_guard, z)
-    at_zero = z.abs() < _TINY_Z
-    pixels = intrinsics[..., :2] * xy / torch.where(at_zero, 1.0, z) + intrinsics[..., 2:]
-    limit = torch.where(xy == 0, 0.0, infinite_pixel * xy.sign())
-    return torch.where(at_zero, limit, pixels)

@@ -88,7 +88,7 @@ def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tens
 
 
 class TorchRenderer(Renderer):
-    """The oracle: any device, float32 or float64, memory and time G x H x W per camera.
+    """The reference for tests: any device, float32 or float64, time and memory G x H x W.
 
     Gaussians at the same depth are drawn in their given order.
     """
@@ -116,7 +116,7 @@ class TorchRenderer(Renderer):
 
 
 def resolve(sums: Tensor, background: Tensor) -> Rendering:
-    """Sums (B, V, 5, H, W) of w r, w g, w b, w z and w into a Rendering."""
+    """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
     hit = torch.where(alpha > 0, alpha, 1.0)
     return Rendering(
