@@ -106,12 +106,8 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "refinement": {"type": "qgs/none"},
     }
     model["head"] |= {"scale_input_limit": None, "quat_eps": 1e-12}
-    model["centers"] = {
-        "type": "qgs/free",
-        "z_offset": 1.0,
-        "input_limit": None,
-        "output_limit": None,
-    }
+    unlimited = {"input_limit": None, "output_limit": None}
+    model["centers"] = {"type": "qgs/free", "z_offset": 1.0, **unlimited}
     model["supervision"] = {"type": "qgs/layers", "layers": [model["decoder"]["depth"]]}
     return {"recipe": 1, "model": model}
 

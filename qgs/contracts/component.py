@@ -126,6 +126,10 @@ class Component(ABC):
     class Config(ComponentConfig):
         """No options."""
 
+    def __init__(self, config: ComponentConfig) -> None:
+        super().__init__()
+        self.config = config
+
     def __init_subclass__(cls, **options: Any) -> None:
         """Give every class a Config of its own, for `component_of`."""
         super().__init_subclass__(**options)
@@ -172,8 +176,7 @@ class ModelComponent(Component, torch.nn.Module):
     """A component with parameters, built with the sizes that all parts of the model share."""
 
     def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
+        super().__init__(config)
         self.dims = dims
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from qgs.contracts.component import Component, ComponentConfig
+from qgs.contracts.component import Component
 from qgs.types import LayerPrediction, Rendering, Views
 
 Renderings: TypeAlias = Literal["each", "all", "none"]
@@ -31,10 +31,6 @@ class Loss(Component, torch.nn.Module):
     slot: ClassVar[str] = "losses"
     renderings: ClassVar[Renderings] = "all"
 
-    def __init__(self, config: ComponentConfig) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
-
     @abstractmethod
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
@@ -46,9 +42,6 @@ class Supervision(Component):
     """The supervised decoder layers and their weights."""
 
     slot: ClassVar[str] = "supervision"
-
-    def __init__(self, config: ComponentConfig) -> None:
-        self.config = config
 
     @abstractmethod
     def weights(self) -> Mapping[int, float]:

@@ -63,9 +63,7 @@ class Renderer(Component, torch.nn.Module):
     class Config(RendererConfig):
         """The settings of every renderer; add your own below."""
 
-    def __init__(self, config: RendererConfig) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
+    config: RendererConfig
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:

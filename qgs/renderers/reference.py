@@ -105,13 +105,12 @@ class TorchRenderer(Renderer):
             gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, config.background, gaussians.means)
             splats = project(gaussians, cameras, config.near, config.far, config.dilation)
-            height, width = cameras.size
             sums = [
-                _composite(splats, gaussians, (b, v), height, width, config)
+                _composite(splats, gaussians, (b, v), cameras.size, config)
                 for b in range(cameras.shape[0])
                 for v in range(cameras.shape[1])
             ]
-            sums = torch.stack(sums).reshape(*cameras.shape, 5, height, width)
+            sums = torch.stack(sums).reshape(*cameras.shape, 5, *cameras.size)
             return resolve(sums, backdrop)
 
 
@@ -130,11 +129,11 @@ def _composite(
     splats: Splats,
     gaussians: Gaussians,
     image: tuple[int, int],
-    height: int,
-    width: int,
+    size: tuple[int, int],
     config: RendererConfig,
 ) -> Tensor:
-    """Sums (5, H, W) of one image, front to back."""
+    """Sums (5, H, W) of one image (scene, view), front to back."""
+    height, width = size
     order = splats.depths[image].argsort(stable=True)
     order = order[splats.visible[image][order]]
     means, conics, depths = (
