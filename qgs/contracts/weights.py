@@ -36,21 +36,14 @@ class Rename:
 
 
 @dataclass(frozen=True)
-class Unused:
-    """A published parameter that their code never uses, stored wherever `beside` is."""
-
-    theirs: str
-    beside: str
-
-
-@dataclass(frozen=True)
 class WeightLayout:
     """Names and shapes in the state dicts of one published codebase.
 
     name: what the codebase calls its model. source: where it is published.
     components: slot to the component types that the codebase has; other slots may hold any.
-    renames: the first that applies to a name counts. unused: what their code stores, never uses.
+    renames: the first that applies to a name counts.
     marks: published names that tell this layout from others.
+    unused: from a published name to that of a parameter stored beside it, which their code ignores.
     read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
         raises LayoutError.
     read_options: dotted paths of the options that `read` takes from names and shapes.
@@ -64,7 +57,7 @@ class WeightLayout:
     marks: tuple[str, ...]
     read: Callable[[Shapes], dict[str, Any]]
     read_options: tuple[str, ...]
-    unused: tuple[Unused, ...] = ()
+    unused: tuple[Rename, ...] = ()
     undecided: tuple[str, ...] = ()
 
     def published_name(self, ours: str) -> str | None:
@@ -73,8 +66,8 @@ class WeightLayout:
 
     def unused_names(self, theirs: Iterable[str]) -> list[str]:
         """Published parameters that are stored beside `theirs` and never used."""
-        rules = [Rename(unused.beside, unused.theirs) for unused in self.unused]
-        return [name for key in theirs for rule in rules if (name := rule.renamed(key)) is not None]
+        found = (rule.renamed(name) for name in theirs for rule in self.unused)
+        return [name for name in found if name is not None]
 
     def marks_all_in(self, names: Iterable[str]) -> bool:
         """Whether a state dict with these published names has this layout."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from qgs.components.weights import BACKBONE_RENAMES, DECODER, READ_OPTIONS, backbone
-from qgs.contracts.weights import Rename, Shapes, Unused, WeightLayout
+from qgs.contracts.weights import Rename, Shapes, WeightLayout
 
 _CROSS = DECODER + "{}.gs_cross_attn."
-_Q_NORM = _CROSS + "q_norm."
+_UNUSED_NORMS = ("anchor_norm.", "plucker_norm.", "q_pos_norm.", "k_pos_norm.")
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
@@ -62,11 +62,8 @@ LOCUSGS = WeightLayout(
     read=_read,
     read_options=(*READ_OPTIONS, "model.queries.radius", "model.decoder.refinement.radius"),
     unused=(
-        Unused(_CROSS + "anchor_norm.", _Q_NORM),
-        Unused(_CROSS + "plucker_norm.", _Q_NORM),
-        Unused(_CROSS + "q_pos_norm.", _Q_NORM),
-        Unused(_CROSS + "k_pos_norm.", _Q_NORM),
-        Unused(_CROSS + "tau_sample", _CROSS + "geo_scale"),
+        *(Rename(_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
+        Rename(_CROSS + "geo_scale", _CROSS + "tau_sample"),
     ),
     undecided=(
         "bandwidth of the ray bias: the radius where there is one, else fixed",
