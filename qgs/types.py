@@ -133,7 +133,7 @@ class Cameras(TensorContainer):
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
 
     def __getitem__(self, index: Any) -> Cameras:
-        return Cameras(self.c2w[index], self.intrinsics[index], self.size)
+        return map_tensors(lambda x: x[index], self)
 
 
 @dataclass(frozen=True)
@@ -164,8 +164,7 @@ class Views(TensorContainer):
 
     def select(self, index: Any) -> Views:
         """The views at `index` of every scene (a slice or a list of ints)."""
-        masks = None if self.masks is None else self.masks[:, index]
-        return Views(self.images[:, index], self.cameras[:, index], masks)
+        return map_tensors(lambda x: x[:, index], self)
 
 
 @dataclass(frozen=True)
@@ -287,7 +286,7 @@ class Gaussians(TensorContainer):
         return self.means.shape[-2]
 
     def __getitem__(self, index: Any) -> Gaussians:
-        return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return map_tensors(lambda x: x[index], self)
 
 
 @dataclass(frozen=True)
