@@ -52,7 +52,7 @@ BUILTIN = Plugin(
 )
 NAME = re.compile(r"[^\s/]+")
 """Of a component: `type: PLUGIN/NAME` must be read as it was written."""
-DEVICES = ("cpu", "cuda")
+DEVICES = ("cpu", "cuda", "mps")
 """Types of the devices that a renderer can render on."""
 
 

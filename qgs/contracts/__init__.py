@@ -35,7 +35,7 @@ from qgs.contracts.plugin import (
 from qgs.contracts.queries import Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
-from qgs.contracts.weights import LayoutError, Rename, Unused, WeightLayout
+from qgs.contracts.weights import LayoutError, Rename, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -77,7 +77,6 @@ __all__ = [
     "Split",
     "Supervision",
     "TrainingConfig",
-    "Unused",
     "ViewsConfig",
     "WeightLayout",
     "component_of",

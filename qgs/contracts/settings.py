@@ -1,4 +1,4 @@
-"""The settings of a recipe that are no components: views, training, evaluation."""
+"""Sections of a recipe that are not components: views, training, evaluation."""
 
 from __future__ import annotations
 

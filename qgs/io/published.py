@@ -264,10 +264,10 @@ def _whatever_the_recipe(remaining: list[str], layout: WeightLayout) -> str:
 
 
 def _differing(recipe: Recipe, fitting: Recipe, layout: WeightLayout) -> list[str]:
-    """`path: value (the recipe has ...)` of every legible option that differs."""
+    """`path: value (the recipe has ...)` of every option read from the weights that differs."""
     apart = differing_options(recipe.tree, fitting.tree)
     lines = []
-    for path in layout.legible:
+    for path in layout.read_options:
         has, wanted = apart.get(path, (None, None))
         if wanted is not None:
             lines.append(f"{path}: {wanted} ({f'the recipe has {has}' if has else 'not in it'})")
