@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.lazy import warn_once
+from qgs.data.scenes import warn_once
 from qgs.geometry.poses import (
     first_camera,
     largest_distance,

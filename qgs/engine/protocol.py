@@ -68,10 +68,10 @@ def protocol_of(
     """
     config = recipe.parts["data",].config
     assert isinstance(config, SceneSourceConfig)
-    undecisive = config.undecisive | (config.split_options if index is not None else set())
+    left_out = config.unhashed_options | (config.split_options if index is not None else set())
     options = config.model_dump(
         mode="json",
-        exclude={"image_size", *undecisive},
+        exclude={"image_size", *left_out},
         exclude_defaults=index is not None,
     )
     evaluation = recipe.evaluation
