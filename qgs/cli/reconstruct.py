@@ -42,8 +42,7 @@ def reconstruct(
         str | None, typer.Option(help="Input frames, such as 0,8,16; default: spread mid-folder.")
     ] = None,
     holdout: Annotated[
-        str | None,
-        typer.Option(help="Frames to compare with; default: six between the inputs."),
+        str | None, typer.Option(help="Frames to compare with; default: six between the inputs.")
     ] = None,
     tune: Annotated[
         int, typer.Option(min=0, help="Steps of token tuning on the input photos; 0 for none.")

@@ -47,12 +47,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Record:
-    """A scene as a chunk holds it; nothing is decoded.
+    """A scene as a chunk holds it (see the top of this file); nothing is decoded.
 
-    where: file and key, for messages. cameras: (V, 18) float32. images: V uint8 tensors with the
-    bytes of image files. names: V names of frames. sizes: (V, 2) height and width, None where the
-    chunk does not say. masks: V uint8 tensors, empty for a frame without one; None without masks.
-    held_out: frames that training is not to see.
+    where: file and key, for messages. names: time stamps or numbers where the chunk has no names.
+    sizes, masks: None where the chunk has none.
     """
 
     where: str
@@ -233,9 +231,8 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 def load_chunk(path: UPath) -> list[Any]:
     """The entries of a chunk, unpickled as tensors and plain containers only.
 
-    A local file of torch's zip format is memory-mapped, so that no image is read before it is
-    used; others are read whole. Raises FileNotFoundError, and ValueError for a file that is no
-    list.
+    A local file of torch's zip format is memory-mapped, so that images are read when they are used;
+    others are read whole. Raises FileNotFoundError, and ValueError for a file that is no list.
     """
     try:
         if is_local(path):
@@ -308,18 +305,6 @@ class Chunk:
         return self._parsed[key]
 
 
-@dataclass(frozen=True)
-class ChunkListing:
-    """Scenes of one folder, in the index's order.
-
-    files: a scene's key to its chunk file. missing: the same for chunks that do not exist.
-    """
-
-    folder: UPath
-    files: Mapping[str, UPath]
-    missing: Mapping[str, UPath]
-
-
 def has_chunks(folder: UPath) -> bool:
     """Whether a folder looks like one of chunks: it holds an index.json or .torch files."""
     return folder.is_dir() and (
@@ -348,20 +333,21 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
     return index
 
 
-def list_scenes(folder: UPath) -> ChunkListing:
-    """The scenes of a folder, from index.json alone where there is one; else chunks are opened.
+def list_scenes(folder: UPath) -> dict[str, UPath]:
+    """The scenes of a folder by key, in the index's order, with their chunk files.
 
+    They are read from index.json alone where there is one; else chunks are opened.
     Scenes whose chunk does not exist are counted and named in a warning. Raises FileNotFoundError
     when no scene is left, ValueError for an index or a chunk that cannot be read.
     """
     if not (folder / INDEX).is_file():
-        return ChunkListing(folder, _scanned(folder), {})
+        return _scanned(folder)
     index = read_chunk_index(folder / INDEX)
     present = {item.name for item in folder.iterdir()}
     chunks = {name: folder / name for name in set(index.values())}
     there = {name for name in chunks if name in present or chunks[name].is_file()}
     here = {key: chunks[name] for key, name in index.items() if name in there}
-    missing = {key: chunks[name] for key, name in index.items() if name not in there}
+    missing = [f"{key} ({name})" for key, name in index.items() if name not in there]
     if not here:
         raise FileNotFoundError(
             f"{folder / INDEX} names {len(index)} scenes, and none of their chunks exists: "
@@ -370,10 +356,9 @@ def list_scenes(folder: UPath) -> ChunkListing:
     if missing:
         _log.warning(
             "%d of %d scenes of %s are left out, because their chunks do not exist: %s",
-            len(missing), len(index), folder / INDEX,
-            ", ".join(f"{key} ({file.name})" for key, file in missing.items()),
+            len(missing), len(index), folder / INDEX, ", ".join(missing),
         )  # fmt: skip
-    return ChunkListing(folder, here, missing)
+    return here
 
 
 def _scanned(folder: UPath) -> dict[str, UPath]:

@@ -15,16 +15,7 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.chunk_files import (
-    INDEX,
-    SUFFIX,
-    Chunk,
-    ChunkListing,
-    Record,
-    has_chunks,
-    list_scenes,
-    require_usable,
-)
+from qgs.data.chunk_files import SUFFIX, Chunk, Record, has_chunks, list_scenes, require_usable
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
 from qgs.data.paths import opened_path
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes
@@ -38,10 +29,7 @@ _log = logging.getLogger(__name__)
 class ChunksConfig(SceneSource.Config):
     """Options of `qgs/chunks`."""
 
-    unhashed_options: ClassVar[frozenset[str]] = SceneSource.Config.unhashed_options | {
-        "max_scenes",
-        "min_frames",
-    }
+    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
@@ -69,15 +57,14 @@ class ChunkScene(EncodedScene):
 
     @property
     def _record(self) -> Record:
-        chunk = self._chunks.get(str(self._file), lambda: Chunk(self._file))
-        return chunk.record(self.name)
+        return self._chunks.get(str(self._file), lambda: Chunk(self._file)).record(self.name)
 
     @cached_property
-    def _count(self) -> int:
+    def _length(self) -> int:
         return len(self._record)
 
     def __len__(self) -> int:
-        return self._count
+        return self._length
 
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
@@ -189,9 +176,8 @@ class ChunksSource(SceneSource):
     """Chunks under PATH/train and PATH/test; a folder without these is the training split.
 
     A data set without test chunks is evaluated on the held-out frames of its training scenes,
-    where there are any.
-
-    missing: keys that an index.json names and whose chunks do not exist, by split.
+    where there are any. Scenes that an index.json names and whose chunks do not exist are left out,
+    counted and named in a warning.
     """
 
     name = "chunks"
@@ -200,19 +186,18 @@ class ChunksSource(SceneSource):
     def __init__(self, config: ChunksConfig) -> None:
         super().__init__(config)
         chunks: BoundedCache[Chunk] = BoundedCache(_OPEN)
-        self.missing: dict[Split, list[str]] = {}
-        self._splits: dict[Split, ChunkScenes] = {}
-        for split, folder in _folders(opened_path(config.path)).items():
-            listing = list_scenes(folder)
-            self.missing[split] = list(listing.missing)
-            self._splits[split] = ChunkScenes(chunks, _chosen(chunks, listing, config), config)
+        self._splits: dict[Split, ChunkScenes] = {
+            split: ChunkScenes(chunks, _chosen(chunks, folder, config), config)
+            for split, folder in _folders(opened_path(config.path)).items()
+        }
         self._nothing = ChunkScenes(chunks, {}, config)
-        self._splits.setdefault("train", self._nothing)
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
         """Chunk files or an index.json in train or test, or chunk files in the folder itself."""
-        return _holds_chunks(path) or any(_holds_chunks(path / part) for part in ("train", "test"))
+        inside = [path, *path.iterdir()] if path.is_dir() else []
+        splits = [item for item in inside if item.name in ("train", "test")]
+        return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`.
@@ -222,9 +207,9 @@ class ChunksSource(SceneSource):
         return self._split(split)
 
     def _split(self, split: Split) -> ChunkScenes:
-        if split in self._splits:
-            return self._splits[split]
-        train = self._splits["train"]
+        train = self._splits.get("train", self._nothing)
+        if split == "train" or split in self._splits:
+            return self._splits.get(split, train)
         first = next(iter(train.groups()), [])
         return train if any(train[index].held_out for index in first) else self._nothing
 
@@ -233,23 +218,13 @@ class ChunksSource(SceneSource):
         return self._split(split).groups()
 
 
-def _holds_chunks(folder: UPath) -> bool:
-    if not folder.is_dir():
-        return False
-    names = [item.name for item in folder.iterdir()]
-    indexed = folder.name in ("train", "test") and INDEX in names
-    return indexed or any(name.endswith(SUFFIX) for name in names)
-
-
 def _folders(path: UPath) -> dict[Split, UPath]:
     if not path.is_dir():
         raise FileNotFoundError(
             f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
         )
-    splits: tuple[Split, ...] = ("train", "test")
-    found: dict[Split, UPath] = {
-        split: path / split for split in splits if has_chunks(path / split)
-    }
+    folders: dict[Split, UPath] = {"train": path / "train", "test": path / "test"}
+    found = {split: folder for split, folder in folders.items() if has_chunks(folder)}
     if not found and has_chunks(path):
         return {"train": path}
     if not found:
@@ -261,11 +236,9 @@ def _folders(path: UPath) -> dict[Split, UPath]:
     return found
 
 
-def _chosen(
-    chunks: BoundedCache[Chunk], listing: ChunkListing, config: ChunksConfig
-) -> dict[str, UPath]:
+def _chosen(chunks: BoundedCache[Chunk], folder: UPath, config: ChunksConfig) -> dict[str, UPath]:
     """The scenes that the options leave; those with too few frames are counted and named."""
-    files = dict(listing.files)
+    files = list_scenes(folder)
     if config.min_frames:
         by_file = sorted(files.items(), key=lambda item: str(item[1]))
         frames = {key: len(ChunkScene(chunks, file, key, config)) for key, file in by_file}
@@ -273,7 +246,7 @@ def _chosen(
         if short:
             _log.warning(
                 "%d of %d scenes of %s have fewer than %d frames (min_frames) and are left out: %s",
-                len(short), len(files), listing.folder, config.min_frames,
+                len(short), len(files), folder, config.min_frames,
                 ", ".join(f"{key} ({count})" for key, count in short.items()),
             )  # fmt: skip
         files = {key: file for key, file in files.items() if key not in short}

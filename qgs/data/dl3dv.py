@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar, TypeAlias, cast
 
@@ -29,10 +30,7 @@ Place: TypeAlias = UPath | ArchivePath
 class Dl3dvConfig(SceneSource.Config):
     """Options of `qgs/dl3dv`."""
 
-    unhashed_options: ClassVar[frozenset[str]] = SceneSource.Config.unhashed_options | {
-        "test_scenes",
-        "max_scenes",
-    }
+    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
@@ -55,16 +53,10 @@ class Dl3dvScenes(PhotoScenes):
     """The scenes of a split, each read when it is asked for."""
 
     def __init__(self, places: Mapping[str, Place], config: Dl3dvConfig) -> None:
-        wanted = list(places.items())[: config.max_scenes or None]
-        photos = PhotosConfig(
-            path=config.path,
-            format="nerfstudio",
-            images=config.images,
-            holdout=config.holdout,
-            background=config.background,
-            image_size=config.image_size,
-        )
-        super().__init__(cast(Mapping[str, UPath], dict(wanted)), photos, cache_bytes=0)
+        wanted = dict(list(places.items())[: config.max_scenes or None])
+        same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
+        photos = PhotosConfig(format="nerfstudio", **same)
+        super().__init__(cast(Mapping[str, UPath], wanted), photos, cache_bytes=0)
 
     def open(self, name: str, folder: UPath) -> PhotoScene:
         """See `PhotoScenes`; raises as `scene_folder` too."""
@@ -76,10 +68,8 @@ class Dl3dvSource(SceneSource):
 
     Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
     `holdout` asks for any. Intrinsics are those of transforms.json, scaled to the photos' size.
-    Images that do not exist are left out, counted and named in a warning.
-
-    absent: scenes that `test_scenes` names and that are not there, which are counted and named in a
-    warning.
+    Images that do not exist are left out, counted and named in a warning; so are scenes of
+    `test_scenes` that are not there.
     """
 
     name = "dl3dv"
@@ -88,17 +78,16 @@ class Dl3dvSource(SceneSource):
     def __init__(self, config: Dl3dvConfig) -> None:
         super().__init__(config)
         places = find_scenes(opened_path(config.path))
-        self.absent: list[str] = []
         train, test = places, places if config.holdout else {}
         if config.test_scenes is not None:
             listed = read_scene_list(opened_path(config.test_scenes))
-            self.absent = [name for name in listed if name not in places]
+            absent = [name for name in listed if name not in places]
             test = {name: places[name] for name in listed if name in places}
             train = {name: place for name, place in places.items() if name not in test}
-            if self.absent:
+            if absent:
                 _log.warning(
                     "%d of %d test scenes are not there: %s",
-                    len(self.absent), len(listed), ", ".join(self.absent),
+                    len(absent), len(listed), ", ".join(absent),
                 )  # fmt: skip
         self._splits = {"train": Dl3dvScenes(train, config), "test": Dl3dvScenes(test, config)}
 
@@ -143,10 +132,8 @@ def find_scenes(path: UPath) -> dict[str, Place]:
             "or {hash}/"
         )
     scenes: dict[str, Place] = {}
-    again: set[str] = set()
-    for name, place in sorted(_places(path, _DEPTH), key=lambda item: (item[0], str(item[1]))):
-        if name in scenes:
-            again.add(name)
+    found = sorted(_places(path, _DEPTH), key=lambda item: (item[0], str(item[1])))
+    for name, place in found:
         if name not in scenes or isinstance(scenes[name], ArchivePath):
             scenes[name] = place
     if not scenes:
@@ -155,10 +142,11 @@ def find_scenes(path: UPath) -> dict[str, Place]:
             f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING}, also "
             f"in folders such as 1K/, found {inside}"
         )
+    again = [name for name, times in Counter(name for name, _ in found).items() if times > 1]
     if again:
         _log.warning(
             "%d scenes of %s are there more than once, as folders or archives; one of each is "
-            "read: %s", len(again), path, ", ".join(f"{n} ({scenes[n]})" for n in sorted(again)),
+            "read: %s", len(again), path, ", ".join(f"{n} ({scenes[n]})" for n in again),
         )  # fmt: skip
     return scenes
 
@@ -210,10 +198,9 @@ def read_scene_list(file: UPath) -> list[str]:
 
     Raises FileNotFoundError, and ValueError for a file that names no scene.
     """
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"the list of scenes {file} does not exist") from None
+    if not file.is_file():
+        raise FileNotFoundError(f"the list of scenes {file} does not exist")
+    text = file.read_text(encoding="utf-8-sig")
     if file.suffix == ".json":
         try:
             names = json.loads(text)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -27,11 +27,8 @@ class LazyScenes(Sequence[Scene]):
     def scene(self, place: int) -> Scene:
         """The scene at `place`, from 0 to below the number of scenes."""
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
+    def __getitem__(self, index: Any) -> Any:
+        """The scene at an index, or scenes at a slice of them."""
         places = range(len(self))[index]  # raises IndexError
         return [self.scene(i) for i in places] if isinstance(places, range) else self.scene(places)
 

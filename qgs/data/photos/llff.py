@@ -7,13 +7,7 @@ import re
 import numpy as np
 from upath import UPath
 
-from qgs.data.photos.reader import (
-    IMAGE_SUFFIXES,
-    Listing,
-    PhotoFrame,
-    PhotoReader,
-    image_folder,
-)
+from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoFrame, PhotoReader, image_folder
 
 
 class Llff(PhotoReader):

@@ -223,8 +223,7 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
     rest = "unused" if train and test else "test" if train else "train"
     return [
         replace(
-            frame,
-            split="train" if frame.name in train else "test" if frame.name in test else rest,
+            frame, split="train" if frame.name in train else "test" if frame.name in test else rest
         )
         for frame in frames
     ]

@@ -187,22 +187,15 @@ def _checked(size: tuple[int, ...], frame: PhotoFrame, file: UPath | None = None
 
 
 class PhotoScenes(LazyScenes):
-    """Scenes by name, opened when asked for; the last ones stay open.
-
-    missing: by scene that was opened, the listed photos that do not exist.
-    """
+    """Scenes by name, opened when asked for; the last ones stay open."""
 
     def __init__(
-        self,
-        folders: Mapping[str, UPath],
-        config: PhotosConfig,
-        cache_bytes: int = _CACHE_BYTES,
+        self, folders: Mapping[str, UPath], config: PhotosConfig, cache_bytes: int = _CACHE_BYTES
     ) -> None:
         self._folders, self._config = dict(folders), config
         self._opened: BoundedCache[PhotoScene] = BoundedCache(_OPEN_SCENES)
         self._images: BoundedCache[np.ndarray] = BoundedCache(cache_bytes, attrgetter("nbytes"))
         self.names = list(folders)
-        self.missing: dict[str, Sequence[str]] = {}
 
     def __len__(self) -> int:
         return len(self.names)
@@ -216,7 +209,6 @@ class PhotoScenes(LazyScenes):
         """The scene in `folder`. Raises as `present_frames`."""
         config = self._config
         frames, missing = present_frames(folder, config.format, config.images)
-        self.missing[name] = missing
         frames = frames[: config.max_frames or None]
         held_out = held_out_frames(frames, config.holdout)
         return PhotoScene(name, frames, config, held_out, missing, self._images)
@@ -263,12 +255,6 @@ class PhotosSource(SceneSource):
         """See `SceneSource`; no frame is held out."""
         config = super().config_for(path, image_size, trained)
         return config.model_copy(update={"holdout": 0})
-
-    @property
-    def missing(self) -> list[str]:
-        """Photos that a listing names and that do not exist, of the scenes opened so far."""
-        scenes = dict.fromkeys(self._scenes.values())
-        return [path for opened in scenes for paths in opened.missing.values() for path in paths]
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`."""
