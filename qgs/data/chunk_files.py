@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import io
 import json
-import logging
 import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,19 +29,17 @@ from PIL import Image
 from torch import Tensor
 from upath import UPath
 
-from qgs.data.lenses import Size
+from qgs.data.lenses import Intrinsics, Size
 from qgs.data.paths import is_local, stays_inside
 from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
+from qgs.data.scenes import warn_once
 
 INDEX = "index.json"
 SUFFIX = ".torch"
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
 _DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
-_HEADER = 4096  # bytes that nearly always hold an image's size
-_AGAIN = "pack the data set again with `qgs data pack`, or remove the scene from index.json"
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,16 +85,16 @@ class Record:
 
     def stored_size(self, frame: int) -> Size:
         """(H, W) in the header of an image. Raises ValueError for no readable image."""
-        data = self.images[frame]
-        for part in (data[:_HEADER], data):
-            try:
-                with Image.open(io.BytesIO(part.numpy().tobytes())) as image:
-                    return image.height, image.width
-            except (OSError, SyntaxError, ValueError):
-                continue
-        raise ValueError(f"{self.place(frame)}: the bytes are no readable image: {_AGAIN}")
+        try:
+            with Image.open(io.BytesIO(self.images[frame].numpy().tobytes())) as image:
+                return image.height, image.width
+        except (OSError, SyntaxError, ValueError) as error:
+            raise ValueError(
+                f"{self.place(frame)}: the bytes are no readable image ({error}): pack the data "
+                "set again with `qgs data pack`, or remove the scene from index.json"
+            ) from error
 
-    def intrinsics(self, frame: int, size: Size) -> tuple[float, float, float, float]:
+    def intrinsics(self, frame: int, size: Size) -> Intrinsics:
         """fx, fy, cx, cy in pixels of an image of `size` (H, W)."""
         fx, fy, cx, cy = self.cameras[frame, :4].double().tolist()
         return fx * size[1], fy * size[0], cx * size[1], cy * size[0]
@@ -115,34 +112,37 @@ def parse_record(file: str, data: Any) -> Record:
             "'images': is it a chunk of RealEstate10K's format?"
         )
     where = f"{file}: scene {data['key']!r}"
-    images = _encoded(where, "images", data.get("images"))
-    count = len(images)
-    if not count:
-        raise ValueError(f"{where} has no frames: {_AGAIN}")
-    cameras = _tensor(where, "cameras", data.get("cameras"), (count, 18))
-    if not cameras.is_floating_point():
-        raise ValueError(f"{where}: 'cameras' are {cameras.dtype}, expected float32: {_AGAIN}")
-    sizes, masks, names = data.get("sizes"), data.get("masks"), data.get("names")
+    images, masks, sizes = (data.get(name) for name in ("images", "masks", "sizes"))
+    _expect_files(where, "images", images)
+    _expect(len(images) > 0, where, "there are no frames")
+    cameras = _tensor(where, "cameras", data.get("cameras"), (len(images), 18))
+    _expect(cameras.is_floating_point(), where, f"'cameras' are {cameras.dtype}, expected float32")
     if sizes is not None:
-        sizes = _tensor(where, "sizes", sizes, (count, 2))
+        sizes = _tensor(where, "sizes", sizes, (len(images), 2))
     if masks is not None:
-        masks = _encoded(where, "masks", masks)
+        _expect_files(where, "masks", masks)
+    names, stamps = data.get("names"), data.get("timestamps")
     if not isinstance(names, list):
-        stamps = data.get("timestamps")
-        stamped = isinstance(stamps, Tensor) and stamps.numel() == count
-        names = stamps.flatten().tolist() if stamped else range(count)
-    for name, items in (("masks", masks), ("names", names)):
-        if items is not None and len(items) != count:
-            raise ValueError(f"{where}: {len(items)} {name} for {count} images: {_AGAIN}")
-    given = data.get("held_out")
-    held_out = given.tolist() if isinstance(given, Tensor) else list(() if given is None else given)
-    if not all(isinstance(frame, int) and 0 <= frame < count for frame in held_out):
-        raise ValueError(
-            f"{where}: 'held_out' must list frames from 0 to {count - 1}, got {held_out}: {_AGAIN}"
-        )
-    return Record(
-        where, data["key"], cameras, images, [*map(str, names)], sizes, masks, tuple(held_out)
+        stamped = isinstance(stamps, Tensor) and stamps.numel() == len(images)
+        names = stamps.flatten().tolist() if stamped else range(len(images))
+    for name, items in (("masks", images if masks is None else masks), ("names", names)):
+        counts = f"{len(items)} {name} for {len(images)} images"
+        _expect(len(items) == len(images), where, counts)
+    held_out = data.get("held_out", ())
+    held_out = tuple(held_out.tolist() if isinstance(held_out, Tensor) else held_out or ())
+    _expect(
+        all(isinstance(frame, int) and 0 <= frame < len(images) for frame in held_out),
+        where,
+        f"'held_out' must list frames from 0 to {len(images) - 1}, got {held_out}",
     )
+    names = [str(name) for name in names]
+    return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
+
+
+def _expect(valid: bool, where: str, reason: str) -> None:
+    if not valid:
+        fix = "pack the data set again with `qgs data pack`, or remove the scene from index.json"
+        raise ValueError(f"{where}: {reason}: {fix}")
 
 
 def a_type(value: object) -> str:
@@ -158,27 +158,19 @@ def _described(data: Any) -> str:
 
 
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
-    if isinstance(data, np.ndarray):
-        data = torch.from_numpy(data)
-    if not isinstance(data, Tensor) or tuple(data.shape) != shape:
-        found = list(data.shape) if isinstance(data, Tensor) else _described(data)
-        raise ValueError(
-            f"{where}: {name!r} must be a tensor of shape {list(shape)}, as there are {shape[0]} "
-            f"images, got {found}: {_AGAIN}"
-        )
+    data = torch.from_numpy(data) if isinstance(data, np.ndarray) else data
+    found = list(data.shape) if isinstance(data, Tensor) else _described(data)
+    wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
+    _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
     return data
 
 
-def _encoded(where: str, name: str, data: Any) -> Sequence[Tensor]:
+def _expect_files(where: str, name: str, data: Any) -> None:
     valid = isinstance(data, list | tuple) and all(
         isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
     )
-    if not valid:
-        raise ValueError(
-            f"{where}: {name!r} must be a list of one-dimensional uint8 tensors with the bytes of "
-            f"image files, got {_described(data)}: {_AGAIN}"
-        )
-    return data
+    wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
+    _expect(valid, where, f"{name!r} must be {wanted}, got {_described(data)}")
 
 
 def require_usable(record: Record) -> None:
@@ -213,17 +205,12 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
     """What is wrong with the unit of a frame's intrinsics, fractions of the image's sides."""
     values = record.cameras[frame, :4].tolist()
     focal = max(values[:2])
-    said = ", ".join(f"{value:.6g}" for value in values)
-    if focal >= _IN_PIXELS:
+    divided_twice = 0 < focal < _DIVIDED_TWICE
+    if divided_twice or focal >= _IN_PIXELS:
+        said = ", ".join(f"{value:.6g}" for value in values)
         yield FrameProblem(
             "intrinsics",
-            f"the intrinsics ({said}) look like pixels",
-            "chunks hold fx and cx divided by the image's width, fy and cy by its height",
-        )
-    elif 0 < focal < _DIVIDED_TWICE:
-        yield FrameProblem(
-            "intrinsics",
-            f"the intrinsics ({said}) look divided twice",
+            f"the intrinsics ({said}) look {'divided twice' if divided_twice else 'like pixels'}",
             "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
         )
 
@@ -354,10 +341,10 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
             "download the chunks beside it"
         )
     if missing:
-        _log.warning(
-            "%d of %d scenes of %s are left out, because their chunks do not exist: %s",
-            len(missing), len(index), folder / INDEX, ", ".join(missing),
-        )  # fmt: skip
+        warn_once(
+            f"{len(missing)} of {len(index)} scenes of {folder / INDEX} are left out, because "
+            f"their chunks do not exist: {', '.join(missing)}"
+        )
     return here
 
 
@@ -377,8 +364,8 @@ def _scanned(folder: UPath) -> dict[str, UPath]:
                     f"remove one of the files, or write an {INDEX}"
                 )
             files[key] = path
-    _log.warning(
-        "%s has no %s: all of its %d chunks were opened to list %d scenes, which happens at every "
-        "start", folder, INDEX, len(paths), len(files),
-    )  # fmt: skip
+    warn_once(
+        f"{folder} has no {INDEX}: all of its {len(paths)} chunks were opened to list {len(files)} "
+        "scenes, which happens at every start"
+    )
     return files

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import ClassVar
@@ -18,12 +17,11 @@ from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.chunk_files import SUFFIX, Chunk, Record, has_chunks, list_scenes, require_usable
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
 from qgs.data.paths import opened_path
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, warn_once
 from qgs.types import Cameras
 
 _OPEN = 4  # chunks kept open
 _SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
-_log = logging.getLogger(__name__)
 
 
 class ChunksConfig(SceneSource.Config):
@@ -244,10 +242,10 @@ def _chosen(chunks: BoundedCache[Chunk], folder: UPath, config: ChunksConfig) ->
         frames = {key: len(ChunkScene(chunks, file, key, config)) for key, file in by_file}
         short = {key: count for key, count in frames.items() if count < config.min_frames}
         if short:
-            _log.warning(
-                "%d of %d scenes of %s have fewer than %d frames (min_frames) and are left out: %s",
-                len(short), len(files), folder, config.min_frames,
-                ", ".join(f"{key} ({count})" for key, count in short.items()),
-            )  # fmt: skip
+            names = ", ".join(f"{key} ({count})" for key, count in short.items())
+            warn_once(
+                f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
+                f"{config.min_frames} frames (min_frames) and are left out: {names}"
+            )
         files = {key: file for key, file in files.items() if key not in short}
     return dict(list(files.items())[: config.max_scenes or None])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,12 +15,12 @@ from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.paths import ArchivePath, opened_path
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotoScenes, PhotosConfig
+from qgs.data.scenes import warn_once
 
 LISTING = "transforms.json"
 _INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
 _DEPTH = 2  # folders between the data set's and a scene
 _HASH = re.compile(r"[0-9a-f]{64}")
-_log = logging.getLogger(__name__)
 
 Place: TypeAlias = UPath | ArchivePath
 """An archive's top or a folder: what a scene is published as."""
@@ -85,10 +84,8 @@ class Dl3dvSource(SceneSource):
             test = {name: places[name] for name in listed if name in places}
             train = {name: place for name, place in places.items() if name not in test}
             if absent:
-                _log.warning(
-                    "%d of %d test scenes are not there: %s",
-                    len(absent), len(listed), ", ".join(absent),
-                )  # fmt: skip
+                names = ", ".join(absent)
+                warn_once(f"{len(absent)} of {len(listed)} test scenes are not there: {names}")
         self._splits = {"train": Dl3dvScenes(train, config), "test": Dl3dvScenes(test, config)}
 
     @classmethod
@@ -98,7 +95,10 @@ class Dl3dvSource(SceneSource):
         """
         if path.is_file():
             return path.suffix == ".zip"
-        return not formats_of(path) and _holds_scene(path, _DEPTH)
+        return not formats_of(path) and any(
+            isinstance(place, ArchivePath) or _HASH.fullmatch(name) or not formats_of(place)
+            for name, place in _places(path, _DEPTH)
+        )
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`."""
@@ -107,16 +107,6 @@ class Dl3dvSource(SceneSource):
     def names(self, split: Split) -> Sequence[str]:
         """See `SceneSource`."""
         return self._splits[split].names
-
-
-def _holds_scene(folder: UPath, depth: int) -> bool:
-    """Whether `folder`, or a folder in it, holds a scene as DL3DV publishes them."""
-    if any((folder / inside / LISTING).is_file() for inside in _INSIDE[1:]):
-        return True
-    items = [item for item in folder.iterdir() if not item.name.startswith(".")]
-    if any(item.suffix == ".zip" or _HASH.fullmatch(item.name) for item in items):
-        return True
-    return depth > 0 and any(_holds_scene(item, depth - 1) for item in items if item.is_dir())
 
 
 def find_scenes(path: UPath) -> dict[str, Place]:
@@ -144,10 +134,10 @@ def find_scenes(path: UPath) -> dict[str, Place]:
         )
     again = [name for name, times in Counter(name for name, _ in found).items() if times > 1]
     if again:
-        _log.warning(
-            "%d scenes of %s are there more than once, as folders or archives; one of each is "
-            "read: %s", len(again), path, ", ".join(f"{n} ({scenes[n]})" for n in again),
-        )  # fmt: skip
+        warn_once(
+            f"{len(again)} scenes of {path} are there more than once, as folders or archives; one "
+            f"of each is read: {', '.join(f'{name} ({scenes[name]})' for name in again)}"
+        )
     return scenes
 
 

@@ -46,11 +46,10 @@ class CropResize:
         return (source - source.new_tensor([0.0, 0.0, left, top])) * self.scale
 
     def image(
-        self, image: Image.Image, filter: Image.Resampling = Image.Resampling.LANCZOS
+        self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
     ) -> np.ndarray:
         """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel."""
-        height, width = self.target
-        return np.array(image.resize((width, height), filter, box=self.box))
+        return np.array(image.resize(self.target[::-1], kernel, box=self.box))
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from qgs.geometry.rays import pixel_directions
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
+Mode: TypeAlias = Literal["bilinear", "nearest"]
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def undistorted(
     pixels: np.ndarray,
     intrinsics: Intrinsics,
     lens: Lens | None,
-    mode: Literal["bilinear", "nearest"] = "bilinear",
+    mode: Mode = "bilinear",
 ) -> np.ndarray:
     """The photo as a pinhole camera with the same intrinsics would have taken it.
 

@@ -98,10 +98,8 @@ class Archive:
             raise OSError(f"the archive is damaged there: {error}") from error
 
 
-@lru_cache(maxsize=8)
-def open_archive(path: UPath) -> Archive:
-    """The zip file `path`. A process keeps the last 8 open. Raises as `Archive`."""
-    return Archive(path)
+open_archive = lru_cache(maxsize=8)(Archive)
+"""A process keeps the last archives open."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import threading
 import traceback
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count, islice
@@ -223,8 +222,12 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
         worker_init_fn=_prepare_worker,
         generator=torch.Generator(),  # so that no random number of the training is used up
     )
-    with _without_torchs_handler():
-        made = iter(loader)
+    handler = signal.getsignal(signal.SIGCHLD)
+    made = iter(loader)
+    if threading.current_thread() is threading.main_thread():
+        # torch's handler raises wherever training is when a worker dies. Asking for a batch raises
+        # too, within seconds, between two steps.
+        signal.signal(signal.SIGCHLD, handler)
     try:
         while True:
             try:
@@ -242,20 +245,6 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
             yield batch
     finally:
         del made
-
-
-@contextmanager
-def _without_torchs_handler() -> Iterator[None]:
-    """Undo torch's handler of SIGCHLD, which raises wherever training is when a worker dies.
-
-    Asking for a batch raises too, within seconds, between two steps.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.getsignal(signal.SIGCHLD)
-    yield
-    signal.signal(signal.SIGCHLD, before)
 
 
 def _prepare_worker(number: int) -> None:

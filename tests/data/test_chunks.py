@@ -203,7 +203,7 @@ BROKEN = {
         r"scene 's0': 'cameras' must be a tensor of shape \[4, 18\].*got \[5, 18\]",
     ),
     "no images": ([record("s0", images=None)], "'images' must be a list of one-dimensional uint8"),
-    "no frames": ([record("s0", 0)], "scene 's0' has no frames"),
+    "no frames": ([record("s0", 0)], "scene 's0': there are no frames"),
     "another key": ([record("s9")], "does not hold the scene 's0'.*it holds s9"),
     "one key twice": ([record("s0"), record("s0")], "'s0' twice"),
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
@@ -17,7 +17,7 @@ import numpy as np
 from upath import UPath
 
 from qgs.contracts.component import MissingExtraError
-from qgs.data.lenses import Fisheye, Lens, RadialTangential, Size, bending
+from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
 from qgs.data.photos.checks import FrameProblem
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
 
@@ -59,9 +59,13 @@ class Colmap(PhotoReader):
                 f"reading the COLMAP model {model} needs pycolmap, which is not installed: run "
                 '`pip install "query-gaussians[colmap]"`'
             )
+        read_cameras, read_images = _READ[suffix]
         try:
-            read = _read_text if suffix == "txt" else _read_binary
-            posed = list(read(model / f"cameras.{suffix}", model / f"images.{suffix}"))
+            cameras = {number: _camera(*rest) for number, *rest in read_cameras(model)}
+            posed = list(read_images(model))
+            unknown = {camera for *_, camera in posed} - cameras.keys()
+            if unknown:
+                raise ValueError(f"images are of cameras {sorted(unknown)}, which are not in it")
         except ValueError as error:
             raise ValueError(
                 f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
@@ -69,7 +73,9 @@ class Colmap(PhotoReader):
             ) from error
         photos = image_folder(folder, images)
         frames = [
-            PhotoFrame(str(PurePosixPath(photos.name, name)), photos / name, _c2w(*pose), **camera)
+            PhotoFrame(
+                str(PurePosixPath(photos.name, name)), photos / name, _c2w(*pose), **cameras[camera]
+            )
             for name, pose, camera in posed
         ]
         return Listing(model, sorted(frames, key=lambda frame: frame.name))
@@ -84,53 +90,51 @@ def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
                 yield folder / place, suffix
 
 
-Image: TypeAlias = tuple[str, list[float], dict[str, Any]]
-"""Its name, its quaternion (w, x, y, z) and translation (x, y, z), what its camera says."""
+Camera: TypeAlias = tuple[int, str, int, int, Sequence[float]]
+"""Number, name of the model, width, height, parameters."""
+Image: TypeAlias = tuple[str, list[float], int]
+"""Name, quaternion (w, x, y, z) with translation (x, y, z), number of the camera."""
 
 
-def _read_text(cameras_file: UPath, images_file: UPath) -> Iterator[Image]:
-    import pycolmap
+def _text_cameras(model: UPath) -> Iterator[Camera]:
+    for line in _lines(model / "cameras.txt"):
+        number, name, width, height, *parameters = line.split()
+        yield int(number), name, int(width), int(height), [*map(float, parameters)]
 
-    cameras: dict[int, dict[str, Any]] = {}
-    for line in _lines(cameras_file):
-        number, model, width, height, *parameters = line.split()
-        if model not in pycolmap.CameraModelId.__members__:
-            raise ValueError(f"cameras.txt has a camera of the unknown model {model}")
-        size = (int(height), int(width))
-        model_id = pycolmap.CameraModelId.__members__[model]
-        cameras[int(number)] = _camera(model_id, size, list(map(float, parameters)))
-    lines = _lines(images_file, every=2)  # each line of an image is followed by one of its points
-    for line in lines:
+
+def _text_images(model: UPath) -> Iterator[Image]:
+    for line in _lines(model / "images.txt", after=1):  # a line of points follows each image
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal():
             raise ValueError(
                 f"images.txt has the line {line[:60]!r} where an image was expected: 9 numbers "
                 "and a name, then a line of points, which may be empty"
             )
-        yield fields[8], list(map(float, fields[:7])), _of_image(cameras, int(fields[7]))
+        yield fields[8], [*map(float, fields[:7])], int(fields[7])
 
 
-def _lines(file: UPath, every: int = 1) -> Iterator[str]:
-    """The lines of a text file less comments and empty ones, the first of each `every` lines."""
+def _lines(file: UPath, after: int = 0) -> Iterator[str]:
+    """The lines of a file less comments, empty ones, and so many `after` each of the others."""
     with file.open("r", encoding="utf-8") as opened:
         for line in map(str.strip, opened):
             if line and not line.startswith("#"):
                 yield line
-                for _ in range(every - 1):
+                for _ in range(after):
                     next(opened, None)
 
 
-def _read_binary(cameras_file: UPath, images_file: UPath) -> Iterator[Image]:
+def _binary_cameras(model: UPath) -> Iterator[Camera]:
     import pycolmap
 
-    cameras: dict[int, dict[str, Any]] = {}
-    with cameras_file.open("rb") as file:
+    with (model / "cameras.bin").open("rb") as file:
         for _ in range(_unpacked("<Q", file)[0]):
-            number, model, width, height = _unpacked("<IiQQ", file)
-            model_id = pycolmap.CameraModelId(model)
-            count = len(_parameter_names(model_id))
-            cameras[number] = _camera(model_id, (height, width), _unpacked(f"<{count}d", file))
-    with images_file.open("rb") as file:
+            number, kind, width, height = _unpacked("<IiQQ", file)
+            name = pycolmap.CameraModelId(kind).name
+            yield number, name, width, height, _unpacked(f"<{len(_parameters(name))}d", file)
+
+
+def _binary_images(model: UPath) -> Iterator[Image]:
+    with (model / "images.bin").open("rb") as file:
         end = file.seek(0, 2)
         file.seek(0)
         for _ in range(_unpacked("<Q", file)[0]):
@@ -140,7 +144,10 @@ def _read_binary(cameras_file: UPath, images_file: UPath) -> Iterator[Image]:
             if file.tell() + points > end:
                 raise ValueError("images.bin is cut off")
             file.seek(points, 1)
-            yield name, pose, _of_image(cameras, camera)
+            yield name, pose, camera
+
+
+_READ = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_images)}
 
 
 def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
@@ -150,34 +157,31 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
     return struct.unpack(format, content)
 
 
-def _parameter_names(model: Any) -> list[str]:
-    """Of a `pycolmap.CameraModelId`."""
+def _parameters(model: str) -> list[str]:
+    """Names of the parameters of a camera model. Raises ValueError for one unknown to pycolmap."""
     import pycolmap
 
-    return pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params_info.split(", ")
+    kind = pycolmap.CameraModelId.__members__.get(model)
+    if kind is None:
+        raise ValueError(f"there is no camera model {model}")
+    return pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params_info.split(", ")
 
 
-def _camera(model: Any, size: Size, parameters: Sequence[float]) -> dict[str, Any]:
-    """Fields of a `PhotoFrame` that a camera of a `pycolmap.CameraModelId` took."""
-    values = dict(zip(_parameter_names(model), parameters, strict=True))
-    fields: dict[str, Any] = {"size": size if all(size) else None}
-    if model.name not in _LENSES:
+def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
+    """Fields of a `PhotoFrame` that the camera took."""
+    values = dict(zip(_parameters(model), parameters, strict=True))
+    fields: dict[str, Any] = {"size": (height, width) if height and width else None}
+    if model not in _LENSES:
         fix = f"undistort with `colmap image_undistorter`, or use one of {', '.join(_LENSES)}"
-        problem = FrameProblem("lens", f"the camera model {model.name} is not known", fix)
+        problem = FrameProblem("lens", f"the camera model {model} is not known", fix)
         return {**fields, "intrinsics": (math.nan,) * 4, "problems": (problem,)}
     focal = values.pop("f", math.nan)
     fx, fy = values.pop("fx", focal), values.pop("fy", focal)
     fields["intrinsics"] = (fx, fy, values.pop("cx"), values.pop("cy"))
-    lens = _LENSES[model.name]
+    lens = _LENSES[model]
     if lens is not None:
         fields["lens"] = bending(lens(**{"k1" if k == "k" else k: v for k, v in values.items()}))
     return fields
-
-
-def _of_image(cameras: Mapping[int, dict[str, Any]], number: int) -> dict[str, Any]:
-    if number not in cameras:
-        raise ValueError(f"an image was taken by camera {number}, which is not in the model")
-    return cameras[number]
 
 
 def _c2w(*cam_from_world: float) -> np.ndarray:

@@ -215,28 +215,22 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
     Validation photos are test photos too. With one kind of list, the other frames are of the other
     kind; with both, frames that no list names are unused.
     """
-    train = _split_names(data, "train_filenames", frames)
-    test = _split_names(data, "test_filenames", frames)
-    test |= _split_names(data, "val_filenames", frames)
-    if not train and not test:
-        return list(frames)
-    rest = "unused" if train and test else "test" if train else "train"
+    known = {frame.name for frame in frames}
+    splits: dict[str, set[str]] = {"train": set(), "test": set()}
+    for part, split in (("train", "train"), ("test", "test"), ("val", "test")):
+        key = f"{part}_filenames"
+        given = data.get(key) or []
+        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+            raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
+        names = set(map(image_name, given))
+        for name in sorted(names - known):
+            raise ValueError(
+                f"{key!r} names {name}, which no frame has: add the frame, or remove the name"
+            )
+        splits[split] |= names
+    train, test = splits["train"], splits["test"]
+    rest = ("unused" if test else "test") if train else ("train" if test else None)
     return [
-        replace(
-            frame, split="train" if frame.name in train else "test" if frame.name in test else rest
-        )
-        for frame in frames
+        replace(f, split="train" if f.name in train else "test" if f.name in test else rest)
+        for f in frames
     ]
-
-
-def _split_names(data: Mapping[str, Any], key: str, frames: Sequence[PhotoFrame]) -> set[str]:
-    given = data.get(key) or []
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-        raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
-    names = {image_name(name) for name in given}
-    unknown = sorted(names - {frame.name for frame in frames})
-    if unknown:
-        raise ValueError(
-            f"{key!r} names {unknown[0]}, which no frame has: add the frame, or remove the name"
-        )
-    return names

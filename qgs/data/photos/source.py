@@ -26,7 +26,7 @@ from qgs.data.images import (
     open_rgb,
     to_tensor,
 )
-from qgs.data.lenses import Size, undistorted
+from qgs.data.lenses import Mode, Size, undistorted
 from qgs.data.paths import opened_path
 from qgs.data.photos import Format, formats_of, read_listing
 from qgs.data.photos.checks import require_sound, size_problems
@@ -35,7 +35,6 @@ from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes
 from qgs.types import Cameras, Views
 
 _OPEN_SCENES = 64
-_CACHE_BYTES = 512 * 2**20
 
 
 class PhotosConfig(SceneSource.Config):
@@ -64,22 +63,19 @@ class PhotosConfig(SceneSource.Config):
 class PhotoScene(EncodedScene):
     """The photos of one listing, in its order. World: that of the listing's poses.
 
-    held_out: frames that training never sees. missing: listed photos that do not exist.
-    cache: of decoded images, shared by the scenes of a source.
+    cache: of decoded images, shared by the scenes of a source. Raises as `present_frames`.
     """
 
     def __init__(
-        self,
-        name: str,
-        frames: Sequence[PhotoFrame],
-        config: PhotosConfig,
-        held_out: Sequence[int] = (),
-        missing: Sequence[str] = (),
-        cache: BoundedCache[np.ndarray] | None = None,
+        self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
     ) -> None:
-        self.name, self.held_out, self.missing = name, tuple(held_out), missing
-        self._frames, self._config = frames, config
-        self._cache = cache or BoundedCache(_CACHE_BYTES, attrgetter("nbytes"))
+        self.name, self._config, self._cache = name, config, cache
+        frames, self.missing = present_frames(folder, config.format, config.images)
+        self._frames = frames = frames[: config.max_frames or None]
+        every = config.holdout
+        self.held_out = tuple(range(every // 2, len(frames), every)) if every else ()
+        if any(frame.split for frame in frames):
+            self.held_out = tuple(i for i, frame in enumerate(frames) if frame.split == "test")
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -95,7 +91,7 @@ class PhotoScene(EncodedScene):
         for frame in self._frames:
             alike = (frame.path.parent, frame.size) if frame.size else frame.path
             if alike not in known:
-                known[alike] = _checked(image_size(frame.path), frame)
+                known[alike] = _checked(image_size(frame.path), frame, frame.path)
             size = known[alike]
             listed = torch.tensor(frame.at_size(size), dtype=torch.float64)
             intrinsics.append(CropResize(size, self._config.image_size).intrinsics(listed))
@@ -104,20 +100,20 @@ class PhotoScene(EncodedScene):
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`. Raises ValueError for a file that cannot be decoded."""
-        return to_tensor(self._stacked("image", self._image, frames))
+        return to_tensor(self._stacked(self._image, frames))
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
         """See `Scene`; 1 everywhere for a photo without a mask in a scene that has some."""
         if all(frame.mask is None for frame in self._frames):
             return None
-        masks = self._stacked("mask", self._mask, frames)
+        masks = self._stacked(self._mask, frames)
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
         """See `Scene`; 0 where a map says nothing. None unless all `frames` have a map."""
         if any(self._frames[i].depth is None for i in frames):
             return None
-        return torch.from_numpy(self._stacked("depth", self._depth, frames))[:, None]
+        return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
 
     def frame_name(self, frame: int) -> str:
         """See `Scene`: the image file, relative to the scene's folder."""
@@ -126,7 +122,7 @@ class PhotoScene(EncodedScene):
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
         listed = self._frames[frame]
-        size = _checked(image_size(listed.path), listed)
+        size = _checked(image_size(listed.path), listed, listed.path)
         mask = None
         if listed.mask is not None:
             buffer = io.BytesIO()
@@ -138,39 +134,34 @@ class PhotoScene(EncodedScene):
         )  # fmt: skip
 
     def _stacked(
-        self, kind: str, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
+        self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
         """(F, H, W, ...) of what `read` makes of the frames, or made before."""
-        return np.stack(
-            [
-                self._cache.get((self.name, kind, i), lambda i=i: read(self._frames[i]))
-                for i in frames
-            ]
-        )
+        keys = ((self.name, read.__name__, i) for i in frames)
+        return np.stack([self._cache.get(k, lambda k=k: read(self._frames[k[2]])) for k in keys])
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
-        return self._delivered(np.array(open_rgb(frame.path, self._config.background)), frame)
+        pixels = np.array(open_rgb(frame.path, self._config.background))
+        return self._delivered(pixels, frame, frame.path)
 
     def _mask(self, frame: PhotoFrame) -> np.ndarray:
         if frame.mask is None:
             return np.full(self._config.image_size, 255, np.uint8)
         return self._delivered(_whole_mask(frame), frame, frame.mask)
 
-    def _delivered(
-        self, pixels: np.ndarray, frame: PhotoFrame, file: UPath | None = None
-    ) -> np.ndarray:
-        """Pixels of the photo or of `file` without distortion, at the delivered size."""
-        size = _checked(pixels.shape[:2], frame, file)
-        pixels = undistorted(pixels, frame.at_size(size), frame.lens)
-        return CropResize(size, self._config.image_size).image(Image.fromarray(pixels))
-
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
         assert frame.depth is not None
         depth = open_depth(frame.depth, self._config.depth_unit)
-        size = _checked(depth.shape, frame, frame.depth)
-        depth = undistorted(depth, frame.at_size(size), frame.lens, "nearest")
-        crop = CropResize(size, self._config.image_size)
-        return crop.image(Image.fromarray(depth), Image.Resampling.NEAREST)
+        return self._delivered(depth, frame, frame.depth, "nearest")
+
+    def _delivered(
+        self, pixels: np.ndarray, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
+    ) -> np.ndarray:
+        """The content of `file` without distortion, at the delivered size."""
+        size = _checked(pixels.shape[:2], frame, file)
+        pixels = undistorted(pixels, frame.at_size(size), frame.lens, mode)
+        kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
+        return CropResize(size, self._config.image_size).image(Image.fromarray(pixels), kernel)
 
 
 def _whole_mask(frame: PhotoFrame) -> np.ndarray:
@@ -178,11 +169,11 @@ def _whole_mask(frame: PhotoFrame) -> np.ndarray:
     return alpha_mask(frame.path) if frame.mask == frame.path else open_mask(frame.mask)
 
 
-def _checked(size: tuple[int, ...], frame: PhotoFrame, file: UPath | None = None) -> Size:
-    """`size` of a file of the frame, its photo by default, if it goes with what is listed."""
+def _checked(size: tuple[int, ...], frame: PhotoFrame, file: UPath) -> Size:
+    """(H, W) of `file`, which is one of the frame, if it goes with what is listed."""
     height, width = size
     for problem in size_problems((height, width), frame.size):
-        raise ValueError(f"{file or frame.path}: {problem}")
+        raise ValueError(f"{file}: {problem}")
     return height, width
 
 
@@ -190,7 +181,7 @@ class PhotoScenes(LazyScenes):
     """Scenes by name, opened when asked for; the last ones stay open."""
 
     def __init__(
-        self, folders: Mapping[str, UPath], config: PhotosConfig, cache_bytes: int = _CACHE_BYTES
+        self, folders: Mapping[str, UPath], config: PhotosConfig, cache_bytes: int = 512 * 2**20
     ) -> None:
         self._folders, self._config = dict(folders), config
         self._opened: BoundedCache[PhotoScene] = BoundedCache(_OPEN_SCENES)
@@ -207,11 +198,7 @@ class PhotoScenes(LazyScenes):
 
     def open(self, name: str, folder: UPath) -> PhotoScene:
         """The scene in `folder`. Raises as `present_frames`."""
-        config = self._config
-        frames, missing = present_frames(folder, config.format, config.images)
-        frames = frames[: config.max_frames or None]
-        held_out = held_out_frames(frames, config.holdout)
-        return PhotoScene(name, frames, config, held_out, missing, self._images)
+        return PhotoScene(name, folder, self._config, self._images)
 
 
 class PhotosSource(SceneSource):
@@ -300,13 +287,6 @@ def folder_name(folder: UPath) -> str:
     return folder.resolve().name or "photos"
 
 
-def held_out_frames(frames: Sequence[PhotoFrame], holdout: int) -> tuple[int, ...]:
-    """The frames that a listing's split keeps from training; else every `holdout`-th one."""
-    if any(frame.split for frame in frames):
-        return tuple(i for i, frame in enumerate(frames) if frame.split == "test")
-    return tuple(range(holdout // 2, len(frames), holdout)) if holdout else ()
-
-
 def present_frames(
     folder: UPath, format: Format = "auto", images: str | None = None
 ) -> tuple[list[PhotoFrame], list[str]]:
@@ -358,7 +338,7 @@ def read_photos(
     """
     folder = opened_path(path)
     config = PhotosConfig(path=str(path), image_size=image_size, format=format)
-    scene = PhotoScene(folder_name(folder), present_frames(folder, format)[0], config)
+    scene = PhotoScenes({folder_name(folder): folder}, config).scene(0)
     chosen = list(range(len(scene))) if frames is None else list(frames)
     outside = [frame for frame in chosen if not 0 <= frame < len(scene)]
     if outside:
