@@ -68,7 +68,7 @@ def protocol_of(
     """
     evaluation, config = recipe.evaluation, recipe.parts["data",].config
     assert isinstance(config, SceneSourceConfig)
-    left_out = {"image_size", *config.undecisive}
+    left_out = {"image_size", *config.unhashed_options}
     data: dict[str, Any] = {}
     if index is None:
         data["type"] = recipe.tree["data"]["type"]

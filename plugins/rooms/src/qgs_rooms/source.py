@@ -16,7 +16,7 @@ from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.contracts.component import MissingExtraError
-from qgs.data.lazy import LazyScenes
+from qgs.data.scenes import LazyScenes
 from qgs.types import Cameras
 from qgs_rooms.draws import Draws
 from qgs_rooms.path import camera_path
@@ -35,7 +35,7 @@ class RoomsConfig(SceneSource.Config):
     0 for none.
     """
 
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {"cache_mb"}
+    unhashed_options: ClassVar[frozenset[str]] = SceneSource.Config.unhashed_options | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
     scenes: int = Field(default=2000, ge=1)
