@@ -88,17 +88,18 @@ def new_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     when it appeared while the block ran. When the block raises, there is no `folder`.
     """
     target = Path(folder)
-    _refuse_existing(target)
+    refuse_existing(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
         fresh = Path(temporary, target.name)
         fresh.mkdir()
         yield fresh
-        _refuse_existing(target)
+        refuse_existing(target)
         fresh.rename(target)
 
 
-def _refuse_existing(target: Path) -> None:
+def refuse_existing(target: Path) -> None:
+    """Raise FileExistsError for a path at which something lies already."""
     if target.exists() or target.is_symlink():
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 
