@@ -16,6 +16,8 @@ from upath import UPath
 
 from qgs.data.paths import is_local
 
+_log = logging.getLogger(__name__)
+
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -110,9 +112,6 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-_log = logging.getLogger(__name__)
-
-
 def read_records(path: Path) -> list[dict[str, Any]]:
     """The records of `path` that tell their "step"; none when the file does not exist.
 
@@ -124,20 +123,14 @@ def read_records(path: Path) -> list[dict[str, Any]]:
     *lines, _ = path.read_text(encoding="utf-8", errors="replace").split("\n")
     records = []
     for number, line in enumerate(lines, start=1):
-        record = _parsed(line)
-        if record is None:
+        try:
+            record = json.loads(line)
+            int(record["step"])
+        except (ValueError, TypeError, KeyError):
             _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
         else:
             records.append(record)
     return records
-
-
-def _parsed(line: str) -> dict[str, Any] | None:
-    try:
-        record = json.loads(line)
-    except ValueError:
-        return None
-    return record if isinstance(record, dict) and isinstance(record.get("step"), int) else None
 
 
 @contextmanager
