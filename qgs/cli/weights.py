@@ -43,10 +43,10 @@ def import_(
     resolved = None if recipe == "auto" else resolve(recipe, overrides or ())
     done = import_weights(weights, resolved, out, overrides=overrides or (), to_float32=to_float32)
     name = done.layout.name
-    lines = [*done.notes, f"{name} ({done.layout.source}): {done.used} tensors used"]
-    if done.dropped:
-        lines.append(f"knowingly dropped, {name} never reads these {len(done.dropped)}:")
-        lines += [f"  {tensor}" for tensor in done.dropped]
+    lines = [*done.notes, f"{name} ({done.layout.source}): {done.count} tensors used"]
+    if done.unused:
+        lines.append(f"knowingly dropped, {name} never reads these {len(done.unused)}:")
+        lines += [f"  {tensor}" for tensor in done.unused]
     if done.settings:
         lines.append(f"the recipe differs from {name} in options that no weight shows:")
         lines += [f"  {setting}" for setting in done.settings]
@@ -68,14 +68,14 @@ def export(
 
     done = export_weights(checkpoint_of(checkpoint), out)
     name = done.layout.name
-    lines = [f"{name} ({done.layout.source}): {done.written} tensors written"]
+    lines = [f"{name} ({done.layout.source}): {done.count} tensors written"]
     if done.settings:
         lines.append("the file does not carry these options; its reader must be given them:")
         lines += [f"  {setting}" for setting in done.settings]
-    if done.absent:
+    if done.unused:
         lines.append(
-            f"{name} also stores {len(done.absent)} tensors that it never reads; they are absent, "
+            f"{name} also stores {len(done.unused)} tensors that it never reads; they are absent, "
             "so load with strict=False and expect exactly these to be missing:"
         )
-        lines += [f"  {tensor}" for tensor in done.absent]
+        lines += [f"  {tensor}" for tensor in done.unused]
     typer.echo("\n".join([*lines, f"wrote {out}"]))

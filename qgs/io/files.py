@@ -125,11 +125,13 @@ def read_records(path: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
-            int(record["step"])
+            sound = isinstance(record["step"], int)
         except (ValueError, TypeError, KeyError):
-            _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
-        else:
+            sound = False
+        if sound:
             records.append(record)
+        else:
+            _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
     return records
 
 

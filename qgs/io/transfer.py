@@ -31,35 +31,22 @@ from qgs.io.weight_file import WeightFile, read_weight_file
 
 
 @dataclass(frozen=True)
-class Imported:
-    """What `import_weights` did.
+class Transfer:
+    """What `import_weights` or `export_weights` did.
 
-    used: parameters installed. dropped: published names that nothing reads. notes: what was made of
-    the file. recipe_file: the recipe that was written, if one was. settings: as of `Exported`.
+    count: parameters taken over. unused: published names that nothing reads, of an import those
+    that the file had, of an export all, which the file lacks. settings: options that weights do not
+    show and in which the model differs from the published one, as `path: value (published value)`.
+    notes: what was made of the file. recipe_file: the recipe that was written, if one was.
     """
 
     layout: WeightLayout
     recipe: Recipe
-    used: int
-    dropped: tuple[str, ...]
-    notes: tuple[str, ...]
-    recipe_file: Path | None
+    count: int
+    unused: tuple[str, ...]
     settings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Exported:
-    """What `export_weights` did.
-
-    absent: parameters that the codebase stores, never reads, and finds missing in the file.
-    settings: options that the file cannot carry and in which the model differs from the published
-    one, as `path: value (published value)`.
-    """
-
-    layout: WeightLayout
-    written: int
-    absent: tuple[str, ...]
-    settings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    recipe_file: Path | None = None
 
 
 def import_weights(
@@ -69,7 +56,7 @@ def import_weights(
     *,
     overrides: Sequence[str] = (),
     to_float32: bool = False,
-) -> Imported:
+) -> Transfer:
     """Write a checkpoint of `recipe` with published weights.
 
     recipe: None for the one that fits, changed by `overrides` (such as "data.image_size=[64, 64]"),
@@ -104,10 +91,10 @@ def import_weights(
             raise
     dropped = tuple(name for name in names.unused if name in file.tensors)
     notes = (*file.notes, *converted)
-    return Imported(names.layout, recipe, len(tensors), dropped, notes, recipe_file, settings)
+    return Transfer(names.layout, recipe, len(tensors), dropped, settings, notes, recipe_file)
 
 
-def export_weights(checkpoint: str | Path, out: str | Path) -> Exported:
+def export_weights(checkpoint: str | Path, out: str | Path) -> Transfer:
     """Write the weights of a checkpoint under their published names.
 
     out: a new .safetensors file. Raises FileNotFoundError, FileExistsError, CheckpointError,
@@ -124,7 +111,7 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Exported:
     with replacing(out) as temporary:
         save_file(published, temporary, {"format": "pt"})
     settings = _settings(recipe, names.layout, shapes_of(published))
-    return Exported(names.layout, len(published), names.unused, settings)
+    return Transfer(names.layout, recipe, len(published), names.unused, settings)
 
 
 def _new_safetensors(path: str | Path) -> Path:
