@@ -23,8 +23,6 @@ from qgs.io.ply import write_ply
 SAME = ("data", "views", "evaluation", "metrics", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
 
-NO_STEP_LIMIT = 1_000_000_000
-
 
 class StoppedError(Exception):
     """Someone stopped the contest; the argument is the signal's name."""
@@ -44,11 +42,7 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 
     Raises ValueError when two files share a name, or differ in anything but the model and losses.
     """
-    overrides = [
-        f"training.seconds={seconds}",
-        f"training.steps={NO_STEP_LIMIT}",
-        f"seed={seed}",
-    ]
+    overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
     recipes = {file.stem: resolve(file, overrides) for file in files}
     if len(recipes) < len(files):
         raise ValueError(f"recipes are told apart by file name, got {[f.name for f in files]}")
@@ -163,16 +157,13 @@ def _facts(recipes: Sequence[Recipe], seconds: float, seed: int) -> dict[str, st
     height, width = data["image_size"]
     plugins = {name: version for r in recipes for name, version in r.plugin_versions.items()}
     versions = [f"{name} {version}" for name, version in plugins.items()]
+    device = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
+    if torch.cuda.is_available():
+        device = torch.cuda.get_device_name()
     return {
         "Data": f"{data['type']}, {width} × {height} pixels",
         "Views": f"{views.inputs} inputs, judged on the views between them",
         "Budget": f"{seconds:g} seconds of training each, seed {seed}",
-        "Machine": f"{_device()}, {torch.get_num_threads()} threads, {platform.system()}",
+        "Machine": f"{device}, {torch.get_num_threads()} threads, {platform.system()}",
         "Software": ", ".join([f"torch {torch.__version__}", *versions]),
     }
-
-
-def _device() -> str:
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"CPU with {os.cpu_count()} cores ({platform.machine()})"

@@ -36,7 +36,7 @@ def anchored() -> dict:
         },
         "centers": {"type": "locus/radius_scaled"},
     }
-    return {**PLAIN, "plugins": ["locus"], "model": model}
+    return {**PLAIN, "plugins": ["locus", "rooms"], "model": model}
 
 
 def page_of(tree: dict, name: str) -> str:

@@ -18,7 +18,7 @@ from qgs.contracts import Queries
 from qgs.engine import train
 from qgs.engine.checkpoint import initialise
 from qgs.io.checkpoint import CheckpointError, save
-from qgs.io.published import to_published
+from qgs.io.published import exact_names_of
 from qgs.io.transfer import import_weights
 from qgs.model import QueryGaussianModel
 
@@ -207,7 +207,7 @@ def test_imported_weights_grow_too(tmp_path: Path) -> None:
     small = {"width": 16, "heads": 2, "queries": {"count": 6}, "decoder": {"depth": 1},
              "supervision": {"layers": [1]}}  # fmt: skip
     recipe = resolve({"recipe": 1, "model": small})
-    weights = to_published(recipe.build_model().state_dict(), recipe)
+    weights = exact_names_of(recipe).to_published(recipe.build_model().state_dict())
     save_file(weights, tmp_path / "w.safetensors")
     import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
     grown = resolve(

@@ -13,7 +13,7 @@ from published.recording import model_tensors
 from published.tokengs import tokengs_recipe
 from qgs.composer import resolve
 from qgs.contracts.weights import real_ratio
-from qgs.io.published import from_published
+from qgs.io.published import names_of
 from qgs.types import Cameras, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -32,7 +32,7 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()
-    model.load_state_dict(from_published(golden.weights(), recipe), strict=True)
+    model.load_state_dict(names_of(recipe).from_published(golden.weights()), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
     return model_tensors(model, Views(golden.input("rgb"), cameras))
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from qgs.analysis.report import png_uri
 from qgs.drawing.figures import INK, figure_picture, figure_style, hex_color
-from qgs.drawing.images import Picture
+from qgs.drawing.images import Picture, png_uri
 from qgs_datatools.check import CheckReport, SceneReport
 from qgs_datatools.epipolar import Pair, epipolar_lines
 
