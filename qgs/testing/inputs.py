@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -31,11 +31,22 @@ Inputs: TypeAlias = dict[str, Any]
 PATCH = 8
 """Pixels along a patch of the image memory that decoder components are given."""
 
+ARGUMENTS: Mapping[str, tuple[str, ...]] = {
+    "encoder": ("views",),
+    "queries": ("batch_size",),
+    "cross_attention": ("state", "memory"),
+    "self_attention": ("state",),
+    "feed_forward": ("features",),
+    "refinement": ("state",),
+    "head": ("state",),
+    "centers": ("offsets", "state"),
+    "renderer": ("gaussians", "cameras"),
+    "losses": ("prediction", "rendering", "target"),
+}
+"""Arguments of the forward pass of each slot's components, in their order: methods of `Maker`."""
+
 QUERY_INPUTS = ("state", "features", "offsets")
 """Arguments whose second dimension counts queries."""
-
-PRESENT = ("memory.", "rendering.")
-"""Prefixes of fields that are no part of the state of the queries."""
 
 
 @dataclass(frozen=True)
@@ -49,40 +60,33 @@ class Sizes:
     image: tuple[int, int] | None = None
 
 
-def crowd_of(case: Case) -> Sizes:
-    """Sizes that no loop over 64 or 128 items at a time covers, in milliseconds.
-
-    200 queries, of one Gaussian each, hundreds of tokens, 6 scenes.
-    """
+def many(case: Case) -> Sizes:
+    """More queries, Gaussians and tokens than what works on windows or chunks of 128 covers."""
     image = (64, 96) if case.slot == "cross_attention" else None
-    return Sizes(
-        batch=6, queries=200, views=12 if case.slot == "encoder" else 3, gaussians=1, image=image
-    )
+    return Sizes(queries=200, views=3, gaussians=1, image=image)
 
 
 def inputs_of(case: Case, sizes: Sizes = Sizes(), seed: int = 0) -> Inputs:
-    """What a component of the slot of `case` is called with."""
+    """What a component of the slot of `case` is called with, drawn from `seed`."""
     maker = Maker(case, sizes, torch.Generator().manual_seed(seed))
-    return {name: MAKERS[name](maker) for name in ARGUMENTS[case.slot]}
+    return {name: getattr(maker, name)() for name in ARGUMENTS[case.slot]}
 
 
 def tracked_inputs(case: Case, inputs: Inputs) -> Inputs:
-    """A copy that asks for gradients, of cameras only for those that a renderer declares."""
+    """A copy that requires gradients; of cameras only in the tensors that a renderer declares."""
     copy, component = tracked(inputs), case.component
     if not issubclass(component, Renderer):
         return copy
-    declared = tuple(f"cameras.{name}" for name in component.camera_gradients)
-
-    def visit(name: str, x: Tensor) -> Tensor:
-        return x.detach() if name.startswith("cameras.") and name not in declared else x
-
-    return mapped(copy, visit)
+    kept = {f"cameras.{name}" for name in component.camera_gradients}
+    fixed = {"cameras.c2w", "cameras.intrinsics"} - kept
+    return mapped(copy, lambda name, x: x.detach() if name in fixed else x)
 
 
 def required_fields(case: Case) -> dict[str, FieldSpec]:
     """The fields of the state of the queries that the case requires."""
     required = case.component.requires(case.config)
-    return {n: spec for n, spec in required.items() if not n.startswith(PRESENT)}
+    elsewhere = ("memory.", "rendering.")
+    return {n: spec for n, spec in required.items() if not n.startswith(elsewhere)}
 
 
 class Maker:
@@ -94,8 +98,12 @@ class Maker:
         self.generator = generator
         self.image = sizes.image or case.size
 
+    def batch_size(self) -> int:
+        """B."""
+        return self.sizes.batch
+
     def normal(self, *shape: int) -> Tensor:
-        """N(0, 1)."""
+        """Numbers from N(0, 1)."""
         return torch.randn(shape, generator=self.generator).to(self.case.device)
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
@@ -136,14 +144,12 @@ class Maker:
         """Cameras side by side that look along z, a little inwards."""
         height, width = image or self.image
         count = self.sizes.views if views is None else views
+        scene, view = torch.arange(self.sizes.batch)[:, None], torch.arange(count)
+        angle = -0.06 * view - 0.02 * scene
         c2w = torch.eye(4).repeat(self.sizes.batch, count, 1, 1)
-        for scene in range(self.sizes.batch):
-            for view in range(count):
-                angle = -0.06 * view - 0.02 * scene
-                turn = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0]]
-                turn.append([-math.sin(angle), 0, math.cos(angle)])
-                c2w[scene, view, :3, :3] = torch.tensor(turn)
-                c2w[scene, view, :3, 3] = torch.tensor([0.2 * view, 0.05 * scene, 0.0])
+        c2w[..., 0, 0] = c2w[..., 2, 2] = angle.cos()
+        c2w[..., 0, 2], c2w[..., 2, 0] = angle.sin(), -angle.sin()
+        c2w[..., 0, 3], c2w[..., 1, 3] = 0.2 * view, 0.05 * scene
         focal = 0.9 * max(height, width)
         lens = torch.tensor([focal, focal, width / 2, height / 2]).expand(*c2w.shape[:2], 4)
         return Cameras(c2w, lens.clone(), (height, width)).to(self.case.device)
@@ -203,31 +209,3 @@ class Maker:
 def is_place(spec: FieldSpec) -> bool:
     """Whether a field holds points of the world."""
     return spec.shape == (3,) and spec.frame == "world" and spec.dtype.is_floating_point
-
-
-MAKERS: Mapping[str, Callable[[Maker], Any]] = {
-    "views": Maker.views,
-    "batch_size": lambda maker: maker.sizes.batch,
-    "state": Maker.state,
-    "memory": Maker.memory,
-    "features": Maker.features,
-    "offsets": Maker.offsets,
-    "gaussians": Maker.gaussians,
-    "cameras": Maker.cameras,
-    "prediction": Maker.prediction,
-    "rendering": Maker.rendering,
-    "target": Maker.target,
-}
-
-ARGUMENTS: Mapping[str, tuple[str, ...]] = {
-    "encoder": ("views",),
-    "queries": ("batch_size",),
-    "cross_attention": ("state", "memory"),
-    "self_attention": ("state",),
-    "feed_forward": ("features",),
-    "refinement": ("state",),
-    "head": ("state",),
-    "centers": ("offsets", "state"),
-    "renderer": ("gaussians", "cameras"),
-    "losses": ("prediction", "rendering", "target"),
-}
