@@ -24,14 +24,6 @@ def seeded(seed: int) -> Iterator[None]:
         yield
 
 
-def draws(module: Any, *inputs: Any) -> bool:
-    """Whether a forward pass draws from torch's global generator, as dropout does in training."""
-    with seeded(0), torch.no_grad():
-        before = torch.get_rng_state()
-        module(*inputs)
-        return not torch.equal(before, torch.get_rng_state())
-
-
 def each_mode(module: Any) -> Iterator[str]:
     """The names of the two modes, each while `module` is in it."""
     for mode in ("evaluation", "training"):

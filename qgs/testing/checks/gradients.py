@@ -146,22 +146,12 @@ def check_gradients_match_differences(case: Case) -> None:
             return scalar(functional_call(module, own, tuple(changed.values())))
 
     for mode in each_mode(module):
-        _expect_gradients(value, [*points.values()], mode)
-
-
-def _expect_gradients(value: Callable[..., Tensor], points: list[Tensor], mode: str) -> None:
-    before = value(*points)
-    if before.requires_grad:
+        if not value(*points.values()).requires_grad:
+            continue  # what it should have gradients in is the subject of other checks
         try:
-            gradcheck(value, points, eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
+            gradcheck(value, [*points.values()], eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
         except GradcheckError as error:
             expect(False, f"in {mode}: {' '.join(str(error).split())}"[:400])
-        return
-    generator = torch.Generator().manual_seed(0)
-    moved = [x + 1e-3 * torch.randn(x.shape, generator=generator).to(x) for x in points]
-    change = (value(*moved) - before).abs().item()
-    seen = f"in {mode} it changes with its inputs, by {change:.2g}, but has no gradient"
-    expect(change == 0, seen)
 
 
 @check(MODULES - {"queries"})

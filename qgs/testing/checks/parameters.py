@@ -17,14 +17,11 @@ from qgs.testing.case import Case, expect
 from qgs.testing.inputs import inputs_of
 from qgs.testing.modules import is_torchs_own, seeded
 from qgs.testing.registry import PARAMETRIC, check
-from qgs.testing.trees import cast, difference, floating, scalar, tracked
+from qgs.testing.trees import cast, difference, floating, not_finite, scalar, tracked
 from qgs.types import map_tensors
 
 STEPS = 12
 """Optimiser steps for a component that leaves parameters out of some of them at random."""
-
-NOISE = 1e-10
-"""Gradients that are rounding errors in float64, in units of the largest one."""
 
 
 @check(PARAMETRIC)
@@ -93,12 +90,10 @@ def check_saved_weights_load(case: Case) -> None:
 
 @check(PARAMETRIC)
 def check_state_dict_keys(case: Case) -> None:
-    """Names and shapes in the state dict are the same each time, and as pinned in the case."""
+    """Names and shapes in the state dict are as pinned in the case; a forward pass keeps them."""
     module = case.build()
     shapes = {name: tuple(x.shape) for name, x in module.state_dict().items()}
     module(*inputs_of(case).values())
-    again = {name: tuple(x.shape) for name, x in case.build(seed=1).state_dict().items()}
-    expect(shapes == again, f"the second instance has {again}, the first {shapes}")
     expect(set(shapes) == set(module.state_dict()), "a forward pass changes the names")
     if case.state_dict is not None:
         pinned = {name: tuple(shape) for name, shape in case.state_dict.items()}
@@ -139,9 +134,7 @@ def _autocast_accepts_meta() -> Iterator[None]:
 def check_parameters_learn(case: Case) -> None:
     """Every trainable parameter gets a finite, non-zero gradient within two optimiser steps.
 
-    Non-zero is more than a rounding error beside the other gradients, except for biases of torch's
-    own layers: the softmax takes away that of attention's keys. A component that draws numbers in
-    training, as to leave a layer out, has twelve steps.
+    A component that draws numbers in training, as to leave a layer out, has twelve steps.
     """
     module = case.build().double().train()
     parameters = {n: p for n, p in module.named_parameters() if p.requires_grad}
@@ -152,19 +145,13 @@ def check_parameters_learn(case: Case) -> None:
     for step in range(STEPS):
         before = torch.get_rng_state()
         optimizer.zero_grad()
-        inputs = tracked(cast(inputs_of(case, seed=step), torch.float64))
-        total = scalar(module(*inputs.values()))
+        total = scalar(module(*cast(inputs_of(case, seed=step), torch.float64).values()))
         if total.requires_grad:
             total.backward()
         gradients = {n: p.grad for n, p in parameters.items() if p.grad is not None}
-        given = [x.grad for x in floating(inputs).values() if x.grad is not None]
-        sizes = [x.abs().max().item() for x in (*gradients.values(), *given) if x.numel()]
-        for name, gradient in gradients.items():
-            finite = bool(gradient.isfinite().all())
-            expect(finite, f"the gradient of `{name}` is not finite in step {step + 1}")
-            least = 0.0 if _is_bias_of_a_layer(module, name) else NOISE * max(sizes)
-            if gradient.abs().max() > least:
-                learned.add(name)
+        broken = not_finite(gradients)
+        expect(not broken, f"the gradient of {', '.join(broken)} is not finite in step {step + 1}")
+        learned |= {name for name, gradient in gradients.items() if gradient.any()}
         torch.nn.utils.clip_grad_norm_(parameters.values(), 1.0)
         optimizer.step()
         draws_nothing = torch.equal(before, torch.get_rng_state())
@@ -172,8 +159,3 @@ def check_parameters_learn(case: Case) -> None:
             break
     idle = [name for name in parameters if name not in learned]
     expect(not idle, f"no gradient reaches {', '.join(idle)}")
-
-
-def _is_bias_of_a_layer(module: nn.Module, name: str) -> bool:
-    owner, _, kind = name.rpartition(".")
-    return kind == "bias" and is_torchs_own(module.get_submodule(owner))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from qgs.contracts import CrossAttention, SelfAttention
@@ -80,7 +78,7 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
 def _expect_geometry_in_float32(case: Case, module: Any, where: str) -> None:
     inputs = _halved(inputs_of(case))
     autocast = torch.autocast(case.device, dtype=torch.bfloat16)
-    with seeded(0), autocast, RecordedLayers() as layers:
+    with seeded(0), autocast, LearnedLayers() as layers:
         outputs = _with_explanation(module, inputs)
     broken = [name for name in not_finite(outputs) if name != EXPLAINED]
     expect(not broken, f"{where} {', '.join(broken)} is not finite")
@@ -88,7 +86,7 @@ def _expect_geometry_in_float32(case: Case, module: Any, where: str) -> None:
     for name, tensor in seen.items():
         kept = tensor.dtype == torch.float32
         expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
-    with seeded(0), ReplayedLayers(layers.outputs) as replayed:
+    with seeded(0), LearnedLayers(layers.outputs) as replayed:
         exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
     placed = {name: x for name, x in seen.items() if name not in _learned_fields(case)}
     found = difference({name: exact[name] for name in placed}, placed, RTOL, ATOL)
@@ -149,65 +147,41 @@ def check_float64_stays_float64(case: Case) -> None:
             expect(kept, f"in {mode} `{name}` is {described(tensor)} for float64 inputs")
 
 
-class RecordedLayers(TorchFunctionMode):
-    """Keeps what learned layers give, in their order, in `outputs`.
+class LearnedLayers(TorchFunctionMode):
+    """Keeps what learned layers give, in their order, in `outputs`; or gives `replayed` instead.
 
     A product counts as a learned layer if all its factors require gradients: parameters, features,
-    and what is made of them. `halved` names the products of float32 tensors, none of them learned,
-    that autocast took to bfloat16.
+    and what is made of them. halved: names of the products of float32 tensors, none of them
+    learned, that autocast took to bfloat16. differs: whether other layers were called than those
+    that gave `replayed`; from the first such one on, layers give what they compute.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, replayed: Iterable[tuple[str, Any]] | None = None) -> None:
         super().__init__()
         self.outputs: list[tuple[str, Any]] = []
         self.halved: set[str] = set()
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func` and keep what it gives."""
-        given = func(*args, **(kwargs or {}))
-        name, operands = getattr(func, "__name__", ""), _tensors(args, kwargs)
-        if _is_learned(name, operands):
-            self.outputs.append((name, map_tensors(torch.clone, given)))
-        elif (
-            name in PRODUCTS
-            and given.dtype == torch.bfloat16
-            and all(x.dtype == torch.float32 and not x.requires_grad for x in operands)
-        ):
-            self.halved.add(name)
-        return given
-
-
-class ReplayedLayers(TorchFunctionMode):
-    """Learned layers give `outputs`, in their order and in float32, instead of what they compute.
-
-    differs: whether other layers were called than those that gave the outputs; from the first such
-    one on, layers give what they compute.
-    """
-
-    def __init__(self, outputs: Sequence[tuple[str, Any]]) -> None:
-        super().__init__()
-        self._left = deque(outputs)
         self.differs = False
+        self._replayed = None if replayed is None else iter(replayed)
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func`, and give what it gave before if it is a learned layer."""
+        """Call `func`; keep what it gives if it is a learned layer, or give what is replayed."""
         given = func(*args, **(kwargs or {}))
         name = getattr(func, "__name__", "")
-        if self.differs or not _is_learned(name, _tensors(args, kwargs)):
+        factors = [x for _, x in named_tensors([args, kwargs or {}])]
+        learned = [x.requires_grad for x in factors]
+        if not ((name in LAYERS and any(learned)) or (name in PRODUCTS and all(learned))):
+            halved = name in PRODUCTS and given.dtype == torch.bfloat16 and not any(learned)
+            if halved and all(x.dtype == torch.float32 for x in factors):
+                self.halved.add(name)
             return given
-        recorded, before = self._left.popleft() if self._left else ("", None)
-        self.differs = recorded != name or _shapes(before) != _shapes(given)
-        return given if self.differs else map_tensors(at_least_float32, before)
-
-
-def _tensors(args: Any, kwargs: Any) -> list[Tensor]:
-    return [tensor for _, tensor in named_tensors([args, kwargs or {}])]
+        if self._replayed is None:
+            self.outputs.append((name, map_tensors(torch.clone, given)))
+        elif not self.differs:
+            recorded, before = next(self._replayed, ("", None))
+            self.differs = recorded != name or _shapes(before) != _shapes(given)
+            return given if self.differs else map_tensors(at_least_float32, before)
+        return given
 
 
 def _shapes(value: Any) -> list[torch.Size]:
     return [tensor.shape for _, tensor in named_tensors(value)]
-
-
-def _is_learned(name: str, operands: list[Tensor]) -> bool:
-    learned = [x.requires_grad for x in operands]
-    return (name in LAYERS and any(learned)) or (name in PRODUCTS and all(learned))

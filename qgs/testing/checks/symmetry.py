@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -20,9 +19,9 @@ from qgs.testing.inputs import (
     required_fields,
     tracked_inputs,
 )
-from qgs.testing.modules import draws, each_mode, seeded
+from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import MODULES, PER_QUERY, check
-from qgs.testing.trees import cloned, difference, floating, gradients, leaves, mapped, scalar
+from qgs.testing.trees import difference, floating, gradients, leaves, mapped, scalar
 from qgs.types import ImageMemory, map_tensors
 
 RTOL, ATOL = 1e-4, 1e-5
@@ -71,23 +70,23 @@ def _first_scene(module: Any, inputs: Inputs) -> Any:
 def check_query_permutation(case: Case) -> None:
     """Permuting the queries, with all their fields, permutes what is computed for them.
 
-    Renderings and losses stay as they are. In training too, unless that draws numbers.
+    Renderings and losses stay as they are.
     """
     module, sizes = case.lively(), many(case)
     inputs, order = inputs_of(case, sizes), _shuffled(sizes.queries)
     counted = (*QUERY_INPUTS, "gaussians", "prediction")
     moved = {n: _reordered(x, order) if n in counted else x for n, x in inputs.items()}
-    for mode, one, other in _outputs(module, inputs, moved):
-        expected = _reordered(one, order) if case.slot in PER_QUERY else one
-        found = difference(expected, other, RTOL, ATOL)
-        expect(not found, f"in {mode}, with {sizes.queries} permuted queries, {found}")
+    one, other = _outputs(module, inputs, moved)
+    expected = _reordered(one, order) if case.slot in PER_QUERY else one
+    found = difference(expected, other, RTOL, ATOL)
+    expect(not found, f"with {sizes.queries} permuted queries, {found}")
 
 
 @check({"encoder", "cross_attention", "renderer", "losses"})
 def check_view_permutation(case: Case) -> None:
     """Views have no order, unless an encoder or a cross-attention declares `ordered_views`.
 
-    Then they have one. In training too, unless that draws numbers.
+    Then they have one.
     """
     module, component = case.lively(), case.component
     may_declare = issubclass(component, Encoder | CrossAttention)
@@ -96,26 +95,17 @@ def check_view_permutation(case: Case) -> None:
     sizes = many(case)
     inputs, order = inputs_of(case, sizes), _shuffled(sizes.views)
     moved = {n: _permuted(x, order) if n in VIEW_INPUTS else x for n, x in inputs.items()}
-    for mode, one, other in _outputs(module, inputs, moved):
-        expected = _permuted(one, order) if case.slot in ("encoder", "renderer") else one
-        found = difference(expected, other, RTOL, ATOL)
-        seen = f"in {mode}, with {sizes.views} permuted views, {found}{hint}"
-        expect(ordered or not found, seen)
-        ignored = f"in {mode}, `ordered_views` is declared, but the order is ignored"
-        expect(bool(found) or not ordered, ignored)
+    one, other = _outputs(module, inputs, moved)
+    expected = _permuted(one, order) if case.slot in ("encoder", "renderer") else one
+    found = difference(expected, other, RTOL, ATOL)
+    expect(ordered or not found, f"with {sizes.views} permuted views, {found}{hint}")
+    ignored = "`ordered_views` is declared, but the order is ignored"
+    expect(bool(found) or not ordered, ignored)
 
 
-def _outputs(module: Any, inputs: Inputs, moved: Inputs) -> Iterator[tuple[str, Any, Any]]:
-    """Each mode, and the outputs for both inputs.
-
-    Without training that draws numbers: those for one query or view are not those for another.
-    """
-    for mode in each_mode(module):
-        if mode == "training" and draws(module, *cloned(inputs).values()):
-            continue
-        with torch.no_grad():
-            one, other = (module(*cloned(given).values()) for given in (inputs, moved))
-        yield mode, one, other
+def _outputs(module: Any, inputs: Inputs, moved: Inputs) -> tuple[Any, Any]:
+    with torch.no_grad():
+        return module(*inputs.values()), module(*moved.values())
 
 
 def _shuffled(count: int) -> list[int]:

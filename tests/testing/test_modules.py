@@ -1,4 +1,4 @@
-"""What a module keeps beside its state dict is seen to change."""
+"""What a module keeps beside its state dict is compared."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from qgs.testing.memory import remembered
+from qgs.testing.modules import attributes
 
 
 class Keeper(nn.Module):
@@ -43,22 +43,22 @@ KEPT = {
 def test_a_change_is_seen(what: str) -> None:
     kept, change = KEPT[what]
     module = Keeper(kept)
-    before = remembered(module)
-    assert remembered(module) == before
+    before = attributes(module)
+    assert attributes(module) == before
     change(kept)
-    assert [name for name, value in remembered(module).items() if before.get(name) != value]
+    assert [name for name, value in attributes(module).items() if before.get(name) != value]
 
 
 def test_what_contains_itself_comes_to_an_end() -> None:
     circle: list[object] = []
     circle.append(circle)
-    assert remembered(Keeper(circle))["part._kept"] == "1 items"
+    assert attributes(Keeper(circle))["part._kept"] == [None]
 
 
 def test_what_torch_keeps_is_left_to_it() -> None:
     module = Keeper(None)
-    before = remembered(module)
+    before = attributes(module)
     module.train(False)
     module.register_forward_hook(lambda *_: None)
     module.part.weight.data.add_(1)
-    assert remembered(module) == before
+    assert attributes(module) == before
