@@ -36,6 +36,9 @@ class OneTerm(Loss):
 class ChangedEncoder(MultiViewViT):
     """A sound encoder, whose input or output mutants change."""
 
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
     def given(self, views: Views) -> Views:
         return views
 

@@ -157,6 +157,9 @@ class DecodesItsQueries(Queries):
 class SeesFar(MultiViewViT):
     """Convolutions over 19 pixels, before patches of 8 are cut."""
 
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
     def __init__(self, config, dims):
         super().__init__(config, dims)
         layers = [(3, 16), (16, 16), (16, 3)]
