@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from PIL import Image
-from qgs_datatools.packing import chunk_entry
+from qgs_datatools.entries import chunk_entry
 from upath import UPath
 
 from qgs.contracts import Scene, ViewsConfig
