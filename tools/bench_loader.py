@@ -24,8 +24,9 @@ from bench_data import chunks_at
 from qgs.composer import Recipe, resolve
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.objective import Gradients, Objective
+from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
+from qgs.engine.training import compute_gradients
 
 TINY = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 ROUNDS, STEPS, BATCHES = 3, 3, 60
@@ -69,14 +70,13 @@ def _trainer(recipe: Recipe):
     torch.set_num_threads(2)
     accelerator = make_accelerator("cpu")
     objective = Objective(recipe.build_model().train(), recipe.build_losses(), 0)
-    optimizer = make_optimizer(objective, recipe.training)
-    gradients = Gradients(accelerator, objective, recipe.training)
+    optimizer = make_optimizer(objective, recipe.build_optimizer())
     with closing(training_batches(recipe.build_data(), recipe.views, 2, 0)) as stream:
         batch = next(stream)
 
     def step() -> None:
         optimizer.zero_grad()
-        gradients.compute([batch])
+        compute_gradients(accelerator, objective, recipe.training, [batch])
         optimizer.step()
 
     step()

@@ -44,6 +44,7 @@ PLACES = {
     "losses": ("losses", "NAME"),
     "metrics": ("metrics", "NAME"),
     "data": ("data",),
+    "optimizer": ("optimizer",),
 }
 """Slot to the place of a recipe that holds it."""
 

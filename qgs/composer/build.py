@@ -12,7 +12,7 @@ from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.flow import hold_to_promise
 from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_failure
-from qgs.contracts import Component, ModelComponent, ModelDims, Refinement, SceneSource
+from qgs.contracts import Component, ModelComponent, ModelDims, Optimizer, Refinement, SceneSource
 from qgs.contracts.component import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
 
@@ -26,15 +26,16 @@ def build(chosen: Chosen, dims: ModelDims) -> Any:
     return built
 
 
-def build_plain(chosen: Chosen) -> Any:
-    """A component that knows nothing of the model's sizes."""
-    return _constructed(chosen, chosen.config)
+def build_plain(chosen: Chosen, *arguments: Any) -> Any:
+    """A component that knows nothing of the model's sizes; arguments: for it besides its Config."""
+    return _constructed(chosen, chosen.config, *arguments)
 
 
 def _constructed(chosen: Chosen, *arguments: Any) -> Any:
     """An instance; what a plugin's constructor raises is reported with its distribution.
 
-    Missing packages, and data that cannot be opened, are the user's to mend: told as they are.
+    Missing packages, data that cannot be opened and training that is too short for an optimiser
+    are the user's to mend: told as they are.
     """
     make: Any = chosen.component
     try:
@@ -43,7 +44,8 @@ def _constructed(chosen: Chosen, *arguments: Any) -> Any:
         raise
     except Exception as error:
         ours = chosen.installed.plugin.name == BUILTIN.name
-        if ours or (issubclass(make, SceneSource) and isinstance(error, ValueError | OSError)):
+        told = issubclass(make, SceneSource | Optimizer) and isinstance(error, ValueError | OSError)
+        if ours or told:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         origin, path = chosen.place.origin, chosen.written_at

@@ -16,6 +16,7 @@ from qgs.contracts import (
     Head,
     Loss,
     Metric,
+    Optimizer,
     Queries,
     Refinement,
     Renderer,
@@ -54,6 +55,7 @@ SLOTS = {
         Slot(Loss, None),
         Slot(Metric, None),
         Slot(SceneSource, None),
+        Slot(Optimizer, "qgs/adamw"),
     )
 }
 
@@ -83,6 +85,7 @@ SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
     "metrics": Section(named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
+    "optimizer": Section(),
 }
 
 
