@@ -33,12 +33,12 @@ import numpy as np
 import torch
 from PIL import Image
 from process_memory import megabytes
+from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from qgs_datatools.entries import chunk_entry
 from upath import UPath
 
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.objective import Gradients, Objective

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-
 from qgs.data.photos.frames import Fault, Intrinsics, Size, intrinsics_faults, pose_faults
+
 from qgs_datatools.decoding import DecodedScene
 from qgs_datatools.findings import Finding
 

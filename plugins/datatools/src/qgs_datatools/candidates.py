@@ -10,13 +10,13 @@ from typing import cast
 
 import numpy as np
 from PIL import Image
+from qgs.data.photos.formats import Format, formats_of, read_listing
+from qgs.data.photos.frames import PhotoFrame, Size, undistorted
+from qgs.data.photos.reading import existing
 from upath import UPath
 
 from qgs.data.dl3dv import find_scenes, scene_folder
 from qgs.data.images import decode_rgb
-from qgs.data.photos.formats import Format, formats_of, read_listing
-from qgs.data.photos.frames import PhotoFrame, Size, undistorted
-from qgs.data.photos.reading import existing
 from qgs.data.photos.source import folder_name
 from qgs.data.recognition import recognised
 from qgs_datatools.conventions import LLFF, OPENCV, OPENGL, Convention

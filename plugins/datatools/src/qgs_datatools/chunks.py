@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from upath import UPath
-
 from qgs.data.chunks.files import INDEX, SUFFIX, has_chunks, load_chunk, read_chunk_index
 from qgs.data.chunks.record import Record, parse_record, unit_faults
 from qgs.data.lazy import a_type
 from qgs.data.photos.frames import PhotoFrame, Size
+from upath import UPath
+
 from qgs_datatools.candidates import Candidate, Photo
 from qgs_datatools.conventions import OPENCV
 from qgs_datatools.findings import Finding

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from statistics import median, median_low
 
 from PIL import Image, UnidentifiedImageError
-
 from qgs.data.photos.frames import PhotoFrame, Size, open_mask, size_faults
+
 from qgs_datatools.candidates import Photo
 from qgs_datatools.findings import Finding, Severity
 
