@@ -29,9 +29,8 @@ def test_overlay_is_the_recipe() -> None:
 def test_slots_and_their_defaults() -> None:
     rows = re.findall(r"^\| `([\w.]+)` \| [^|]* \| ([^|]*) \|", section("Slots"), re.MULTILINE)
     shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
-    defaults = {name: [slot.default] for name, slot in SLOTS.items() if slot.default}
-    defaults |= {name: [*part.defaults.values()] for name, part in SECTIONS.items() if part.named}
-    assert shown == defaults
+    named = {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.named}
+    assert shown == named | {name: [s.default] for name, s in SLOTS.items() if s.default}
 
 
 def test_commands() -> None:

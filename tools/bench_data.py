@@ -30,8 +30,8 @@ from upath import UPath
 
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data import ChunksSource
-from qgs.data.chunks.source import ChunksConfig
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
+from qgs.data.chunks import ChunksConfig
+from qgs.data.scenes import EncodedFrame, EncodedScene
 from qgs.data.stream import SampleStream
 from qgs.io.files import opened_replacing, write_bytes
 

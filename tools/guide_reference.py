@@ -12,10 +12,11 @@ from typing import Any
 
 from guide_docstrings import entries, joined
 
+from qgs.composer import slots
 from qgs.composer.recipe import dump
 from qgs.composer.registry import Registry, load_registry
 from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
-from qgs.composer.slots import DEFAULT_LOSSES, SLOTS, slot_at
+from qgs.composer.slots import SLOTS, slot_at
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
 PLUGINS = ("locus", "ellipsoid")
@@ -41,6 +42,7 @@ PLACES = {
     "supervision": ("model", "supervision"),
     "renderer": ("model", "renderer"),
     "losses": ("losses", "NAME"),
+    "metrics": ("metrics", "NAME"),
     "data": ("data",),
 }
 """Slot to the place of a recipe that holds it."""
@@ -148,9 +150,12 @@ def _slot_section(slot: str, registry: Registry) -> str:
     place = PLACES[slot]
     assert slot_at(place) is SLOTS[slot]
     default = f"Default: `{SLOTS[slot].default}`."
-    if slot == "losses":
-        listed = ", ".join(f"`{name}: {{type: {kind}}}`" for name, kind in DEFAULT_LOSSES.items())
-        default = f"Names are free. Default: {listed}."
+    section = slots.SECTIONS.get(slot)
+    if section and section.named:
+        kinds = section.defaults.items()
+        listed = ", ".join(f"`{name}: {{type: {kind}}}`" for name, kind in kinds)
+        stay = " They stay beside others; `NAME: null` drops one." if section.defaults_stay else ""
+        default = f"Names are free. Default: {listed}.{stay}"
     elif slot == "data":
         kind = SLOTS[slot].default
         default = f"A recipe without `data` has none; `data` without a `type` is `{kind}`."

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from qgs.analysis.reconstruction import orbit_path
 from qgs.analysis.trace import trace
+from qgs.contracts import Column
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
 from qgs.drawing.images import (
@@ -42,17 +43,13 @@ from qgs.types import Prediction
 class Contender:
     """A trained model and its figures.
 
-    psnr (dB) and ssim: means over unseen views. dispersion_mean, dispersion_median: distance of
-    Gaussians to their token's centroid, world units. gaussians: per scene. seconds: of training.
-    recipe: the resolved recipe as YAML.
+    scores: means over unseen scenes of `Report.columns`. gaussians: per scene. seconds: of
+    training. recipe: the resolved recipe as YAML.
     """
 
     name: str
     model: QueryGaussianModel
-    psnr: float
-    ssim: float
-    dispersion_mean: float
-    dispersion_median: float
+    scores: Mapping[str, float | None]
     gaussians: int
     parameters: int
     seconds: float
@@ -62,22 +59,23 @@ class Contender:
 
 @dataclass(frozen=True)
 class Baseline:
-    """What needs no model: its mean PSNR (dB) and SSIM on the same views."""
+    """What needs no model: its `Report.columns` on the same views."""
 
     name: str
-    psnr: float
-    ssim: float
+    scores: Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
 class Report:
     """A comparison.
 
-    contenders: in the order in which they are shown. samples: the unseen scenes to picture. depths:
-    for each of them the true depth (T, 1, H, W) of its targets in the model's units, where known.
-    facts: name to value, what was run where.
+    columns: name of each score to how it is shown. contenders: in the order in which they are
+    shown. samples: the unseen scenes to picture. depths: for each of them the true depth
+    (T, 1, H, W) of its targets in the model's units, where known. facts: name to value, what was
+    run where.
     """
 
+    columns: Mapping[str, Column]
     title: str
     contenders: Sequence[Contender]
     baselines: Sequence[Baseline]

@@ -15,7 +15,7 @@ from rich.table import Table
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
 
 if TYPE_CHECKING:
-    from qgs.engine.bench import Report, Spread
+    from qgs.engine.bench.run import Report, Spread
     from qgs.engine.bench.work import Operation
 
 MEBIBYTE = 2**20
@@ -57,9 +57,9 @@ def bench(
     process, on a GPU what torch allocated at most.
     """
     from qgs.composer import resolve
-    from qgs.engine.bench import Measures, Subject, workload_of
-    from qgs.engine.bench import bench as measure
-    from qgs.engine.bench.run import refuse_other_file
+    from qgs.engine.bench.run import Subject, refuse_other_file
+    from qgs.engine.bench.run import bench as measure
+    from qgs.engine.bench.work import workload_of
     from qgs.engine.distributed import choose_device
 
     if json is not None:
@@ -72,9 +72,17 @@ def bench(
     work["device"] = choose_device(device, console.print)
     resolved = [(str(path), resolve(path, overrides or ())) for path in recipes]
     subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
-    measures = Measures(step, memory, renderer, rounds, warmup)
     with console.status("composing") as status:
-        report = measure(subjects, measures, overrides=overrides or (), say=status.update)
+        report = measure(
+            subjects,
+            step=step,
+            memory=memory,
+            renderer=renderer,
+            rounds=rounds,
+            warmup=warmup,
+            overrides=overrides or (),
+            say=status.update,
+        )
     console.print(_headline(report), markup=False)
     for table in _tables(report):
         console.print(table)
@@ -140,7 +148,7 @@ def short_names(paths: Sequence[str]) -> list[str]:
 
 def _seconds(report: Report, operation: Operation) -> Table:
     base = report.results[0].times[operation]
-    unit, scale = ("s", 1.0) if base.median >= 10 else ("ms", 1000.0)
+    unit, scale = ("s", 1.0) if base.quartiles[1] >= 10 else ("ms", 1000.0)
     headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")
     times = [result.times[operation] for result in report.results]
     rows = [(*_cells(spread, scale), *_cells(spread.over(base), 1.0)) for spread in times]

@@ -155,11 +155,11 @@ def compare_results(
 
     out: folder for comparison.json and comparison.md; None writes nothing.
     """
-    from qgs.engine.comparison import Comparisons
+    from qgs.engine.comparison import compare
     from qgs.engine.results import read_results
 
     results = [read_results(run) for run in runs]
-    comparisons = Comparisons.of(results, across_protocols)
+    comparisons = compare(results, across_protocols)
     comparisons.show(console)
     if out is None:
         console.print("add --out FOLDER to keep this as JSON and Markdown")

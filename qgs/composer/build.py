@@ -2,55 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import RecipeError, RecipeProblem
-from qgs.composer.flow import hold_to_promise
+from qgs.composer.flow import fits
 from qgs.composer.nodes import KeyPath
-from qgs.composer.registry import BUILTIN, component_failure
-from qgs.contracts import Component, ModelComponent, ModelDims, Refinement, SceneSource
+from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
+from qgs.contracts import ModelComponent, ModelDims, Queries, Refinement, SceneSource
 from qgs.contracts.component import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
-
-
-def build(chosen: Chosen, dims: ModelDims) -> Any:
-    """The component itself, built with the sizes of the model and held to what it provides."""
-    if not issubclass(chosen.component, ModelComponent):
-        return build_plain(chosen)
-    built = _constructed(chosen, chosen.config, dims)
-    hold_to_promise(built, chosen)
-    return built
-
-
-def build_plain(chosen: Chosen) -> Any:
-    """A component that knows nothing of the model's sizes."""
-    return _constructed(chosen, chosen.config)
-
-
-def _constructed(chosen: Chosen, *arguments: Any) -> Any:
-    """An instance; what a plugin's constructor raises is reported with its distribution.
-
-    Missing packages, and data that cannot be opened, are the user's to mend: told as they are.
-    """
-    make: Any = chosen.component
-    try:
-        built = make(*arguments)
-    except MissingExtraError:
-        raise
-    except Exception as error:
-        ours = chosen.installed.plugin.name == BUILTIN.name
-        if ours or (issubclass(make, SceneSource) and isinstance(error, ValueError | OSError)):
-            raise
-        failure = component_failure(chosen.type, "__init__", error, chosen.installed)
-        origin, path = chosen.place.origin, chosen.written_at
-        problem = RecipeProblem(origin.file, origin.line, path, failure.reason, failure.fix)
-        raise RecipeError([problem]) from error
-    assert isinstance(built, Component)
-    return built
+from qgs.types import QueryState
 
 
 def build_model(
@@ -67,20 +35,60 @@ def build_model(
     device, and the global random state stays as it was. On "meta" nothing is allocated.
     """
     on_meta = device is not None and torch.device(device).type == "meta"
-    with torch.random.fork_rng(devices=()), torch.device("meta" if on_meta else "cpu"):
+    with (
+        torch.random.fork_rng(devices=()),
+        torch.device("meta" if on_meta else "cpu"),
+        _ShapesAlone() if on_meta else nullcontext(),
+    ):
         torch.default_generator.manual_seed(seed)
         model = _assemble(parts, dims, layer_scale, tree)
     return model if on_meta or device is None else model.to(device)
 
 
+class _ShapesAlone(TorchFunctionMode):
+    """On "meta", makes the results of `randn`, `cat` and arithmetic from their shapes.
+
+    torch's own way to do so imports its compiler, which takes longer than everything else that
+    `qgs compose` does.
+    """
+
+    arithmetic = ("add", "sub", "mul", "div", "pow", "__rsub__", "__rdiv__", "__rpow__")
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> Any:
+        if func is torch.randn and "generator" not in (kwargs or {}):
+            func = torch.empty
+        elif func is torch.cat and len(args) == 2 and not kwargs:
+            tensors, dim = args
+            shape = list(tensors[0].shape)
+            shape[dim] = sum(x.shape[dim] for x in tensors)
+            return torch.empty(shape, dtype=tensors[0].dtype)
+        elif getattr(func, "__name__", "") in self.arithmetic and not kwargs:
+            dtype = torch.result_type(*args)
+            shapes = [x.shape for x in args if isinstance(x, Tensor)]
+            if dtype.is_floating_point:
+                return torch.empty(torch.broadcast_shapes(*shapes), dtype=dtype)
+        return func(*args, **(kwargs or {}))
+
+
 def _assemble(
     parts: Mapping[KeyPath, Chosen], dims: ModelDims, layer_scale: float, tree: Mapping[str, Any]
 ) -> QueryGaussianModel:
+    shared: list[tuple[Chosen, nn.Module]] = []
+
     def at(*path: str) -> Any:
-        return build(parts["model", *path], dims)
+        chosen = parts["model", *path]
+        for known, built in shared:
+            if known.component is chosen.component and known.config == chosen.config:
+                return built
+        built = build(chosen, *(dims,) if issubclass(chosen.component, ModelComponent) else ())
+        if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
+            shared.append((chosen, built))
+        return built
 
     encoder, queries = at("encoder"), at("queries")
-    decoder, refinements, shared = [], [], {}
+    decoder, refinements = [], []
     for index in map(str, range(dims.depth)):
         layer = ("decoder", "layers", index)
         decoder.append(
@@ -91,7 +99,7 @@ def _assemble(
                 layer_scale=layer_scale,
             )
         )
-        refinements.append(_shared_refinement(parts["model", *layer, "refinement"], dims, shared))
+        refinements.append(at(*layer, "refinement"))
     return QueryGaussianModel(
         encoder=encoder,
         queries=queries,
@@ -105,14 +113,65 @@ def _assemble(
     )
 
 
-def _shared_refinement(
-    chosen: Chosen, dims: ModelDims, shared: dict[tuple[str, str], Refinement]
-) -> Refinement:
-    refinement = chosen.component
-    assert issubclass(refinement, Refinement)
-    if not refinement.shared_by_layers:
-        return build(chosen, dims)
-    key = (chosen.type, chosen.config.model_dump_json())
-    if key not in shared:
-        shared[key] = build(chosen, dims)
-    return shared[key]
+def build(chosen: Chosen, *arguments: Any) -> Any:
+    """The component itself. arguments: what its constructor takes besides its Config.
+
+    What a plugin's constructor raises is reported with its distribution. Missing packages, and
+    data that cannot be opened, are for the user to put right, and raised as they are.
+    """
+    component: Any = chosen.component
+    try:
+        built = component(chosen.config, *arguments)
+    except MissingExtraError:
+        raise
+    except Exception as error:
+        ours = chosen.installed.plugin.name == BUILTIN.name
+        if ours or (issubclass(component, SceneSource) and isinstance(error, ValueError | OSError)):
+            raise
+        failure = component_failure(chosen.type, "__init__", error, chosen.installed)
+        origin = chosen.place.origin
+        raise RecipeError(
+            [RecipeProblem(chosen.path, failure.reason, failure.fix, origin.file, origin.line)]
+        ) from error
+    if issubclass(component, Queries | Refinement):
+        _check_first_state(built, chosen)
+    return built
+
+
+def _check_first_state(module: nn.Module, chosen: Chosen) -> None:
+    """Make the first forward pass raise PluginError if it does not return the state that it must.
+
+    That has the fields that the component provides, and those of the state that it was given.
+    """
+    provided = dict(chosen.component.provides(chosen.config))
+
+    def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
+        fault = _state_fault(provided, arguments, state)
+        if fault:
+            place = place_of(chosen.component.forward)  # type: ignore[attr-defined]
+            raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
+        hook.remove()
+
+    hook = module.register_forward_hook(check)
+
+
+def _state_fault(provided: Mapping[str, Any], arguments: tuple[Any, ...], state: Any) -> str:
+    """What is wrong with a state that a component returned; "" if nothing is."""
+    if not isinstance(state, QueryState):
+        return f"returns {type(state).__name__}, not a QueryState"
+    found = ", ".join(state.fields) or "no field at all"
+    for name, spec in provided.items():
+        says = f"says that it provides {name} ({spec}), but"
+        if name not in state.fields:
+            return f"{says} the state that it returns has {found}"
+        shape = tuple(state.fields[name].shape[2:])
+        if not fits(shape, spec.shape):
+            return f"{says} it returns one of trailing shape {shape}"
+    for given in arguments:
+        lost = [name for name in getattr(given, "fields", ()) if name not in state.fields]
+        if lost:
+            return (
+                f"loses {', '.join(lost)}: the state that it returns has {found}; "
+                "`state.replace(...)` keeps what it does not change"
+            )
+    return ""

@@ -7,26 +7,23 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 
 from qgs.composer.nodes import Origin
+from qgs.contracts import Problem
 
 
-@dataclass(frozen=True, order=True)
-class RecipeProblem:
-    """One mistake.
+@dataclass(frozen=True)
+class RecipeProblem(Problem):
+    """A mistake in a recipe. option: its dotted path, "" for the whole recipe.
 
     file: as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python mapping.
-    line: 1-based, 0 where there is none. path: dotted path in the recipe, "" for the whole of it.
-    cause: what a plugin's code raised, None where nothing was.
+    line: 1-based, 0 where there is none. cause: what a plugin's code raised, if that is the reason.
     """
 
     file: str
     line: int
-    path: str
-    reason: str
-    fix: str
     cause: Exception | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
-        place = f"{Origin(self.file, self.line)}: {self.path or 'recipe'}"
+        place = f"{Origin(self.file, self.line)}: {self.option or 'recipe'}"
         return f"{place}\n  why: {self.reason}\n  fix: {self.fix}"
 
 
@@ -34,21 +31,21 @@ class RecipeError(ValueError):
     """A recipe that cannot work. `problems` holds all that were found, by file and line."""
 
     def __init__(self, problems: Iterable[RecipeProblem]) -> None:
-        self.problems = tuple(sorted(set(problems)))
-        count = len(self.problems)
-        title = "1 problem" if count == 1 else f"{count} problems"
-        super().__init__("\n".join([f"{title} in the recipe", *map(str, self.problems)]))
+        ordered = sorted(set(problems), key=lambda p: (p.file, p.line, p.option, p.reason, p.fix))
+        self.problems = tuple(ordered)
+        title = "1 problem" if len(ordered) == 1 else f"{len(ordered)} problems"
+        super().__init__("\n".join([f"{title} in the recipe", *map(str, ordered)]))
 
 
 class Problems:
-    """Collects problems while a recipe is read, so that all come at once."""
+    """Collects problems while a recipe is read, so that all are reported at once."""
 
     def __init__(self) -> None:
         self._found: list[RecipeProblem] = []
         self._stopped = False
 
     def stop(self, origin: Origin, path: str, reason: str, fix: str) -> None:
-        """Note a mistake that hides part of the recipe: reading on would only mislead."""
+        """Note a mistake that hides part of the recipe: checks of the rest would mislead."""
         self.add(origin, path, reason, fix)
         self._stopped = True
 
@@ -56,7 +53,7 @@ class Problems:
         self, origin: Origin, path: str, reason: str, fix: str, cause: Exception | None = None
     ) -> None:
         """Note a mistake and go on."""
-        self._found.append(RecipeProblem(origin.file, origin.line, path, reason, fix, cause))
+        self._found.append(RecipeProblem(path, reason, fix, origin.file, origin.line, cause))
 
     def raise_if_stopped(self) -> None:
         """Raise RecipeError if part of the recipe could not be read."""
@@ -64,7 +61,7 @@ class Problems:
             self.raise_any()
 
     def raise_any(self) -> None:
-        """Raise RecipeError if anything was found, from what plugins raised if they did."""
+        """Raise RecipeError if anything was found, chained to what plugins raised."""
         if not self._found:
             return
         error = RecipeError(self._found)

@@ -1,11 +1,11 @@
-"""A recipe as a tree in which every value and every key knows where it was written."""
+"""A recipe as mappings and lists that know where each key and item was written."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, TypeAlias, final
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 KeyPath: TypeAlias = tuple[str, ...]
 
@@ -21,52 +21,44 @@ class Origin:
         return f"{self.file}:{self.line}" if self.line else self.file
 
 
-@final
-@dataclass(frozen=True)
-class ScalarNode:
-    """A string, number, bool or None."""
+class MapNode(dict[str, Any]):
+    """A mapping. origin: where it begins. origins: where each key was written."""
 
-    origin: Origin
-    value: Any
+    def __init__(self, origin: Origin, items: Iterable[tuple[str, Any, Origin]] = ()) -> None:
+        super().__init__()
+        self.origin = origin
+        self.origins: dict[str, Origin] = {}
+        for key, value, place in items:
+            self[key], self.origins[key] = value, place
 
-
-@final
-@dataclass(frozen=True)
-class ListNode:
-    """A list."""
-
-    origin: Origin
-    items: tuple[Node, ...] = ()
-
-
-@final
-@dataclass(frozen=True)
-class MapNode:
-    """A mapping. keys: where each key was written."""
-
-    origin: Origin
-    items: Mapping[str, Node] = field(default_factory=dict)
-    keys: Mapping[str, Origin] = field(default_factory=dict)
-
-    def with_item(self, key: str, node: Node, origin: Origin) -> MapNode:
-        """A copy in which `key` is `node`."""
-        return MapNode(self.origin, {**self.items, key: node}, {**self.keys, key: origin})
+    def entries(self) -> list[tuple[str, Any, Origin]]:
+        """Keys and values, and where each key was written."""
+        return [(key, value, self.origins[key]) for key, value in self.items()]
 
     def without(self, *names: str) -> MapNode:
         """A copy that lacks `names`."""
-        return MapNode(
-            self.origin,
-            {key: node for key, node in self.items.items() if key not in names},
-            {key: origin for key, origin in self.keys.items() if key not in names},
-        )
+        return MapNode(self.origin, (entry for entry in self.entries() if entry[0] not in names))
 
-    def child_map(self, key: str) -> MapNode:
-        """The mapping under `key`, an empty one where there is none."""
-        node = self.items.get(key)
-        return node if isinstance(node, MapNode) else MapNode(self.keys.get(key, self.origin))
+    def child(self, *path: str) -> MapNode:
+        """The mapping at `path`, an empty one where there is none."""
+        found = self
+        for key in path:
+            value = found.get(key)
+            empty = MapNode(found.origins.get(key, found.origin))
+            found = value if isinstance(value, MapNode) else empty
+        return found
 
 
-Node: TypeAlias = ScalarNode | ListNode | MapNode
+class ListNode(list[Any]):
+    """A list. origin: where it begins. origins: where each item was written."""
+
+    def __init__(self, origin: Origin, items: Iterable[tuple[Any, Origin]] = ()) -> None:
+        items = list(items)
+        super().__init__(value for value, _ in items)
+        self.origin, self.origins = origin, [place for _, place in items]
+
+
+Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
 def from_plain(value: Any, origin: Origin) -> Node:
@@ -75,56 +67,45 @@ def from_plain(value: Any, origin: Origin) -> Node:
     Raises ValueError for a value that YAML could not hold.
     """
     if isinstance(value, Mapping):
-        items = {str(key): from_plain(item, origin) for key, item in value.items()}
-        return MapNode(origin, items, dict.fromkeys(items, origin))
+        entries = ((str(key), from_plain(item, origin), origin) for key, item in value.items())
+        return MapNode(origin, entries)
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return ListNode(origin, tuple(from_plain(item, origin) for item in value))
+        return ListNode(origin, ((from_plain(item, origin), origin) for item in value))
     if isinstance(value, os.PathLike):
-        return ScalarNode(origin, os.fspath(value))
+        return os.fspath(value)
     if value is None or isinstance(value, str | bool | int | float):
-        return ScalarNode(origin, value)
+        return value
     raise ValueError(
         f"a recipe holds mappings, lists, strings, numbers, truth values and None; got {value!r} "
         f"({type(value).__name__})"
     )
 
 
-def to_plain(node: Node) -> Any:
-    """The plain value of a tree."""
-    if isinstance(node, MapNode):
-        return {key: to_plain(item) for key, item in node.items.items()}
-    if isinstance(node, ListNode):
-        return [to_plain(item) for item in node.items]
-    return node.value
-
-
-def kind_of(node: Node) -> str:
-    """What `node` is, for messages."""
-    if isinstance(node, MapNode):
-        return "a mapping"
-    if isinstance(node, ListNode):
-        return "a list"
-    if node.value is None:
+def kind_of(value: Any) -> str:
+    """What the value of a node is, for messages."""
+    if isinstance(value, dict | list):
+        return "a mapping" if isinstance(value, dict) else "a list"
+    if value is None:
         return "nothing (null)"
-    if isinstance(node.value, bool):
-        return f"the truth value {str(node.value).lower()}"
-    if isinstance(node.value, str):
-        return f"the string {node.value!r}"
-    return f"the number {node.value!r}"
+    if isinstance(value, bool):
+        return f"the truth value {str(value).lower()}"
+    return f"the {'string' if isinstance(value, str) else 'number'} {value!r}"
 
 
-def is_null(node: Node | None) -> bool:
-    """Whether `node` is absent or null."""
-    return node is None or (isinstance(node, ScalarNode) and node.value is None)
+def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:
+    """Follow `path` into `tree`, skipping steps that are not written there.
 
-
-def locate(node: Node, path: Sequence[str | int]) -> Origin:
-    """Where the value at `path` was written; its nearest written ancestor if it was not."""
-    origin = node.origin
+    Returns the steps taken, where the last one was written, and the value found.
+    """
+    taken: list[str | int] = []
+    origin: Origin = tree.origin
+    node: Any = tree
     for step in path:
-        if isinstance(node, MapNode) and str(step) in node.items:
-            origin, node = node.keys[str(step)], node.items[str(step)]
-        elif isinstance(node, ListNode) and isinstance(step, int) and step < len(node.items):
-            node = node.items[step]
-            origin = node.origin
-    return origin
+        if isinstance(node, MapNode) and str(step) in node:
+            origin, node = node.origins[str(step)], node[str(step)]
+        elif isinstance(node, ListNode) and isinstance(step, int) and step < len(node):
+            origin, node = node.origins[step], node[step]
+        else:
+            continue
+        taken.append(step)
+    return taken, origin, node

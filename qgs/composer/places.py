@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 from qgs.composer.errors import Problems, did_you_mean, nearest
 from qgs.composer.files import merge
-from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, is_null, kind_of
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot
+from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, kind_of
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot, slot_at
 
 
 @dataclass(frozen=True)
@@ -29,65 +29,55 @@ class Place:
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
     """All places of `tree`; a layer's overrides are laid over the decoder's template."""
-    model = tree.child_map("model")
-    decoder = model.child_map("decoder")
-    places = [_place(model, ("model", name), SLOTS[name]) for name in MODEL_SLOTS]
-    template = [_place(decoder, ("model", "decoder", name), SLOTS[name]) for name in LAYER_SLOTS]
+    places = [_place(tree, ("model", name)) for name in MODEL_SLOTS]
+    template = [_place(tree, ("model", "decoder", name)) for name in LAYER_SLOTS]
     places += template
-    places += _layers(decoder.child_map("layers"), template, depth, problems)
+    layers = tree.child("model", "decoder", "layers")
+    _check_layers(layers, depth, problems)
+    for index in map(str, range(depth)):
+        places += [_layer_place(place, index, layers.child(index)) for place in template]
     for name, section in SECTIONS.items():
-        slot = SLOTS[name]
         if section.named:
-            below = tree.child_map(name)
-            written = [key for key, node in below.items.items() if not is_null(node)]
-            places += [_place(below, (name, key), slot) for key in written]
-        elif slot.default or not is_null(tree.items.get(name)):
-            places.append(_place(tree, (name,), slot))
+            written = tree.child(name).items()
+            places += [_place(tree, (name, key)) for key, node in written if node is not None]
+        elif SLOTS[name].default or tree.get(name) is not None:
+            places.append(_place(tree, (name,)))
     return {place.path: place for place in places}
 
 
-def _place(parent: MapNode, path: KeyPath, slot: Slot) -> Place:
-    origin = parent.keys.get(path[-1], parent.origin)
-    return Place(path, path, slot, parent.items.get(path[-1]), origin)
+def _place(tree: MapNode, path: KeyPath) -> Place:
+    parent, slot = tree.child(*path[:-1]), slot_at(path)
+    assert slot is not None
+    origin = parent.origins.get(path[-1], parent.origin)
+    return Place(path, path, slot, parent.get(path[-1]), origin)
 
 
-def _layers(
-    layers: MapNode, template: list[Place], depth: int, problems: Problems
-) -> Iterator[Place]:
-    overrides = dict(_overrides(layers, depth, problems))
-    for index in range(depth):
-        for place in template:
-            path = ("model", "decoder", "layers", str(index), place.path[-1])
-            written = overrides.get(index, MapNode(layers.origin))
-            over = written.items.get(place.path[-1])
-            if over is None or is_null(over):
-                yield Place(path, place.source, place.slot, place.node, place.origin)
-                continue
-            base = place.node or MapNode(place.origin)
-            node = merge(MapNode(place.origin) if is_null(base) else base, over, path)
-            yield Place(path, path, place.slot, node, written.keys[place.path[-1]])
+def _layer_place(template: Place, index: str, layer: MapNode) -> Place:
+    """The place of one slot in layer `index`. layer: what is written for this layer alone."""
+    name, base = template.path[-1], template.node
+    path = ("model", "decoder", "layers", index, name)
+    node = layer.get(name)
+    if node is None:
+        return replace(template, path=path)
+    if isinstance(node, MapNode) and (base is None or isinstance(base, MapNode)):
+        node = merge(MapNode(template.origin) if base is None else base, node, path)
+    return Place(path, path, template.slot, node, layer.origins[name])
 
 
-def _overrides(layers: MapNode, depth: int, problems: Problems) -> Iterator[tuple[int, MapNode]]:
-    for key, node in layers.items.items():
-        path, origin = f"model.decoder.layers.{key}", layers.keys[key]
-        if not (key.isascii() and key.isdigit() and str(int(key)) == key and int(key) < depth):
-            problems.add(
-                origin,
-                path,
-                f"there is no layer `{key}` in a decoder of depth {depth}",
-                f"name layers by their index, 0 to {depth - 1}",
-            )
-        elif not isinstance(node, MapNode):
-            if not is_null(node):
-                reason = "a layer's overrides are a mapping from slot to component"
-                problems.add(origin, path, reason, "write `SLOT: {type: NAME}` below it")
-        else:
-            for name in set(node.items) - set(LAYER_SLOTS):
-                reason = f"`{name}` is no slot of a decoder layer"
-                fix = did_you_mean(name, LAYER_SLOTS, "slots")
-                problems.add(node.keys[name], f"{path}.{name}", reason, fix)
-            yield int(key), node
+def _check_layers(written: MapNode, depth: int, problems: Problems) -> None:
+    """Report overrides of layers or slots that do not exist."""
+    for key, node, origin in written.entries():
+        path = f"model.decoder.layers.{key}"
+        if key not in map(str, range(depth)):
+            reason = f"there is no layer `{key}` in a decoder of depth {depth}"
+            problems.add(origin, path, reason, f"name layers by their index, 0 to {depth - 1}")
+        elif node is not None and not isinstance(node, MapNode):
+            reason = "a layer's overrides are a mapping from slot to component"
+            problems.add(origin, path, reason, "write `SLOT: {type: NAME}` below it")
+        for name in set(node) - set(LAYER_SLOTS) if isinstance(node, MapNode) else ():
+            reason = f"`{name}` is no slot of a decoder layer"
+            fix = did_you_mean(name, LAYER_SLOTS, "slots")
+            problems.add(node.origins[name], f"{path}.{name}", reason, fix)
 
 
 def apply_swaps(
@@ -99,36 +89,45 @@ def apply_swaps(
     or without the leading `model.`; decoder layers are addressed as `decoder.layers.INDEX.SLOT`.
     `null` in place of a component drops a swap that was inherited.
     """
-    swapped: dict[KeyPath, str] = {}
     result = dict(places)
-    for pattern, node in swaps.items.items():
-        origin, path = swaps.keys[pattern], f"swap.{pattern}"
-        if is_null(node):
+    # Swaps of the decoder's template would be lost under the layers made from it.
+    swappable = [path for path in places if path[:2] != ("model", "decoder") or len(path) == 5]
+    for pattern, node, origin in swaps.entries():
+        name = f"swap.{pattern}"
+        if node is None:
             reason = f"there is no inherited swap `{pattern}` that null could drop"
-            problems.add(origin, path, reason, "remove this line, or name the pattern as inherited")
+            fix = "remove this line, or name the pattern as inherited"
+            problems.add(origin, name, reason, fix)
             continue
-        if not _names_component(node, origin, path, problems):
+        if not isinstance(node, MapNode) or node.get("type") is None:
+            reason = f"a swap puts a component, this is {kind_of(node)} without a `type`"
+            problems.add(origin, name, reason, "write `PATTERN: {type: PLUGIN/NAME, ...}`")
             continue
-        hits = [place for place in places if _matches(pattern, place)]
+        hits = [path for path in swappable if _matches(pattern, path)]
         if not hits:
-            fix = _near_pattern(pattern, places)
-            problems.add(origin, path, f"the pattern `{pattern}` matches no place", fix)
-        for place in hits:
-            conflict = _conflict(places[place], swapped.get(place), swaps)
+            reason = f"the pattern `{pattern}` matches no place"
+            problems.add(origin, name, reason, _near_pattern(pattern, swappable))
+        for path in hits:
+            conflict = _conflict(result[path])
             if conflict:
-                problems.add(origin, path, *conflict)
+                problems.add(origin, name, *conflict)
                 break
-            swapped[place] = pattern
-            source = ("swap", pattern)
-            result[place] = replace(places[place], source=source, node=node, origin=origin)
+            swap = ("swap", pattern)
+            result[path] = replace(places[path], source=swap, node=node, origin=origin)
     return result
 
 
-def _conflict(place: Place, other: str | None, swaps: MapNode) -> tuple[str, str] | None:
-    """What speaks against a swap at `place`, which the pattern `other` may have swapped before."""
+def _matches(pattern: str, path: KeyPath) -> bool:
+    parts = tuple(pattern.split("."))
+    shown = path[1:] if path[0] == "model" and parts[0] != "model" else path
+    return len(parts) == len(shown) and all(map(fnmatchcase, shown, parts))
+
+
+def _conflict(place: Place) -> tuple[str, str] | None:
+    """Reason and fix if `place` is already swapped, or set for its layer alone."""
     name = ".".join(place.path)
-    if other is not None:
-        reason = f"`{name}` is already swapped by `{other}` ({swaps.keys[other]})"
+    if place.source[0] == "swap":
+        reason = f"`{name}` is already swapped by `{place.source[1]}` ({place.origin})"
         return reason, "narrow one of the two patterns, or remove one"
     if "layers" in place.source:
         reason = f"`{name}` is already set for this layer at {place.origin}"
@@ -136,37 +135,16 @@ def _conflict(place: Place, other: str | None, swaps: MapNode) -> tuple[str, str
     return None
 
 
-def _is_swappable(place: KeyPath) -> bool:
-    return place[:2] != ("model", "decoder") or len(place) == 5
-
-
-def _matches(pattern: str, place: KeyPath) -> bool:
-    parts = tuple(pattern.split("."))
-    shown = place[1:] if place[0] == "model" and parts[0] != "model" else place
-    return _is_swappable(place) and len(parts) == len(shown) and all(map(fnmatchcase, shown, parts))
-
-
-def _names_component(node: Node, origin: Origin, path: str, problems: Problems) -> bool:
-    if isinstance(node, MapNode) and not is_null(node.items.get("type")):
-        return True
-    problems.add(
-        origin,
-        path,
-        f"a swap puts a component, this is {kind_of(node)} without a `type`",
-        "write `PATTERN: {type: PLUGIN/NAME, ...}`",
-    )
-    return False
-
-
-def _near_pattern(pattern: str, places: Mapping[KeyPath, Place]) -> str:
-    choices: dict[str, None] = {}
-    for place in filter(_is_swappable, places):
-        parts = place[1:] if place[0] == "model" else place
+def _near_pattern(pattern: str, swappable: Iterable[KeyPath]) -> str:
+    """A fix: the place, or all layers of it, whose name is nearest to `pattern`."""
+    places: list[str] = []
+    for path in swappable:
+        parts = path[1:] if path[0] == "model" else path
         if "layers" in parts:
-            choices[".".join((*parts[:2], "*", *parts[3:]))] = None
-        choices[".".join(parts)] = None
-    near = nearest(pattern.removeprefix("model."), choices)
+            places.append(".".join((*parts[:2], "*", *parts[3:])))
+        places.append(".".join(parts))
+    near = nearest(pattern.removeprefix("model."), places)
     if near:
         return f"did you mean `{near}`?"
-    starred = [choice for choice in choices if "*" in choice or "layers" not in choice]
+    starred = dict.fromkeys(name for name in places if "*" in name or "layers" not in name)
     return f"places: {', '.join(starred)}"

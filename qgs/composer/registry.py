@@ -8,9 +8,9 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import qgs
 import qgs.components
 import qgs.data
 import qgs.losses
+import qgs.metrics
 import qgs.renderers
 from qgs.composer.slots import SLOTS
 from qgs.contracts import (
@@ -31,163 +32,6 @@ from qgs.contracts import (
     WeightLayout,
 )
 
-
-def file_of(component: type) -> str | None:
-    """The file that defines a class; None for one that was defined in no file."""
-    return getattr(sys.modules.get(component.__module__), "__file__", None)
-
-
-def package_of(file: str) -> Path:
-    """The outermost package folder that holds the module `file`, or the file itself."""
-    path = Path(file).resolve()
-    while (path.parent / "__init__.py").exists():
-        path = path.parent
-    return path
-
-
-def package_named(module: str) -> list[Path]:
-    """The folder, or the file, of the outermost package of `module`, which need not import."""
-    try:
-        spec = find_spec(module.partition(".")[0])
-    except (ImportError, ValueError):
-        return []
-    return [package_of(spec.origin)] if spec and spec.origin else []
-
-
-def lies_in(file: str, root: Path) -> bool:
-    """Whether `file` is `root` or below it."""
-    path = Path(file).resolve()
-    return path == root or root in path.parents
-
-
-def place_of(function: Callable[..., Any]) -> str:
-    """FILE:LINE where a function starts; "" for one that is not written in Python."""
-    code = getattr(inspect.unwrap(function), "__code__", None)
-    return f"{code.co_filename}:{code.co_firstlineno}" if code else ""
-
-
-def place_in(error: BaseException, roots: Iterable[Path]) -> str:
-    """FILE:LINE of the last place below one of `roots` that `error` passed; "" for none."""
-    frames = traceback.extract_tb(error.__traceback__)
-    passed = [(frame.filename, frame.lineno) for frame in frames]
-    if isinstance(error, SyntaxError) and error.filename:
-        passed.append((error.filename, error.lineno))
-    roots = list(roots)
-    own = [place for place in passed if any(lies_in(place[0], root) for root in roots)]
-    return "{}:{}".format(*own[-1]) if own else ""
-
-
-NAME = re.compile(r"[^\s/]+")
-"""Of a component: `type: PLUGIN/NAME` must be read as it was written."""
-
-DEVICES = ("cpu", "cuda")
-"""Types of the devices that a renderer can render on."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """reason: what a plugin does wrong, as the rest of "the plugin X ...".
-
-    fix: what its user can do, "" for no more than to update it.
-    """
-
-    reason: str
-    fix: str = ""
-
-
-def plugin_fault(plugin: object, name: str) -> Fault | None:
-    """The first fault of what the entry point `name` leads to; None for a sound plugin."""
-    if not isinstance(plugin, Plugin):
-        kind = type(plugin).__name__
-        return Fault(f"is no qgs.Plugin: its entry point leads to an object of type {kind}")
-    return next(_faults(plugin, name), None)
-
-
-def _faults(plugin: Plugin, name: str) -> Iterator[Fault]:
-    version: object = plugin.contract_version
-    if type(version) is not int:
-        yield Fault(f"must give `contract_version` as a whole number, not {version!r}")
-    elif version != CONTRACT_VERSION:
-        yield _other_contracts(version)
-    if plugin.name != name:
-        yield Fault(f"calls itself `{plugin.name}`; the two names must be one")
-    for attribute in ("components", "layouts", "examples"):
-        value = getattr(plugin, attribute)
-        if not isinstance(value, Sequence):
-            comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
-            yield Fault(f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}")
-            return
-    if not plugin.components and not plugin.layouts:
-        yield Fault("is empty: it lists neither `components` nor `layouts`")
-    if not isinstance(plugin.exemptions, Mapping):
-        yield Fault(f"must give `exemptions` as a mapping, not {plugin.exemptions!r}")
-    yield from _component_faults(plugin.components)
-    for layout in plugin.layouts:
-        if not isinstance(layout, WeightLayout):
-            yield Fault(f"lists {layout!r}, which is no WeightLayout")
-
-
-def _other_contracts(version: int) -> Fault:
-    reason = f"was written for contract version {version}; this qgs has version {CONTRACT_VERSION}"
-    newer = version > CONTRACT_VERSION
-    return Fault(reason, "update qgs, or do without the plugin" if newer else "")
-
-
-def _component_faults(components: Sequence[object]) -> Iterator[Fault]:
-    taken: set[tuple[str, str]] = set()
-    for component in components:
-        reason = component_fault(component)
-        if reason:
-            yield Fault(f"lists {getattr(component, '__qualname__', repr(component))}, {reason}")
-            return
-        assert inspect.isclass(component)
-        assert issubclass(component, Component)
-        if (component.slot, component.name) in taken:
-            yield Fault(f"registers `{component.name}` twice in the slot `{component.slot}`")
-        taken.add((component.slot, component.name))
-
-
-def component_fault(component: object) -> str:
-    """Why nothing can be built of `component`; "" if it can."""
-    if not (inspect.isclass(component) and issubclass(component, Component)):
-        return "which is no qgs component"
-    slot = SLOTS.get(getattr(component, "slot", ""))
-    if slot is None or not issubclass(component, slot.contract):
-        return "which implements no slot's contract"
-    name = getattr(component, "name", None)
-    if not isinstance(name, str):
-        return "which has no `name`"
-    if not NAME.fullmatch(name):
-        return f"whose name {name!r} is empty or has a slash or a blank"
-    if inspect.isabstract(component):
-        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
-    if issubclass(component, Renderer) and not _are_devices(component.devices):
-        return f"whose `devices` is {component.devices!r}; give some of {DEVICES} as a tuple"
-    return _config_fault(component.Config)
-
-
-def _are_devices(given: object) -> bool:
-    return isinstance(given, tuple) and bool(given) and all(name in DEVICES for name in given)
-
-
-def _config_fault(config: object) -> str:
-    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
-        return "whose Config is no ComponentConfig"
-    if "type" in config.model_fields:
-        return "whose Config has an option `type`, which names the component itself"
-    return _schema_fault(config)
-
-
-@cache
-def _schema_fault(config: type[ComponentConfig]) -> str:
-    try:
-        config.model_json_schema()
-    except Exception as error:
-        told = str(error).splitlines()[0]
-        return f"whose Config has options that YAML cannot express: {told}"
-    return ""
-
-
 BUILTIN = Plugin(
     name="qgs",
     contract_version=CONTRACT_VERSION,
@@ -195,6 +39,7 @@ BUILTIN = Plugin(
         *qgs.components.COMPONENTS,
         *qgs.renderers.COMPONENTS,
         *qgs.losses.COMPONENTS,
+        *qgs.metrics.COMPONENTS,
         *qgs.data.COMPONENTS,
     ),
     layouts=(qgs.components.TOKENGS,),
@@ -205,6 +50,10 @@ BUILTIN = Plugin(
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
     ),
 )
+NAME = re.compile(r"[^\s/]+")
+"""Of a component: `type: PLUGIN/NAME` must be read as it was written."""
+DEVICES = ("cpu", "cuda", "mps")
+"""Types of the devices that a renderer can render on."""
 
 
 class PluginError(ValueError):
@@ -233,6 +82,11 @@ class InstalledPlugin:
         """Name and version of the distribution, as messages give them; "" for none."""
         return f"{self.distribution} {self.version}" if self.distribution else ""
 
+    def repair(self, place: str) -> str:
+        """What its user can do about a fault. place: FILE:LINE of it."""
+        own = self.editable or not self.distribution
+        return f"mend {place}" if own else f"update {self.released_as}"
+
 
 @dataclass(frozen=True)
 class Registry:
@@ -254,43 +108,6 @@ class Registry:
         }
 
 
-def default_config(component: type[Component]) -> ComponentConfig | None:
-    """The options that `component` has by default; None if they do not make a Config."""
-    try:
-        return component.Config()
-    except (
-        Exception,
-        SystemExit,
-    ):  # an option must be given, or the code of a stranger's validator fails
-        return None
-
-
-def component_error(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
-    """A component of `installed` breaks its contract; `fault` says which one, and how.
-
-    place: FILE:LINE in its code, "" for none.
-    """
-    release = installed.released_as
-    origin = f" of {release}" if release else ""
-    at = f" (at {place})" if place else ""
-    own = installed.editable or not release
-    fix = f"mend {place or 'it'}" if own else f"update {release}"
-    return PluginError(
-        f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}",
-        f"{fix}, or choose another component",
-    )
-
-
-def component_failure(
-    kind: str, what: str, error: Exception, installed: InstalledPlugin
-) -> PluginError:
-    """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
-    files = filter(None, map(file_of, installed.plugin.components))
-    roots = {package_of(file) for file in files} - {package_of(qgs.__file__)}
-    fault = f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
-    return component_error(installed, fault, place_in(error, roots))
-
-
 def builtin() -> InstalledPlugin:
     """The plugin `qgs`."""
     return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
@@ -309,25 +126,6 @@ def available_plugins() -> dict[str, list[EntryPoint]]:
     return found
 
 
-def load_plugin(name: str) -> InstalledPlugin:
-    """Import and check the plugin `name`; raises PluginError."""
-    if name == BUILTIN.name:
-        return builtin()
-    entries = available_plugins().get(name, [])
-    if not entries:
-        raise PluginError(
-            f"no installed distribution offers a plugin `{name}`",
-            f"install the one that does; installed plugins: {_names(available_plugins())}",
-        )
-    if len(entries) > 1:
-        raise PluginError(
-            f"several distributions offer a plugin `{name}`: "
-            f"{', '.join(sorted(map(_release, entries)))}",
-            "uninstall all of them but one",
-        )
-    return _load(entries[0])
-
-
 def load_registry(names: Iterable[str]) -> Registry:
     """The built-in components and those of the plugins `names`; raises PluginError."""
     return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
@@ -338,10 +136,8 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
     plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()
     for entry in available.pop(BUILTIN.name, []):
-        broken.append(
-            f"{_release(entry)} offers a plugin `qgs`, the framework's own name; "
-            f"uninstall {_release(entry)}"
-        )
+        reason = f"{_release(entry)} offers a plugin `qgs`, the framework's own name"
+        broken.append(f"{reason}; uninstall {_release(entry)}")
     for name in sorted(available):
         try:
             plugins[name] = load_plugin(name)
@@ -355,52 +151,204 @@ def plugin_versions(names: Iterable[str]) -> dict[str, str]:
     return {name: plugin.version for name, plugin in load_registry(names).plugins.items()}
 
 
-def _load(entry: EntryPoint) -> InstalledPlugin:
-    distribution = _release(entry)
+def load_plugin(name: str) -> InstalledPlugin:
+    """Import and check the plugin `name`; raises PluginError."""
+    if name == BUILTIN.name:
+        return builtin()
+    available = available_plugins()
+    entries = available.get(name, [])
+    if not entries:
+        installed = ", ".join(sorted(available)) or "none"
+        raise PluginError(
+            f"no installed distribution offers a plugin `{name}`",
+            f"install the one that does; installed plugins: {installed}",
+        )
+    if len(entries) > 1:
+        releases = ", ".join(sorted(map(_release, entries)))
+        raise PluginError(
+            f"several distributions offer a plugin `{name}`: {releases}",
+            "uninstall all of them but one",
+        )
+    entry = entries[0]
+    assert entry.dist is not None
+    # The record of where a distribution came from (PEP 610): whether by `pip install -e`.
+    record = json.loads(entry.dist.read_text("direct_url.json") or "{}")
+    editable = bool(record.get("dir_info", {}).get("editable"))
+    empty = Plugin(name, CONTRACT_VERSION, ())
+    installed = InstalledPlugin(empty, entry.dist.name, entry.dist.version, editable)
+    named = f"the plugin `{name}` of {installed.released_as}"
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:
         place = place_in(error, package_named(entry.module))
-        raise PluginError(
-            f"the plugin `{entry.name}` of {distribution} cannot be imported from "
-            f"`{entry.value}`: {type(error).__name__}: {error}{f' (at {place})' if place else ''}",
-            _import_fix(entry, error, place),
-        ) from error
-    fault = plugin_fault(plugin, entry.name)
-    if fault:
-        reason = f"the plugin `{entry.name}` of {distribution} {fault.reason}"
-        raise PluginError(reason, fault.fix or _repair(entry))
-    assert entry.dist is not None
-    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, _is_editable(entry.dist))
-
-
-def _import_fix(entry: EntryPoint, error: BaseException, place: str) -> str:
-    release = _release(entry)
-    missing = error.name if isinstance(error, ModuleNotFoundError) else None
-    if missing == entry.module:
-        return f"install {release} again, its files are gone; or do without the plugin"
-    package = (missing or "").partition(".")[0]
-    if package and package not in ("qgs", entry.module.partition(".")[0]):
-        return f"install `{package}`, which {release} needs, or do without the plugin"
-    return _repair(entry, place)
-
-
-def _repair(entry: EntryPoint, place: str = "") -> str:
-    """place: FILE:LINE of what is wrong, "" where only the entry point leads there."""
-    if entry.dist and _is_editable(entry.dist):
-        return f"mend {place or f'`{entry.value}`'}, or do without the plugin"
-    return f"update {_release(entry)}, or do without the plugin"
-
-
-def _is_editable(distribution: Distribution) -> bool:
-    """Whether it was installed with `pip install -e`: the record of its origin (PEP 610)."""
-    origin = json.loads(distribution.read_text("direct_url.json") or "{}")
-    return bool(origin.get("dir_info", {}).get("editable"))
+        at = f" (at {place})" if place else ""
+        told = f"{type(error).__name__}: {error}{at}"
+        reason = f"{named} cannot be imported from `{entry.value}`: {told}"
+        fix = installed.repair(place or f"`{entry.value}`")
+        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+        package = missing.partition(".")[0]
+        if missing == entry.module:
+            fix = f"install {installed.released_as} again, its files are gone"
+        elif package not in ("", "qgs", entry.module.partition(".")[0]):
+            fix = f"install `{package}`, which {installed.released_as} needs"
+        raise PluginError(reason, f"{fix}, or do without the plugin") from error
+    for fault in _plugin_faults(plugin, name):
+        version = getattr(plugin, "contract_version", None)
+        newer = type(version) is int and version > CONTRACT_VERSION
+        fix = "update qgs" if newer else installed.repair(f"`{entry.value}`")
+        raise PluginError(f"{named} {fault}", f"{fix}, or do without the plugin")
+    return replace(installed, plugin=plugin)
 
 
 def _release(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
 
 
-def _names(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names)) or "none"
+def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
+    """Faults of what the entry point `name` leads to, each the rest of "the plugin X ..."."""
+    if not isinstance(plugin, Plugin):
+        kind = type(plugin).__name__
+        yield f"is no qgs.Plugin: its entry point leads to an object of type {kind}"
+        return
+    version: object = plugin.contract_version
+    if type(version) is not int:
+        yield f"must give `contract_version` as a whole number, not {version!r}"
+    elif version != CONTRACT_VERSION:
+        known = f"this qgs has version {CONTRACT_VERSION}"
+        yield f"was written for contract version {version}; {known}"
+    if plugin.name != name:
+        yield f"calls itself `{plugin.name}`; the two names must be one"
+    for attribute in ("components", "layouts", "examples"):
+        value = getattr(plugin, attribute)
+        if not isinstance(value, Sequence):
+            comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
+            yield f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}"
+            return
+    if not plugin.components and not plugin.layouts:
+        yield "is empty: it lists neither `components` nor `layouts`"
+    if not isinstance(plugin.exemptions, Mapping):
+        yield f"must give `exemptions` as a mapping, not {plugin.exemptions!r}"
+    taken: set[tuple[str, str]] = set()
+    for component in plugin.components:
+        fault = component_fault(component)
+        if fault:
+            yield f"lists {getattr(component, '__qualname__', repr(component))}, {fault}"
+            return
+        if (component.slot, component.name) in taken:
+            yield f"registers `{component.name}` twice in the slot `{component.slot}`"
+        taken.add((component.slot, component.name))
+    for layout in plugin.layouts:
+        if not isinstance(layout, WeightLayout):
+            yield f"lists {layout!r}, which is no WeightLayout"
+
+
+def component_fault(component: object) -> str:
+    """Why nothing can be built of `component`; "" if it can."""
+    if not (inspect.isclass(component) and issubclass(component, Component)):
+        return "which is no qgs component"
+    slot = SLOTS.get(getattr(component, "slot", ""))
+    if slot is None or not issubclass(component, slot.contract):
+        return "which implements no slot's contract"
+    name = getattr(component, "name", None)
+    if not isinstance(name, str):
+        return "which has no `name`"
+    if not NAME.fullmatch(name):
+        return f"whose name {name!r} is empty or has a slash or a blank"
+    if inspect.isabstract(component):
+        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
+    if issubclass(component, Renderer):
+        given: object = component.devices
+        if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
+            return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
+    config: object = component.Config
+    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
+        return "whose Config is no ComponentConfig"
+    if "type" in config.model_fields:
+        return "whose Config has an option `type`, which names the component itself"
+    return _schema_fault(config)
+
+
+@cache
+def _schema_fault(config: type[ComponentConfig]) -> str:
+    try:
+        config.model_json_schema()
+    except Exception as error:
+        first_line = str(error).splitlines()[0]
+        return f"whose Config has options that YAML cannot express: {first_line}"
+    return ""
+
+
+def default_config(component: type[Component]) -> ComponentConfig | None:
+    """The options that `component` has by default.
+
+    None if an option must be given, or if a plugin's own validator fails.
+    """
+    try:
+        return component.Config()
+    except (Exception, SystemExit):
+        return None
+
+
+def component_error(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
+    """A component of `installed` breaks its contract; `fault` says which one, and how.
+
+    place: FILE:LINE in its code, "" for none.
+    """
+    origin = f" of {installed.released_as}" if installed.distribution else ""
+    at = f" (at {place})" if place else ""
+    reason = f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}"
+    return PluginError(reason, f"{installed.repair(place or 'it')}, or choose another component")
+
+
+def component_failure(
+    kind: str, what: str, error: Exception, installed: InstalledPlugin
+) -> PluginError:
+    """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
+    files = filter(None, map(file_of, installed.plugin.components))
+    roots = {package_of(file) for file in files} - {package_of(qgs.__file__)}
+    fault = f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
+    return component_error(installed, fault, place_in(error, roots))
+
+
+def file_of(component: type) -> str | None:
+    """The file that defines a class; None for one that was defined in no file."""
+    return getattr(sys.modules.get(component.__module__), "__file__", None)
+
+
+def package_of(file: str) -> Path:
+    """The outermost package folder that holds the module `file`, or the file itself."""
+    path = Path(file).resolve()
+    while (path.parent / "__init__.py").exists():
+        path = path.parent
+    return path
+
+
+def package_named(module: str) -> list[Path]:
+    """The folder, or the file, of the outermost package of `module`, which need not import."""
+    try:
+        spec = find_spec(module.partition(".")[0])
+    except (ImportError, ValueError):
+        return []
+    return [package_of(spec.origin)] if spec and spec.origin else []
+
+
+def lies_in(file: str, root: Path) -> bool:
+    """Whether `file` is `root` or below it."""
+    return Path(file).resolve().is_relative_to(root)
+
+
+def place_of(function: Callable[..., Any]) -> str:
+    """FILE:LINE where a function starts; "" for one that is not written in Python."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    return f"{code.co_filename}:{code.co_firstlineno}" if code else ""
+
+
+def place_in(error: BaseException, roots: Iterable[Path]) -> str:
+    """FILE:LINE of the last place below one of `roots` that `error` passed; "" for none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    passed = [(frame.filename, frame.lineno) for frame in frames]
+    if isinstance(error, SyntaxError) and error.filename:
+        passed.append((error.filename, error.lineno))
+    roots = list(roots)
+    own = [place for place in passed if any(lies_in(place[0], root) for root in roots)]
+    return "{}:{}".format(*own[-1]) if own else ""

@@ -1,15 +1,15 @@
-"""The JSON Schema of a recipe, so that editors complete and check it."""
+"""The JSON Schema of a recipe, so that editors complete it, check it and show what options mean."""
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
+from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import Registry
-from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot
-from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
-
-_NAMES = {"type": "array", "items": {"type": "string"}}
+from qgs.composer.sections import SETTINGS
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS
+from qgs.contracts import Component, ComponentConfig
 
 
 def recipe_schema(registry: Registry) -> dict[str, Any]:
@@ -18,52 +18,63 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
     Nothing is required: an overlay may leave everything to what it extends. A component without a
     `type` may have the options of any component of its slot.
     """
-    definitions = {slot.name: _slot(slot, registry) for slot in SLOTS.values()}
-    layer = _object({name: _ref(name) for name in LAYER_SLOTS})
-    decoder = _settings(DecoderSettings)
-    decoder["properties"] |= {name: _ref(name) for name in LAYER_SLOTS}
-    decoder["properties"]["layers"] = {
+    names = {"type": "array", "items": {"type": "string"}}
+    layer = {name: _component(name) for name in LAYER_SLOTS}
+    overrides = {
         "type": "object",
-        "patternProperties": {"^[0-9]+$": layer},
+        "patternProperties": {"^[0-9]+$": _object(layer)},
         "additionalProperties": False,
     }
-    model = _settings(ModelSettings)
-    model["properties"] |= {name: _ref(name) for name in MODEL_SLOTS} | {"decoder": decoder}
-    recipe = _settings(RecipeSettings)
-    recipe["properties"] |= {
-        "extends": {"anyOf": [{"type": "string"}, _NAMES]},
-        "plugins": _NAMES,
-        "swap": _mapping_of({"anyOf": [*map(_ref, SLOTS), {"type": "null"}]}),
-        "model": model,
-        **{name: _section(name) for name in SECTIONS},
-        "views": _settings(ViewsConfig),
-        "training": _settings(TrainingConfig),
-        "evaluation": _settings(EvaluationConfig),
+    layers = _described(overrides, "Overrides of single layers, by their index from 0.")
+    decoder = _section(("model", "decoder"), layer | {"layers": layers})
+    parts = {name: _component(name) for name in MODEL_SLOTS}
+    any_component = {"anyOf": [*map(_ref, SLOTS), {"type": "null"}]}
+    beside = {
+        "extends": _described(
+            {"anyOf": [{"type": "string"}, names]},
+            "Recipe file or files that this one is laid over, relative to this file.",
+        ),
+        "plugins": _described(names, "Plugins whose components the recipe may name."),
+        "swap": _described(
+            _mapping_of(any_component),
+            "Components by pattern of the places that they take, such as "
+            "`decoder.layers.*.feed_forward`; null drops an inherited swap.",
+        ),
+        "model": _section(("model",), parts | {"decoder": decoder}),
+    }
+    for name, section in SECTIONS.items():
+        component = _component(name, {"type": "null"})
+        by_name = _described(_mapping_of(component), f"By name: {_summary(SLOTS[name].contract)}")
+        beside[name] = by_name if section.named else component
+    beside |= {path[0]: _section(path) for path in SETTINGS if path and path[0] not in beside}
+    definitions = {
+        name: {
+            "anyOf": [
+                _type(kind, component) for kind, component in registry.components(name).items()
+            ]
+        }
+        for name in SLOTS
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "qgs recipe",
-        **recipe,
+        **_section((), beside),
         "$defs": definitions,
     }
 
 
-def _section(name: str) -> dict[str, Any]:
-    component = {"anyOf": [_ref(name), {"type": "null"}]}
-    return _mapping_of(component) if SECTIONS[name].named else component
+def _type(name: str, component: type[Component]) -> dict[str, Any]:
+    """The options of `component`, and the `type` that chooses it."""
+    summary = _summary(component)
+    schema = _described(_settings(component.Config), summary)
+    kind = {"const": name, "description": summary}
+    return schema | {"properties": {"type": kind, **schema["properties"]}}
 
 
-def _slot(slot: Slot, registry: Registry) -> dict[str, Any]:
-    components = registry.components(slot.name)
-    return {"anyOf": [_component(name, component) for name, component in components.items()]}
-
-
-def _component(name: str, component: type[Component]) -> dict[str, Any]:
-    schema = _settings(component.Config)
-    schema["properties"] = {"type": {"const": name}, **schema["properties"]}
-    if component.__doc__:
-        schema["description"] = component.__doc__.splitlines()[0]
-    return schema
+def _section(path: KeyPath, beside: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The settings of a section. beside: what else stands in it."""
+    schema = _settings(SETTINGS[path])
+    return schema | {"properties": schema["properties"] | (beside or {})}
 
 
 def _settings(config: type[ComponentConfig]) -> dict[str, Any]:
@@ -71,8 +82,7 @@ def _settings(config: type[ComponentConfig]) -> dict[str, Any]:
     definitions = schema.pop("$defs", {})
     schema.pop("required", None)
     schema.pop("title", None)
-    schema.setdefault("properties", {})
-    return _inlined(schema, definitions)
+    return _inlined({"properties": {}} | schema, definitions)
 
 
 def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
@@ -82,10 +92,23 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
     if not isinstance(schema, dict):
         return schema
     if "$ref" in schema:
-        schema = definitions[schema["$ref"].rsplit("/", 1)[1]]
-    return {
-        key: _inlined(item, definitions) for key, item in schema.items() if key != "discriminator"
-    }
+        schema = definitions[schema["$ref"].rsplit("/", 1)[1]] | schema
+    left_out = ("$ref", "discriminator")
+    return {k: _inlined(item, definitions) for k, item in schema.items() if k not in left_out}
+
+
+def _component(slot: str, *others: dict[str, Any]) -> dict[str, Any]:
+    schema = {"anyOf": [_ref(slot), *others]} if others else _ref(slot)
+    return _described(schema, _summary(SLOTS[slot].contract))
+
+
+def _summary(described: type) -> str:
+    """The first paragraph of a docstring, on one line."""
+    return " ".join((inspect.getdoc(described) or "").split("\n\n")[0].split())
+
+
+def _described(schema: dict[str, Any], description: str) -> dict[str, Any]:
+    return schema | {"description": description}
 
 
 def _ref(name: str) -> dict[str, Any]:

@@ -6,29 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from qgs.composer.nodes import KeyPath, MapNode, Node, ScalarNode, is_null
-from qgs.contracts import (
-    Centers,
-    Component,
-    CrossAttention,
-    Encoder,
-    FeedForward,
-    Head,
-    Loss,
-    Queries,
-    Refinement,
-    Renderer,
-    SceneSource,
-    SelfAttention,
-    Supervision,
-)
+from qgs import contracts
+from qgs.composer.nodes import KeyPath, MapNode
 
 
 @dataclass(frozen=True)
 class Slot:
     """One kind of place. default: the `type` of a place that names none; None if it must."""
 
-    contract: type[Component]
+    contract: type[contracts.Component]
     default: str | None
 
     @property
@@ -40,18 +26,19 @@ class Slot:
 SLOTS = {
     slot.name: slot
     for slot in (
-        Slot(Encoder, "qgs/multiview_vit"),
-        Slot(Queries, "qgs/latent"),
-        Slot(CrossAttention, "qgs/content"),
-        Slot(SelfAttention, "qgs/content"),
-        Slot(FeedForward, "qgs/mlp"),
-        Slot(Refinement, "qgs/none"),
-        Slot(Head, "qgs/gaussian_head"),
-        Slot(Centers, "qgs/free"),
-        Slot(Supervision, "qgs/layers"),
-        Slot(Renderer, "qgs/auto"),
-        Slot(Loss, None),
-        Slot(SceneSource, None),
+        Slot(contracts.Encoder, "qgs/multiview_vit"),
+        Slot(contracts.Queries, "qgs/latent"),
+        Slot(contracts.CrossAttention, "qgs/content"),
+        Slot(contracts.SelfAttention, "qgs/content"),
+        Slot(contracts.FeedForward, "qgs/mlp"),
+        Slot(contracts.Refinement, "qgs/none"),
+        Slot(contracts.Head, "qgs/gaussian_head"),
+        Slot(contracts.Centers, "qgs/free"),
+        Slot(contracts.Supervision, "qgs/layers"),
+        Slot(contracts.Renderer, "qgs/auto"),
+        Slot(contracts.Loss, None),
+        Slot(contracts.Metric, None),
+        Slot(contracts.SceneSource, None),
     )
 }
 
@@ -75,11 +62,28 @@ class Section:
 
 
 DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
+DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
 
 SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
+    "metrics": Section(named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
 }
+
+
+MOVED = {
+    "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
+    "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",
+    "evaluation.lpips_weights": "metrics: {lpips: {type: qgs/lpips, weights: ...}}",
+    "training.learning_rate": "optimizer: {learning_rate: ...}",
+    "training.warmup": "optimizer: {warmup: ...}",
+    "training.initial_divisor": "optimizer: {initial_divisor: ...}",
+    "training.final_divisor": "optimizer: {final_divisor: ...}",
+    "training.betas": "optimizer: {betas: ...}",
+    "training.weight_decay": "optimizer: {weight_decay: ...}",
+    "qgs/rooms": "type: rooms/procedural` and, at the top, `plugins: [rooms]",
+}
+"""Keys and types of older recipes, and what to write in their place."""
 
 
 def slot_at(path: KeyPath) -> Slot | None:
@@ -87,24 +91,19 @@ def slot_at(path: KeyPath) -> Slot | None:
     match path:
         case ("model", name) if name in MODEL_SLOTS:
             return SLOTS[name]
-        case ("model", "decoder", name) if name in LAYER_SLOTS:
-            return SLOTS[name]
-        case ("model", "decoder", "layers", _, name) if name in LAYER_SLOTS:
-            return SLOTS[name]
-        case (name,) if name in SECTIONS and not SECTIONS[name].named:
-            return SLOTS[name]
-        case (name, _) if name in SECTIONS and SECTIONS[name].named:
+        case ("model", "decoder", name) | ("model", "decoder", "layers", _, name):
+            return SLOTS[name] if name in LAYER_SLOTS else None
+        case (name, *below) if name in SECTIONS and len(below) == SECTIONS[name].named:
             return SLOTS[name]
     return None
 
 
-def type_at(node: Node | None, path: KeyPath) -> Any:
+def type_at(node: Any, path: KeyPath) -> Any:
     """The `type` of the component written as `node` at `path`: its own, or the slot's default.
 
     `type: null` leaves the default, as `null` does in place of a component.
     """
-    if isinstance(node, MapNode) and not is_null(node.items.get("type")):
-        written = node.items["type"]
-        return written.value if isinstance(written, ScalarNode) else written
+    if isinstance(node, MapNode) and node.get("type") is not None:
+        return node["type"]
     slot = slot_at(path)
     return slot.default if slot else None

@@ -1,4 +1,4 @@
-"""YAML text to nodes: YAML 1.2 core scalars, each node with its line."""
+"""YAML text to nodes, as YAML 1.2 reads scalars, and values to YAML text."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ from typing import Any
 import yaml
 
 from qgs.composer.errors import Problems
-from qgs.composer.nodes import (
-    KeyPath,
-    ListNode,
-    MapNode,
-    Node,
-    Origin,
-    ScalarNode,
-    is_null,
-    kind_of,
-)
+from qgs.composer.nodes import KeyPath, ListNode, MapNode, Node, Origin, kind_of
 
+MAX_NESTING = 64
+MAX_VALUES = 100_000
+"""Values of one file, aliases written out: a few aliases of aliases make billions of them."""
+_LARGEST = 2**63 - 1
+_STANDARD = "tag:yaml.org,2002:"
+_TAGS = {_STANDARD + name for name in ("null", "bool", "int", "float", "str", "map", "seq")}
 _RESOLVERS = (
     ("null", r"~|null|Null|NULL|", "~nN\0"),
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
@@ -32,16 +29,12 @@ _RESOLVERS = (
 )
 
 
-MAX_NESTING = 64
-_LARGEST = 2**63 - 1
-
-
-class NestingError(yaml.MarkedYAMLError):
-    """Mappings and lists inside each other, beyond what any recipe needs."""
+class SizeError(yaml.MarkedYAMLError):
+    """More values, or more of them inside each other, than any recipe needs."""
 
 
 class Yaml12Loader(yaml.SafeLoader):
-    """Composes nodes with YAML 1.2 tags; `qgs.composer.yaml_text` reads their values."""
+    """Composes nodes with YAML 1.2 tags; `scalar_value` reads their values."""
 
     yaml_implicit_resolvers: dict = {}  # noqa: RUF012
     _nesting = 0
@@ -50,7 +43,7 @@ class Yaml12Loader(yaml.SafeLoader):
         """PyYAML's, refusing what would overflow the stack of whoever walks the tree."""
         self._nesting += 1
         if self._nesting > MAX_NESTING:
-            raise NestingError(
+            raise SizeError(
                 problem=f"mappings and lists stand more than {MAX_NESTING} deep in each other",
                 problem_mark=self.peek_event().start_mark,
             )
@@ -72,7 +65,7 @@ class Yaml12Dumper(yaml.SafeDumper):
 for _kind, _pattern, _first in _RESOLVERS:
     for _class in (Yaml12Loader, Yaml12Dumper):
         _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_kind}",
+            _STANDARD + _kind,
             re.compile(f"^(?:{_pattern})$"),
             [c if c != "\0" else "" for c in _first],
         )
@@ -83,7 +76,7 @@ def scalar_value(tag: str, text: str) -> Any:
 
     Raises OverflowError for an integer beyond 64 bits.
     """
-    kind = tag.removeprefix("tag:yaml.org,2002:")
+    kind = tag.removeprefix(_STANDARD)
     if kind == "null":
         return None
     if kind == "bool":
@@ -105,10 +98,9 @@ def dump(value: Any, *, flow: bool | None = False) -> str:
     )
 
 
-_STANDARD = "tag:yaml.org,2002:"
-_TAGS = frozenset(
-    _STANDARD + name for name in ("null", "bool", "int", "float", "str", "map", "seq")
-)
+def inline(value: Any) -> str:
+    """`value` as YAML 1.2 on one line."""
+    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
 
 
 def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
@@ -116,135 +108,104 @@ def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
     node = load_text(text, file, problems)
     if isinstance(node, MapNode):
         return node
+    origin = node.origin if isinstance(node, ListNode) else Origin(file, 1)
     if node is None:
-        return MapNode(Origin(file, 1))
-    if is_null(node):
-        fix = "write a recipe, at least `recipe: 1`"
-        problems.stop(Origin(file, 1), "", "the file is empty", fix)
-        return MapNode(Origin(file, 1))
-    problems.stop(
-        node.origin,
-        "",
-        f"a recipe is a mapping, this is {kind_of(node)}",
-        "write `key: value` lines, the first of them `recipe: 1`",
-    )
-    return MapNode(node.origin)
+        problems.stop(origin, "", "the file is empty", "write a recipe, at least `recipe: 1`")
+    else:
+        fix = "write `key: value` lines, the first of them `recipe: 1`"
+        problems.stop(origin, "", f"a recipe is a mapping, this is {kind_of(node)}", fix)
+    return MapNode(origin)
 
 
 def load_text(
     text: str, file: str, problems: Problems, line: int | None = None, path: KeyPath = ()
-) -> Node | None:
-    """The tree of `text`, a null for an empty text; None, and a problem, for what is no YAML.
+) -> Node:
+    """The value of `text`; an empty mapping, and a problem, where it is no YAML.
 
     line: given to every node in place of its own line. path: where the text belongs.
     """
     try:
         root = yaml.compose(text, Loader=Yaml12Loader)
+        return None if root is None else _Reader(file, problems, line).read(root, path)
     except yaml.YAMLError as error:
-        _stop_at_syntax(error, text, file, path, problems, line)
-        return None
-    if root is None:
-        return ScalarNode(Origin(file, 1 if line is None else line), None)
-    return _Reader(file, problems, line).read(root, path)
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        number = mark.line + 1 if mark else 1
+        origin = Origin(file, number if line is None else line)
+        reason, fix = _explain(error, "".join(text.splitlines()[number - 1 : number]))
+        problems.stop(origin, ".".join(path), reason, fix)
+        return MapNode(origin)
+
+
+def _explain(error: yaml.YAMLError, written: str) -> tuple[str, str]:
+    """Reason and fix. written: the line that the parser complains about."""
+    if isinstance(error, SizeError):
+        return str(error.problem), "write the recipe flatter, with fewer aliases"
+    if "\t" in written[: len(written) - len(written.lstrip())] or "'\\t'" in str(error):
+        return "a tab stands where YAML wants spaces", "indent with spaces"
+    reason = f"this is no valid YAML: {getattr(error, 'problem', None) or error}"
+    return reason, "correct the line; check indentation, brackets, quotes and `: ` before it"
 
 
 class _Reader:
+    """Turns PyYAML's nodes into ours. line: see `load_text`."""
+
     def __init__(self, file: str, problems: Problems, line: int | None) -> None:
-        self.file = file
-        self.problems = problems
-        self.line = line
+        self.file, self.problems, self.line = file, problems, line
         self.open: list[yaml.Node] = []
+        self.count = 0
 
     def origin(self, node: yaml.Node) -> Origin:
-        line = node.start_mark.line + 1 if self.line is None else self.line
-        return Origin(self.file, line)
+        return Origin(self.file, node.start_mark.line + 1 if self.line is None else self.line)
 
     def read(self, node: yaml.Node, path: KeyPath) -> Node:
+        self.count += 1
+        if self.count > MAX_VALUES:
+            told = f"there are more than {MAX_VALUES:,} values, those of aliases counted each time"
+            raise SizeError(problem=told, problem_mark=node.start_mark)
         if any(node is parent for parent in self.open):
-            return self.refuse(
-                node, path, "an alias stands inside its own anchor", "write the value out"
-            )
+            return self.stop(node, path, "an alias stands inside its own anchor", "remove it")
         if node.tag not in _TAGS:
-            return self.refuse(
-                node,
-                path,
-                f"the tag {node.tag!r} is not allowed in a recipe",
-                "remove the tag; components are named with `type`",
-            )
+            fix = "remove the tag; components are named with `type`"
+            return self.stop(node, path, f"the tag {node.tag!r} is not allowed in a recipe", fix)
+        if isinstance(node, yaml.ScalarNode):
+            return self.read_scalar(node, path)
         self.open.append(node)
         try:
             if isinstance(node, yaml.MappingNode):
                 return self.read_mapping(node, path)
-            if isinstance(node, yaml.SequenceNode):
-                items = (self.read(item, (*path, str(i))) for i, item in enumerate(node.value))
-                return ListNode(self.origin(node), tuple(items))
-            return self.read_scalar(node, path)
+            items = (
+                (self.read(x, (*path, str(i))), self.origin(x)) for i, x in enumerate(node.value)
+            )
+            return ListNode(self.origin(node), items)
         finally:
             self.open.pop()
 
     def read_mapping(self, node: yaml.MappingNode, path: KeyPath) -> MapNode:
-        items: dict[str, Node] = {}
-        keys: dict[str, Origin] = {}
+        read: dict[str, tuple[str, Node, Origin]] = {}
         for key_node, value_node in node.value:
-            key = self.read_key(key_node, path)
-            if key is None:
-                continue
-            if key in keys:
-                self.add(
-                    key_node,
-                    (*path, key),
-                    f"the key `{key}` is already given at {keys[key]}",
-                    "keep one of the two",
-                )
-                continue
-            keys[key] = self.origin(key_node)
-            items[key] = self.read(value_node, (*path, key))
-        return MapNode(self.origin(node), items, keys)
+            key, origin, reason = key_node.value, self.origin(key_node), ""
+            if not isinstance(key_node, yaml.ScalarNode):
+                key, reason, fix = "", "a key is a mapping or a list", "use a plain word as the key"
+            elif key == "<<" and key_node.style is None:
+                reason = "merge keys (`<<`) are not part of YAML 1.2"
+                fix = "write the keys out, or share them between files with `extends`"
+            elif key in read:
+                reason = f"the key `{key}` is already given at {read[key][2]}"
+                fix = "keep one of the two"
+            if reason:
+                self.problems.add(origin, ".".join((*path, key)).removesuffix("."), reason, fix)
+            else:
+                read[key] = (key, self.read(value_node, (*path, key)), origin)
+        return MapNode(self.origin(node), read.values())
 
-    def read_key(self, node: yaml.Node, path: KeyPath) -> str | None:
-        if not isinstance(node, yaml.ScalarNode):
-            self.add(node, path, "a key is a mapping or a list", "use a plain word as the key")
-            return None
-        if node.value == "<<" and node.style is None:
-            self.add(
-                node,
-                (*path, "<<"),
-                "merge keys (`<<`) are not part of YAML 1.2",
-                "write the keys out, or share them between files with `extends`",
-            )
-            return None
-        return node.value
-
-    def read_scalar(self, node: yaml.Node, path: KeyPath) -> ScalarNode:
+    def read_scalar(self, node: yaml.Node, path: KeyPath) -> Node:
         try:
-            return ScalarNode(self.origin(node), scalar_value(node.tag, node.value))
+            return scalar_value(node.tag, node.value)
         except OverflowError as error:
-            return self.refuse(node, path, str(error), "write a smaller number")
+            return self.stop(node, path, str(error), "write a smaller number")
         except ValueError:
             kind = node.tag.removeprefix(_STANDARD)
-            return self.refuse(node, path, f"{node.value!r} is no {kind}", "remove the tag")
+            return self.stop(node, path, f"{node.value!r} is no {kind}", "remove the tag")
 
-    def refuse(self, node: yaml.Node, path: KeyPath, reason: str, fix: str) -> ScalarNode:
+    def stop(self, node: yaml.Node, path: KeyPath, reason: str, fix: str) -> None:
         self.problems.stop(self.origin(node), ".".join(path), reason, fix)
-        return ScalarNode(self.origin(node), None)
-
-    def add(self, node: yaml.Node, path: KeyPath, reason: str, fix: str) -> None:
-        self.problems.add(self.origin(node), ".".join(path), reason, fix)
-
-
-def _stop_at_syntax(
-    error: yaml.YAMLError, text: str, file: str, path: KeyPath, problems: Problems, line: int | None
-) -> None:
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    number = mark.line + 1 if mark else 1
-    lines = text.splitlines()
-    written = lines[number - 1] if number <= len(lines) else ""
-    if isinstance(error, NestingError):
-        reason, fix = str(error.problem), "write the recipe flatter"
-    elif "\t" in written[: len(written) - len(written.lstrip())] or "'\\t'" in str(error):
-        reason, fix = "a tab stands where YAML wants spaces", "indent with spaces"
-    else:
-        reason = f"this is no valid YAML: {getattr(error, 'problem', None) or error}"
-        fix = "correct the line; check indentation, brackets, quotes and `: ` before it"
-    origin = Origin(file, number if line is None else line)
-    problems.stop(origin, ".".join(path), reason, fix)

@@ -1,4 +1,4 @@
-"""The settings of a recipe that are no components: views, training, evaluation."""
+"""Sections of a recipe that are not components: views, training, evaluation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
 
-SsimCovariance: TypeAlias = Literal["population", "sample"]
 Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -85,28 +84,27 @@ class TrainingConfig(ComponentConfig):
 
 
 class EvaluationConfig(ComponentConfig):
-    """What `qgs eval` runs.
-
-    scenes: test scenes, at most. samples: view samples from each. seed: of their views. index: a
-    JSON file {scene: null | {"context": [frames], "target": [frames]}} that names scenes and frames
-    instead (pixelSplat's format); then scenes, samples and seed mean nothing. Frames are positions
-    in the scene's frames, the path is relative to the working directory. protocol: a name for these
-    settings in tables, by default the index's file name; what decides the numbers, the index's
-    content included, is hashed beside it. metrics: besides PSNR and SSIM. ssim_covariance:
-    population as in Wang et al. 2004, or sample, scikit-image's default, by which pixelSplat's
-    evaluation and those derived from it score. lpips_weights: file of VGG-16 weights (safetensors,
-    or torchvision's vgg16-397923af.pth), None for torch's cache. tuning_steps, tuning_rate: token
-    tuning on the input views before each scene is judged, with the recipe's photometric loss
-    (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
-    """
+    """What `qgs eval` runs: which views are judged, after how much tuning; see also `metrics`."""
 
     scenes: int = Field(default=32, ge=1)
+    """Test scenes that are judged, at most; without effect beside `index`."""
+
     samples: int = Field(default=1, ge=1)
+    """View samples drawn from each scene; without effect beside `index`."""
+
     seed: int = Field(default=0, ge=0)
+    """Of the views that are drawn; without effect beside `index`."""
+
     index: str | None = None
+    """JSON file {scene: null | {"context": [frames], "target": [frames]}} of the views to judge
+    (pixelSplat's format), relative to the working directory; null draws them."""
+
     protocol: str | None = None
-    metrics: tuple[Literal["lpips"], ...] = ()
-    ssim_covariance: SsimCovariance = "population"
-    lpips_weights: str | None = None
+    """Name of these settings in tables; null takes the name of the index file."""
+
     tuning_steps: int = Field(default=0, ge=0)
+    """Steps of token tuning on the input views of each scene before it is judged, with the recipe's
+    photometric loss (TokenGS: 50); 0 for none."""
+
     tuning_rate: float = Field(default=1e-4, gt=0)
+    """Learning rate of token tuning, by Adam (TokenGS: 1e-4)."""

@@ -214,6 +214,7 @@ FREE = (
     "training.evaluate_every",
     "training.trackers",
     "evaluation",
+    "metrics",
     "data.path",
 )
 """Parts of a recipe that may change when a run is continued.

@@ -30,7 +30,6 @@ from qgs.engine.distributed import StopRequest, mean
 from qgs.engine.evaluation import evaluate
 from qgs.engine.optimizer import MovingAverage
 from qgs.engine.protocol import index_of
-from qgs.engine.results import METRICS
 from qgs.engine.tracking import Trackers
 from qgs.io.files import read_records, write_text
 from qgs.model import QueryGaussianModel
@@ -39,7 +38,7 @@ SAMPLES = 4
 """Samples that are drawn, the same ones each time."""
 
 _GAP = 4
-
+_COUNTS = ("statement", "scenes", "scenes_in_protocol", "samples")
 
 _log = logging.getLogger(__name__)
 
@@ -124,21 +123,19 @@ class PeriodicEvaluation:
     def _record(self, weights: str, step: int) -> dict[str, Any]:
         evaluation = evaluate(self._model, self._recipe, step, observe=self._between_scenes)
         summary = evaluation.summary()
-        told = ("statement", "scenes", "scenes_in_protocol", "samples")
         return {
             "step": step,
             "weights": weights,
             "protocol": summary["protocol"]["sha256"],
-            **{name: summary[name] for name in told},
-            **{name: score for name, score in summary["model"].items() if score is not None},
+            **{name: summary[name] for name in _COUNTS},
+            "scores": {n: score for n, score in evaluation.means().items() if score is not None},
         }
 
     def _tell(self, records: Sequence[Mapping[str, Any]], picture: Picture, step: int) -> None:
         _append(self._folder / "evaluations.jsonl", records)
         write_png(picture, self._folder / "pictures" / f"step-{step}.png")
         for record in records:
-            scores = {name: record[name] for name in METRICS if name in record}
-            group = f"evaluation/{record['weights']}"
+            group, scores = f"evaluation/{record['weights']}", record["scores"]
             self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
         self._trackers.picture("evaluation", picture, step)
 

@@ -221,7 +221,9 @@ def advice(recipe: Recipe, expected: WeightLayout | None, shapes: Shapes) -> lis
     differing = differing_options(recipe.tree, fitting.tree)
     options = [
         f"  {path}: {wanted} ({f'the recipe has {has}' if has else 'not in it'})"
-        for path, (has, wanted) in ((p, differing.get(p, (None, None))) for p in layout.legible)
+        for path, (has, wanted) in (
+            (p, differing.get(p, (None, None))) for p in layout.read_options
+        )
         if wanted is not None
     ]
     if options:

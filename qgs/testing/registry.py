@@ -23,7 +23,7 @@ LIKELY_CAUSES = ("forward_keeps_no_state", "eval_repeats_bitwise")
 """Checks without which many others cannot but fail: these compare one forward pass with another."""
 
 ALL_SLOTS = frozenset(SLOTS)
-MODULES = ALL_SLOTS - {"supervision", "data"}
+MODULES = ALL_SLOTS - {"supervision", "data", "metrics"}
 """Slots whose components have a forward pass."""
 PARAMETRIC = MODULES - {"renderer", "losses"}
 """Slots whose components are built with the sizes of the model."""

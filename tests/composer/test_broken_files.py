@@ -26,7 +26,7 @@ def test_missing_base_suggests_neither_its_reader_nor_something_else(write):
         resolve(recipe)
     base, key = caught.value.problems
     assert base.fix.startswith("check the path")
-    assert key.path == "modle"
+    assert key.option == "modle"
 
 
 def test_missing_base_of_a_mapping(write):
@@ -34,7 +34,7 @@ def test_missing_base_of_a_mapping(write):
     with pytest.raises(RecipeError) as caught:
         resolve({"recipe": 1, "extends": "bases.yaml"})
     (problem,) = caught.value.problems
-    assert problem.path == "extends"
+    assert problem.option == "extends"
     assert "did you mean `base.yaml`" in problem.fix
     assert "working directory" in problem.fix
 
@@ -46,7 +46,7 @@ def test_cycle_is_named_with_its_whole_chain(write):
     with pytest.raises(RecipeError) as caught:
         resolve("a.yaml")
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("c.yaml", 2, "extends")
+    assert (problem.file, problem.line, problem.option) == ("c.yaml", 2, "extends")
     assert "a.yaml -> b.yaml -> c.yaml -> a.yaml" in problem.reason
     assert "remove" in problem.fix
 
@@ -66,7 +66,7 @@ def test_mistake_in_an_extended_file_is_found_there(write):
         ("model.queries.count", "model.queries.count", "is no override"),
         ("model..count=3", "model..count", "is no override"),
         ("model.queries.count=[1", "model.queries.count", "no valid YAML"),
-        ("model.queries.count=x", "model.queries.count", "must be an integer"),
+        ("model.queries.count=x", "model.queries.count", "must be a valid integer"),
         ("extends=a.yaml", "extends", "cannot set"),
     ],
 )
@@ -74,5 +74,5 @@ def test_broken_override(override, path, reason, write):
     with pytest.raises(RecipeError) as caught:
         resolve(write("recipe: 1\n"), ["seed=1", override])
     (problem,) = caught.value.problems
-    assert (problem.file, problem.path) == ("--set #2", path)
+    assert (problem.file, problem.option) == ("--set #2", path)
     assert reason in problem.reason

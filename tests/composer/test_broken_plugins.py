@@ -148,7 +148,7 @@ BROKEN_PLUGINS = {
         "from qgs.contracts import Plugin\nfrom qgs.renderers import TorchRenderer\n"
         "class Odd(TorchRenderer):\n    name = 'odd'\n    devices = ('tpu',)\n"
         "plugin = Plugin('bad', 1, (Odd,))",
-        "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda') as a tuple",
+        "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda', 'mps') as a tuple",
     ),
     "no component": (
         "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, (int,))",
@@ -168,7 +168,7 @@ def test_broken_plugin_is_reported_by_distribution(name, write, install):
     with pytest.raises(RecipeError) as caught:
         resolve(write("recipe: 1\nplugins: [bad]\nmodel: {queries: {type: bad/any}}\n"))
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", 2, "plugins.0")
+    assert (problem.file, problem.line, problem.option) == ("recipe.yaml", 2, "plugins.0")
     assert "qgs-bad 0.7" in problem.reason
     assert reason in problem.reason
     assert "qgs-bad 0.7" in problem.fix

@@ -48,7 +48,7 @@ BROKEN = {
     ),
     "wrong type": (
         "recipe: 1\nmodel:\n  queries: {count: many}\n",
-        3, "model.queries.count", "must be an integer, got the string 'many'", "give an integer",
+        3, "model.queries.count", "must be a valid integer, got the string 'many'", "give a value that fits",
     ),
     "wrong choice": (
         HEAD + "model:\n  queries: {type: spatial/placed}\n  decoder:\n"
@@ -66,13 +66,13 @@ BROKEN = {
         HEAD + "model:\n  queries: {type: spatial/placed, radius: false}\n  decoder:\n"
         "    cross_attention: {type: spatial/near}\n    refinement: {type: spatial/measure}\n",
         6, "model.decoder.cross_attention",
-        "`spatial/measure` at model.decoder.refinement provides it too late",
+        "`spatial/measure` at model.decoder.refinement (recipe.yaml:7) provides it too late",
         "bandwidth: fixed",
     ),
     "fields of different frames": (
         HEAD + "model:\n  queries: {type: spatial/placed}\n  decoder:\n"
         "    refinement: {type: spatial/local}\n",
-        6, "model.decoder.refinement", "camera frame, `spatial/placed` at model.queries writes",
+        6, "model.decoder.refinement", "camera frame, `spatial/placed` at model.queries (recipe.yaml:4) writes",
         "choose another component",
     ),
     "duplicate key": (
@@ -95,15 +95,15 @@ BROKEN = {
     ),
     "1e-4 where an integer belongs": (
         "recipe: 1\nmodel:\n  queries: {count: 1e-4}\n",
-        3, "model.queries.count", "must be an integer, got the number 0.0001", "default: 4096",
+        3, "model.queries.count", "must be a valid integer, got the number 0.0001", "default: 4096",
     ),
     "off": (
         "recipe: 1\nmodel:\n  head: {norm: off}\n",
-        3, "model.head.norm", "must be true or false, got the string 'off'", "write `false`",
+        3, "model.head.norm", "must be a valid boolean, got the string 'off'", "write `false`",
     ),
     "infinity": (
         "recipe: 1\nmodel:\n  queries: {std: .inf}\n",
-        3, "model.queries.std", "must be a finite number", "finite",
+        3, "model.queries.std", "must be a finite number", "give a value that fits",
     ),
     "tab": (
         "recipe: 1\nmodel:\n\twidth: 64\n",
@@ -142,7 +142,7 @@ BROKEN = {
     ),
     "negative count": (
         "recipe: 1\nmodel:\n  queries:\n    count: -4\n",
-        4, "model.queries.count", "must be at least 1, got the number -4", "at least 1",
+        4, "model.queries.count", "must be greater than or equal to 1, got the number -4", "fits (default: 4096)",
     ),
     "heads that do not divide the width": (
         "recipe: 1\nmodel:\n  width: 128\n  heads: 5\n",
@@ -166,6 +166,22 @@ BROKEN = {
         1, "recipe", "missing", "recipe: ...",
     ),
     "newer recipe version": ("recipe: 2\n", 1, "recipe", "must be 1", "choose 1"),
+    "data without a type": (
+        "recipe: 1\ndata: {image_size: [64, 64]}\n",
+        2, "data.type", "no `type` is given, and the slot `data` has no default",
+        "add `type:`, one of qgs/chunks, qgs/dl3dv, qgs/photos, spatial/scenes",
+    ),
+    "type that is called otherwise today": (
+        "recipe: 1\ndata: {type: qgs/rooms}\n",
+        2, "data.type", "`qgs/rooms` has another name", "`plugins: [rooms]`",
+    ),
+    "aliases of aliases": (
+        "recipe: 1\nseed:\n- &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+        + "".join(
+            f"- &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdef", "bcdefg")
+        ),
+        3, "", "more than 100,000 values", "fewer aliases",
+    ),
     "loss without a type": (
         "recipe: 1\nlosses:\n  mine: {weight: 0.1}\n",
         3, "losses.mine.type", "no default component", "add `type:`",
@@ -175,20 +191,20 @@ BROKEN = {
         2, "views.gap", "needs 2 items, got 1", "give 2 items (default: [10, 40])",
     ),
     "no items": (
-        "recipe: 1\ndata: {image_size: []}\n",
+        "recipe: 1\ndata: {type: qgs/chunks, path: x, image_size: []}\n",
         2, "data.image_size", "needs 2 items, got 0", "give 2 items",
     ),
     "too many items": (
         "recipe: 1\nviews: {gap: [5, 6, 7]}\n",
-        2, "views.gap", "must have at most 2 items, got 3", "give at most 2 items",
+        2, "views.gap", "must have at most 2 items, not 3", "give a value that fits",
     ),
     "gap in the wrong order": (
         "recipe: 1\nviews:\n  gap: [9, 4]\n",
         3, "views.gap", "1 <= min <= max, got [9, 4]", "write [4, 9]",
     ),
     "image without height": (
-        "recipe: 1\ndata:\n  image_size: [0, 64]\n",
-        3, "data.image_size.0", "must be at least 1", "at least 1",
+        "recipe: 1\ndata:\n  type: qgs/chunks\n  path: x\n  image_size: [0, 64]\n",
+        5, "data.image_size.0", "must be greater than or equal to 1, got the number 0", "fits",
     ),
     "far before near": (
         "recipe: 1\nmodel:\n  renderer:\n    near: 3\n    far: 2\n",
@@ -200,15 +216,15 @@ BROKEN = {
     ),
     "decay of 1": (
         "recipe: 1\ntraining: {betas: [0.9, 1.0]}\n",
-        2, "training.betas.1", "must be less than 1", "less than 1",
+        2, "training.betas.1", "must be less than 1, got the number 1.0", "fits (default: [0.9, 0.95])",
     ),
     "background out of range": (
         "recipe: 1\nmodel: {renderer: {background: [0, 0, 255]}}\n",
-        2, "model.renderer.background.2", "must be at most 1", "at most 1",
+        2, "model.renderer.background.2", "must be less than or equal to 1, got the number 255", "fits",
     ),
     "LayerScale of nothing": (
         "recipe: 1\nmodel: {decoder: {layer_scale: 0}}\n",
-        2, "model.decoder.layer_scale", "must be more than 0", "more than 0",
+        2, "model.decoder.layer_scale", "must be greater than 0, got the number 0", "fits",
     ),
     "supervised layers in the wrong order": (
         "recipe: 1\nmodel: {supervision: {layers: [4, 2, 2]}}\n",
@@ -264,7 +280,7 @@ def test_one_message_says_it_all(name, write, spatial):
     with pytest.raises(RecipeError) as caught:
         resolve(write(text))
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", line, path)
+    assert (problem.file, problem.line, problem.option) == ("recipe.yaml", line, path)
     assert reason in problem.reason
     assert fix in problem.fix
     for words in (f"recipe.yaml:{line}", path, problem.reason, problem.fix):
@@ -284,7 +300,7 @@ def test_all_errors_come_together_sorted_by_line(write, spatial):
     """)
     with pytest.raises(RecipeError) as caught:
         resolve(recipe, ["model.head.norm=3"])
-    found = [(problem.file, problem.line, problem.path) for problem in caught.value.problems]
+    found = [(problem.file, problem.line, problem.option) for problem in caught.value.problems]
     assert found == [
         ("--set #1", 0, "model.head.norm"),
         ("recipe.yaml", 2, "plugins.0"),

@@ -60,7 +60,7 @@ def test_component_whose_code_fails_is_reported_with_its_distribution(name, writ
     with pytest.raises(RecipeError) as caught:
         resolve(write("recipe: 1\nplugins: [faulty]\n" + decoder))
     (problem,) = caught.value.problems
-    assert (problem.line, problem.path) == (3, "model.decoder.refinement")
+    assert (problem.line, problem.option) == (3, "model.decoder.refinement")
     assert f"`{name}` of `faulty/faulty` raises KeyError: 'oops'" in problem.reason
     assert "qgs-faulty 0.3" in problem.reason
     assert "qgs-faulty 0.3" in problem.fix
@@ -163,7 +163,7 @@ def test_what_a_constructor_raises_is_reported_with_its_distribution(write, faul
     with pytest.raises(RecipeError) as caught:
         recipe.build_model("meta")
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.path) == ("recipe.yaml", 3, "model.queries")
+    assert (problem.file, problem.line, problem.option) == ("recipe.yaml", 3, "model.queries")
     assert "qgs-faulty 0.3" in problem.reason
     assert "`__init__` of `faulty/exploding` raises ValueError: no luck" in problem.reason
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from qgs.composer import RecipeError, compose, plugin_versions, resolve
 from qgs.composer.errors import Problems
 from qgs.composer.files import merge
-from qgs.composer.nodes import Origin, from_plain, to_plain
+from qgs.composer.nodes import Origin, from_plain
 from qgs.composer.recipe import annotated
 from qgs.composer.slots import DEFAULT_LOSSES, SECTIONS, Section
 from qgs.composer.yaml_text import dump, load_text
@@ -63,21 +63,17 @@ SMALL = {
 )
 def test_yaml_12_scalars(text, value):
     problems = Problems()
-    node = load_text(text, "f", problems)
+    result = load_text(text, "f", problems)
     if "*" in text:
         with pytest.raises(RecipeError, match="f:1"):
             problems.raise_any()
         return
-    assert node is not None
-    result = to_plain(node)
     assert result == value
     assert type(result) is type(value)
 
 
 def test_anchors_and_aliases_are_written_out():
-    node = load_text("a: &x {p: 1}\nb: *x\n", "f", Problems())
-    assert node is not None
-    assert to_plain(node) == {"a": {"p": 1}, "b": {"p": 1}}
+    assert load_text("a: &x {p: 1}\nb: *x\n", "f", Problems()) == {"a": {"p": 1}, "b": {"p": 1}}
 
 
 WORDS = st.sampled_from(["1e-4", "off", "12:30", "true", "null", "", "0o17", ".5", "- a", "a: b"])
@@ -89,9 +85,7 @@ SCALARS = st.none() | st.booleans() | INTEGERS | st.floats(allow_nan=False) | TE
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.dictionaries(TEXTS, SCALARS | st.lists(SCALARS, max_size=3), max_size=4))
 def test_what_is_dumped_is_read_back(value):
-    node = load_text(dump(value), "f", Problems())
-    assert node is not None
-    assert to_plain(node) == value
+    assert load_text(dump(value), "f", Problems()) == value
 
 
 TREES = st.dictionaries(
@@ -108,9 +102,9 @@ TREES = st.dictionaries(
 @given(TREES, TREES)
 def test_merging_twice_is_merging_once_and_nothing_changes_nothing(a, b):
     a, b, empty = (from_plain(tree, Origin("f")) for tree in (a, b, {}))
-    assert to_plain(merge(a, a)) == to_plain(a)
-    assert to_plain(merge(merge(a, b), b)) == to_plain(merge(a, b))
-    assert to_plain(merge(empty, a)) == to_plain(merge(a, empty)) == to_plain(a)
+    assert merge(a, a) == a
+    assert merge(merge(a, b), b) == merge(a, b)
+    assert merge(empty, a) == merge(a, empty) == a
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: f"{path.parent.name}/{path.stem}")
@@ -145,19 +139,34 @@ def test_extends_merges_mappings_replaces_lists_and_replaces_nodes_of_another_ty
         """
         recipe: 1
         extends: [a.yaml, b.yaml]
-        plugins: [spatial]
         model:
           queries: {type: qgs/latent, std: 0.4}
           supervision: {layers: [5]}
         """
     )
-    with pytest.raises(RecipeError, match="plugin `spatial`"):
-        resolve(recipe)
-    model = resolve(recipe, ["plugins=[]"]).tree["model"]
+    model = resolve(recipe).tree["model"]
     assert model["head"]["norm"] is True
     assert model["head"]["init_std"] == 0.2
     assert model["queries"] == {"type": "qgs/latent", "count": 7, "std": 0.4}
     assert model["supervision"]["layers"] == [5]
+
+
+def test_plugins_are_united_and_each_keeps_its_line(write, spatial, install):
+    source = "from qgs.components import LatentQueries\nfrom qgs.contracts import Plugin\n"
+    for name in ("first", "second"):
+        listed = f"plugin = Plugin('{name}', 1, (LatentQueries,))\n"
+        install(f"qgs-{name}", name, source + listed)
+    write("recipe: 1\nplugins: [spatial]\n", "a.yaml")
+    write("recipe: 1\n\nplugins: [first, spatial]\n", "b.yaml")
+    overlay = write("recipe: 1\nextends: [a.yaml, b.yaml]\nplugins:\n- first\n")
+    recipe = resolve(overlay, ["plugins=[second]"])
+    assert recipe.tree["plugins"] == ["spatial", "first", "second"]
+    assert recipe.provenance["plugins"] == "a.yaml:2, b.yaml:3, --set #1"
+    assert resolve(overlay, ["plugins=null"]).tree["plugins"] == []
+    with pytest.raises(RecipeError) as caught:
+        resolve(overlay, ["plugins=[second, second]"])
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.option) == ("--set #1", "plugins.3")
 
 
 def test_another_type_forgets_the_options_of_the_first(write, spatial):

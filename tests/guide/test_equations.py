@@ -137,7 +137,7 @@ def owners(option: str, where: str) -> list[type[ComponentConfig]]:
     section, _, name = option.rpartition(".")
     if section:
         places = {title.removeprefix("model."): c for title, c, _ in guide_reference.SECTIONS}
-        places |= {s: components()[SLOTS[s].default][0].Config for s in SLOTS if s != "losses"}
+        places |= {s: components()[SLOTS[s].default][0].Config for s in SLOTS if SLOTS[s].default}
         return [places[section]]
     if name in RecipeSettings.model_fields:
         return [RecipeSettings]

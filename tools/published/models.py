@@ -25,10 +25,10 @@ DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
 def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Whatever the file may hold, computed by its model on its photos and cameras.
+    """All tensors that the file may hold, computed by its model on its photos and cameras.
 
     Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
-    for options that no recipe stands for.
+    for options that no recipe can express.
     """
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()

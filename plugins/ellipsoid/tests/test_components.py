@@ -9,9 +9,8 @@ import torch
 import torch.nn.functional as F
 from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_ellipsoid.decoding import AxisScaledCenters
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
-from qgs_ellipsoid.head import EllipsoidHead, radii_along
+from qgs_ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_ellipsoid.rotations import quat_product, turned
 from qgs_locus.fields import CENTER, RadiusOptions, support_radius
@@ -185,7 +184,7 @@ def test_options_without_effect_are_refused(options: dict, path: str, why: str) 
     with pytest.raises(RecipeError) as caught:
         resolve({**ELLIPSOID, "model": {**ANCHORED, "decoder": decoder}})
     (problem,) = caught.value.problems
-    assert problem.path.endswith(path)
+    assert problem.option.endswith(path)
     assert why in problem.reason
 
 

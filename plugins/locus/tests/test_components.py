@@ -176,7 +176,7 @@ def test_options_without_effect_are_refused(model: dict, path: str) -> None:
     with pytest.raises(RecipeError) as caught:
         resolve({**LOCUS, "model": {**ANCHORED, **model}})
     (problem,) = caught.value.problems
-    assert problem.path.endswith(path)
+    assert problem.option.endswith(path)
     assert "no effect" in problem.reason or "nothing is refined" in problem.reason
 
 
@@ -220,4 +220,4 @@ def test_frustum_needs_ordered_positive_depths(depth: list[float]) -> None:
     with pytest.raises(RecipeError) as caught:
         resolve({**LOCUS, "model": {"queries": queries}})
     (problem,) = caught.value.problems
-    assert problem.path == "model.queries.center_init.depth"
+    assert problem.option == "model.queries.center_init.depth"

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qgs.data.photos.frames import Fault, Intrinsics, Size, intrinsics_faults, pose_faults
+from qgs.data.lenses import Intrinsics, Size
+from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
 from qgs_datatools.decoding import Decoded
 from qgs_datatools.findings import Finding, Photo
 
@@ -29,28 +30,29 @@ def camera_findings(
     others: list[Finding] = []
     for frame, (photo, result) in enumerate(zip(photos, decoded, strict=True)):
         listed = photo.listed
-        unread = bool(listed.faults) and not np.isfinite(listed.c2w).all()
-        of_pose = [] if unread else list(pose_faults(listed.c2w))
-        rest = list(listed.faults)
-        if not listed.faults and frame not in sized:
+        unread = bool(listed.problems) and not np.isfinite(listed.c2w).all()
+        of_pose = [] if unread else list(pose_problems(listed.c2w))
+        rest = list(listed.problems)
+        if not listed.problems and frame not in sized:
             rest += _intrinsics(listed.intrinsics, listed.size or result.size)
-        for faults, found in ((of_pose, poses), (rest, others)):
+        for problems, found in ((of_pose, poses), (rest, others)):
             found += [
-                Finding(scene, fault.reason, fault.fix, (frame,), (listed.name,))
-                for fault in faults
+                Finding(scene, problem.reason, problem.fix, (frame,), (listed.name,))
+                for problem in problems
             ]
     return poses, others
 
 
-def _intrinsics(intrinsics: Intrinsics, size: Size | None) -> Iterator[Fault]:
-    faults = list(intrinsics_faults(intrinsics, size))
-    yield from faults
-    if size is None or faults:
+def _intrinsics(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
+    problems = list(intrinsics_problems(intrinsics, size))
+    yield from problems
+    if size is None or problems:
         return
     height, width = size
     _, _, cx, cy = intrinsics
     if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _FAR_OFF_CENTRE:
-        yield Fault(
+        yield FrameProblem(
+            "intrinsics",
             f"the principal point ({cx:.6g}, {cy:.6g}) is far from the middle of the {width} x "
             f"{height} pixels",
             "correct cx and cy, unless the photo is cut from a larger one",

@@ -6,13 +6,12 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any
 
 import numpy as np
 from upath import UPath
 
-from qgs.data.photos.formats import READERS, Format, read_listing
-from qgs.data.recognition import recognised
+from qgs.data.photos import READERS, Format, read_listing
 from qgs_datatools.cameras import camera_findings, sharing_findings
 from qgs_datatools.decoding import Decoded, decode_all, file_findings, size_findings
 from qgs_datatools.findings import Candidate, Finding, Photo, merged
@@ -26,15 +25,10 @@ from qgs_datatools.folders import (
     photo_folders,
 )
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
+from qgs_datatools.sources import kind_of, source_scenes, sources
 
-_LISTS = {
-    "nerfstudio": "transforms.json",
-    "dl3dv": "transforms.json",
-    "blender": "its transforms file",
-    "colmap": "the model",
-    "llff": "poses_bounds.npy",
-    "chunks": "the chunk",
-}
+_PHOTO_FORMATS = {reader.name: reader.listing for reader in READERS}
+_LISTS = {**_PHOTO_FORMATS, "dl3dv": "transforms.json", "chunks": "the chunk"}
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,7 @@ def _judged(
     with_geometry: bool,
 ) -> SceneReport:
     name = candidate.name
-    files = file_findings(name, photos, decoded, _LISTS[candidate.kind])
+    files = file_findings(name, photos, decoded, _LISTS.get(candidate.kind, "the data set"))
     sizes = size_findings(name, photos, decoded)
     poses, others = camera_findings(name, photos, decoded, _frames(sizes))
     placed = [frame for frame in range(len(photos)) if frame not in _frames(poses)]
@@ -165,11 +159,6 @@ def _reason_and_fix(error: Exception) -> tuple[str, str]:
     return (reason, fix) if colon else (str(error), "get the files again")
 
 
-CheckedFormat: TypeAlias = Literal[
-    "auto", "nerfstudio", "blender", "colmap", "llff", "chunks", "dl3dv"
-]
-
-
 _LISTINGS = (".json", ".npy")
 
 
@@ -179,13 +168,14 @@ class Options:
 
     geometry: poses are judged against photos in so many scenes, spread over the data set.
     headers_only: no image is decoded, and none is matched. images: folder of photos to read instead
-    of the listed one, such as images_4.
+    of the listed one, such as images_4. format: of photos, chunks, dl3dv or PLUGIN/NAME of a
+    plugin's source; auto tells it from what is there.
     """
 
     geometry: int = 20
     headers_only: bool = False
     threads: int = 8
-    format: CheckedFormat = "auto"
+    format: str = "auto"
     images: str | None = None
 
 
@@ -223,8 +213,11 @@ def check(
     """Check the data set at `path`, and evaluation indices: those given and those beside it.
 
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
-    is no data set at `path`, or no file at one of `indices`.
+    is no data set at `path`, or no file at one of `indices`, ValueError for an unknown format.
     """
+    formats = ("auto", *_LISTS, *(kind for kind in sources() if not kind.startswith("qgs/")))
+    if options.format not in formats:
+        raise ValueError(f"there is no format {options.format!r}: use one of {', '.join(formats)}")
     if path.is_file() and path.suffix in _LISTINGS:
         path = path.parent
     candidates, general, told = _candidates(path, options)
@@ -264,6 +257,8 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
         )
     if kind == "dl3dv":
         return dl3dv_scenes(path, options.images), [], set()
+    if "/" in kind:
+        return list(source_scenes(kind, path)), [], set()
     items = list(photo_folders(path, _photo_format(options), options.images))
     return (
         [item for item in items if isinstance(item, Candidate)],
@@ -273,15 +268,15 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
 
 
 def _photo_format(options: Options) -> Format:
-    return cast(Format, options.format if options.format in READERS else "auto")
+    return options.format if options.format in _PHOTO_FORMATS else "auto"
 
 
-def _kind(path: UPath, wanted: CheckedFormat) -> str:
+def _kind(path: UPath, wanted: str) -> str:
     if wanted != "auto":
         return wanted
     if path.is_file() and path.suffix == ".torch":
         return "chunks"
-    return recognised(path).removeprefix("qgs/")
+    return kind_of(path)
 
 
 def _geometry_scenes(count: int, options: Options) -> tuple[set[int], list[str]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,18 +19,6 @@ app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
 _ROWS = 40
 
 
-class Format(StrEnum):
-    """Formats of data sets; auto tells them from what is there."""
-
-    auto = "auto"
-    nerfstudio = "nerfstudio"
-    blender = "blender"
-    colmap = "colmap"
-    llff = "llff"
-    chunks = "chunks"
-    dl3dv = "dl3dv"
-
-
 @app.command("check")
 def check(
     path: Annotated[str, typer.Argument(help="Data set: a folder, an archive, a chunk, a URL.")],
@@ -40,8 +27,8 @@ def check(
         typer.Option(help="Evaluation index to compare with the scenes; repeatable."),
     ] = None,
     format: Annotated[
-        Format, typer.Option(help="Only scenes listed in this format.")
-    ] = Format.auto,
+        str, typer.Option(help="Only scenes in this format, such as colmap, chunks or dl3dv.")
+    ] = "auto",
     images: Annotated[
         str | None, typer.Option(help="Folder of photos to read, such as images_4.")
     ] = None,
@@ -67,7 +54,7 @@ def check(
     from qgs_datatools.check import Options, check
 
     console = Console()
-    options = Options(geometry, quick, threads, format.value, images)
+    options = Options(geometry, quick, threads, format, images)
     indices = [opened_path(name) for name in index or []]
     with console.status("listing scenes") as status:
         result = check(
@@ -208,13 +195,17 @@ def _opened(
     from qgs.composer import resolve
     from qgs.data.paths import opened_path
     from qgs.data.recognition import recognised
+    from qgs_datatools.sources import sources
 
     overrides = [f"data.{option}" for option in options]
     if Path(path).suffix in {".yaml", ".yml"}:
         recipe = resolve(path, overrides)
     else:
-        type_ = recognised(opened_path(path))
-        recipe = resolve({"recipe": 1, "data": {"type": type_, "path": path}}, overrides)
+        kind = recognised(opened_path(path), sources())
+        plugin = kind.partition("/")[0]
+        data = {"type": kind, "path": path}
+        plugins = [] if plugin == "qgs" else [plugin]
+        recipe = resolve({"recipe": 1, "plugins": plugins, "data": data}, overrides)
     source = recipe.build_data()
     if image_size is not None:
         source = type(source)(source.config.model_copy(update={"image_size": image_size}))

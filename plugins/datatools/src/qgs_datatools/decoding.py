@@ -12,7 +12,9 @@ from statistics import median, median_low
 
 from PIL import Image, UnidentifiedImageError
 
-from qgs.data.photos.frames import Size, open_mask, size_faults
+from qgs.data.images import open_mask
+from qgs.data.lenses import Size
+from qgs.data.photos.checks import size_problems
 from qgs_datatools.findings import Finding, Photo
 
 _ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
@@ -186,8 +188,8 @@ def _one_side(item: _Sized) -> bool:
 
 
 def _told_of_sizes(item: _Sized) -> tuple[str, str]:
-    for fault in size_faults(item.file, item.listed):
-        return fault.reason, fault.fix
+    for problem in size_problems(item.file, item.listed):
+        return problem.reason, problem.fix
     return item.said, "give the original image, or correct the listed size"
 
 

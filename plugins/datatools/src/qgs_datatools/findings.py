@@ -12,7 +12,8 @@ import numpy as np
 from PIL import Image
 
 from qgs.data.images import decode_rgb
-from qgs.data.photos.frames import PhotoFrame, Size, undistorted
+from qgs.data.lenses import Size, undistorted
+from qgs.data.photos.reader import PhotoFrame
 from qgs_datatools.conventions import Convention
 
 Severity: TypeAlias = Literal["error", "warning"]

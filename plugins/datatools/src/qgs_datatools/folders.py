@@ -7,26 +7,35 @@ from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from upath import UPath
 
-from qgs.data.chunks.files import INDEX, SUFFIX, has_chunks, load_chunk, read_chunk_index
-from qgs.data.chunks.record import Record, parse_record, unit_faults
+from qgs.data.chunk_files import (
+    INDEX,
+    SUFFIX,
+    Record,
+    a_type,
+    has_chunks,
+    load_chunk,
+    parse_record,
+    read_chunk_index,
+    unit_problems,
+)
 from qgs.data.dl3dv import Place, find_scenes, scene_folder
 from qgs.data.evaluation import GIVEN, IndexEntry, read_index
-from qgs.data.lazy import a_type
-from qgs.data.photos.formats import Format, formats_of, read_listing
-from qgs.data.photos.frames import PhotoFrame, Size
-from qgs.data.photos.reading import existing
+from qgs.data.lenses import Size
+from qgs.data.photos import READERS, Format, formats_of, read_listing
+from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.source import folder_name
-from qgs.data.recognition import recognised
 from qgs_datatools.conventions import LLFF, OPENCV, OPENGL
 from qgs_datatools.findings import Candidate, Finding, Photo, spans
+from qgs_datatools.sources import kind_of
 
-_CONVENTIONS = {"nerfstudio": OPENGL, "blender": OPENGL, "colmap": OPENCV, "llff": LLFF}
+_POSES = {"opengl": OPENGL, "opencv": OPENCV, "llff": LLFF}
+_CONVENTIONS = {reader.name: _POSES[reader.poses] for reader in READERS}
 
 
 def photo_folder(
@@ -36,7 +45,7 @@ def photo_folder(
     held = [kind for kind in formats_of(folder) if wanted in ("auto", kind)]
     for kind in held:
         label = f"{name} ({kind})" if len(held) > 1 else name
-        photos = partial(_listed, folder, cast(Format, kind), images)
+        photos = partial(_listed, folder, kind, images)
         yield Candidate(label, name, kind, _CONVENTIONS[kind], photos)
 
 
@@ -59,7 +68,7 @@ def photo_folders(root: UPath, wanted: Format, images: str | None) -> Iterator[C
 
 
 def _no_scene(folder: UPath) -> Finding:
-    kind = recognised(folder).removeprefix("qgs/")
+    kind = kind_of(folder)
     if kind != "photos":
         reason = f"the folder is another data set ({kind}) and is not checked with the photos"
         return Finding(
@@ -290,7 +299,7 @@ def _frames(file: UPath, record: Record, sizes: Sequence[Size] | None) -> Iterat
             c2w=_inverse(record.w2c[frame].numpy()),
             intrinsics=(fx * width, fy * height, cx * width, cy * height),
             size=size,
-            faults=tuple(unit_faults(record, frame)),
+            problems=tuple(unit_problems(record, frame)),
         )
         yield Photo(listed, partial(_bytes, record, frame))
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from qgs.data.photos.frames import Size
+from qgs.data.lenses import Size
 from qgs_datatools.conventions import AS_READ, Convention
 from qgs_datatools.decoding import Decoded
 from qgs_datatools.epipolar import (

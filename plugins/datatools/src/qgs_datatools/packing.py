@@ -15,10 +15,10 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.chunks.files import INDEX, SUFFIX
+from qgs.data.chunk_files import INDEX, SUFFIX
 from qgs.data.images import decode_gray, decode_rgb
-from qgs.data.photos.frames import undistorted
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
+from qgs.data.lenses import undistorted
+from qgs.data.scenes import EncodedFrame, EncodedScene
 from qgs.io.files import opened_replacing, write_bytes
 
 _KEPT_FORMATS = {"JPEG", "MPO", "PNG"}  # MPO: a JPEG with further pictures behind it
@@ -397,13 +397,13 @@ class _Packer:
             if name in done:
                 self._packed.resumed += 1
             else:
-                self._add(name, source.scenes(place.split)[place.index])
+                self._add(name, source, place)
             progress(name)
         self._flush()
 
-    def _add(self, name: str, scene: Scene) -> None:
+    def _add(self, name: str, source: SceneSource, place: Place) -> None:
         try:
-            entry = self._entry(name, scene)
+            entry = self._entry(name, source.scenes(place.split)[place.index])
         except (ValueError, OSError) as error:
             if not self._leave_out_broken:
                 raise

@@ -16,11 +16,10 @@ from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.contracts.component import MissingExtraError
-from qgs.data.lazy import LazyScenes
+from qgs.data.scenes import LazyScenes
 from qgs.types import Cameras
 from qgs_rooms.draws import Draws
 from qgs_rooms.path import camera_path
-from qgs_rooms.plan import furnish
 from qgs_rooms.shapes import Room
 
 _BAND = 64  # rows of an image that one thread casts at a time
@@ -36,7 +35,7 @@ class RoomsConfig(SceneSource.Config):
     0 for none.
     """
 
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {"cache_mb"}
+    unhashed_options: ClassVar[frozenset[str]] = SceneSource.Config.unhashed_options | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
     scenes: int = Field(default=2000, ge=1)
@@ -103,6 +102,8 @@ class RoomScene(Scene):
     @cached_property
     def room(self) -> Room:
         """The furnished room."""
+        from qgs_rooms.plan import furnish
+
         return furnish(Draws(self._layout_seed), self.size, self._c2w[:, :3, 3])
 
     @cached_property

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from qgs.components.weights import BACKBONE_RENAMES, DECODER, LEGIBLE, backbone
-from qgs.contracts.weights import Rename, Shapes, Unused, WeightLayout
+from qgs.components.weights import BACKBONE_RENAMES, DECODER, READ_OPTIONS, backbone
+from qgs.contracts.weights import Rename, Shapes, WeightLayout
 
 _CROSS = DECODER + "{}.gs_cross_attn."
-_Q_NORM = _CROSS + "q_norm."
+_UNUSED_NORMS = ("anchor_norm.", "plucker_norm.", "q_pos_norm.", "k_pos_norm.")
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
@@ -60,13 +60,10 @@ LOCUSGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_content_proj.weight",),
     read=_read,
-    legible=(*LEGIBLE, "model.queries.radius", "model.decoder.refinement.radius"),
+    read_options=(*READ_OPTIONS, "model.queries.radius", "model.decoder.refinement.radius"),
     unused=(
-        Unused(_CROSS + "anchor_norm.", _Q_NORM),
-        Unused(_CROSS + "plucker_norm.", _Q_NORM),
-        Unused(_CROSS + "q_pos_norm.", _Q_NORM),
-        Unused(_CROSS + "k_pos_norm.", _Q_NORM),
-        Unused(_CROSS + "tau_sample", _CROSS + "geo_scale"),
+        *(Rename(_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
+        Rename(_CROSS + "geo_scale", _CROSS + "tau_sample"),
     ),
     undecided=(
         "bandwidth of the ray bias: the radius where there is one, else fixed",
@@ -77,4 +74,4 @@ LOCUSGS = WeightLayout(
         "scale and frame of the world, renderer, training: the framework's defaults",
     ),
 )
-"""The released LocusGS and its structural ablations."""
+"""The released LocusGS, and its ablations that change parameters."""

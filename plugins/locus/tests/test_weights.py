@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from qgs_locus.layout import LOCUSGS
+from qgs_locus.weights import LOCUSGS
 
 import qgs
 from qgs.contracts import LayoutError

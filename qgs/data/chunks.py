@@ -1,9 +1,8 @@
-"""`qgs/chunks`: RealEstate10K-style chunks."""
+"""`qgs/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
 
 from __future__ import annotations
 
 import io
-import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import ClassVar
@@ -15,79 +14,74 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.chunks.files import ChunkStore, Listing, has_chunks, list_scenes
-from qgs.data.chunks.record import Record, judge_record
+from qgs.data.chunk_files import SUFFIX, Chunk, Record, has_chunks, list_scenes, require_usable
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
-from qgs.data.lazy import LazyScenes
 from qgs.data.paths import opened_path
-from qgs.data.photos.frames import Size
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, warn_once
 from qgs.types import Cameras
 
-_log = logging.getLogger(__name__)
+_OPEN = 4  # chunks kept open
 _SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
 
 
 class ChunksConfig(SceneSource.Config):
-    """Options of `qgs/chunks`.
+    """Options of `qgs/chunks`."""
 
-    path: folder or fsspec URL that holds train/ and test/, relative to the working directory.
-    Chunks at a URL are read whole, by every process and worker; copy them to a local disk to train.
-    holdout: every n-th frame of each scene is kept for evaluation, from frame n // 2 on; 0 for
-    those that `qgs data pack` took over from its source, none in other chunks. max_scenes: only the
-    first scenes of each split, 0 for all. min_frames: scenes with fewer frames are left out, which
-    opens every chunk once at the start; 0 keeps all. background: RGB behind transparent pixels.
-    """
-
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {
-        "max_scenes",
-        "min_frames",
-    }
+    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
+    """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
+    URL are read whole, by every process and worker: copy them to a local disk to train."""
     holdout: int = Field(default=0, ge=0)
+    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 keeps those that
+    `qgs data pack` took over from its source, which other chunks have none of."""
     max_scenes: int = Field(default=0, ge=0)
+    """Only the first scenes of each split; 0 for all."""
     min_frames: int = Field(default=0, ge=0)
+    """Leave out scenes with fewer frames, which opens every chunk once at the start; 0 for none."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
 
 
 class ChunkScene(EncodedScene):
     """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
 
-    def __init__(self, store: ChunkStore, file: UPath, key: str, config: ChunksConfig) -> None:
+    def __init__(
+        self, chunks: BoundedCache[Chunk], file: UPath, key: str, config: ChunksConfig
+    ) -> None:
         self.name = key
-        self._store, self._file, self._config = store, file, config
+        self._chunks, self._file, self._config = chunks, file, config
 
     @property
     def _record(self) -> Record:
-        return self._store.chunk(self._file).record(self.name)
+        return self._chunks.get(str(self._file), lambda: Chunk(self._file)).record(self.name)
 
     @cached_property
-    def _count(self) -> int:
+    def _length(self) -> int:
         return len(self._record)
 
     def __len__(self) -> int:
-        return self._count
+        return self._length
 
     @cached_property
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
         """See `Scene`: as the option says, else as the chunk does."""
         every = self._config.holdout
-        if not every:
-            return self._record.held_out
-        return tuple(range(every // 2, len(self), every))
+        return tuple(range(every // 2, len(self), every)) if every else self._record.held_out
 
     @cached_property
     def cameras(self) -> Cameras:
-        """See `Scene`. Raises ValueError for cameras that cannot be used."""
-        record = self._record
-        judge_record(record)
-        return Cameras(
-            torch.linalg.inv(record.w2c),
-            _intrinsics(record, self._config.image_size),
-            self._config.image_size,
-        )
+        """See `Scene`; float64. Raises ValueError for cameras that cannot be used."""
+        record, target = self._record, self._config.image_size
+        require_usable(record)
+        intrinsics = record.cameras[:, :4].double()
+        sizes = torch.tensor(record.image_sizes)
+        for height, width in set(record.image_sizes):
+            alike = (sizes == torch.tensor([height, width])).all(1)
+            pixels = intrinsics[alike] * torch.tensor([width, height, width, height])
+            intrinsics[alike] = CropResize((height, width), target).intrinsics(pixels)
+        return Cameras(torch.linalg.inv(record.w2c), intrinsics, target)
 
     def frame_name(self, frame: int) -> str:
         """See `Scene`: the writer's name of a frame, else its time stamp."""
@@ -103,23 +97,19 @@ class ChunkScene(EncodedScene):
         record = self._record
         if record.masks is None:
             return None
-        masks = np.stack([self._mask(record, frame) for frame in frames])
+        masks = np.stack([self._mask(record, record.masks[frame], frame) for frame in frames])
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
         record = self._record
-        if not -len(record) <= frame < len(record):
-            raise IndexError(f"frame {frame} of {len(record)}")
         size = record.stored_size(frame)
-        height, width = size
-        fx, fy, cx, cy = record.cameras[frame, :4].double().tolist()
         mask = None if record.masks is None else record.masks[frame].numpy().tobytes()
         return EncodedFrame(
             name=record.names[frame],
             data=record.images[frame].numpy().tobytes(),
             c2w=torch.linalg.inv(record.w2c[frame]).numpy(),
-            intrinsics=(fx * width, fy * height, cx * width, cy * height),
+            intrinsics=record.intrinsics(frame, size),
             size=size,
             mask=mask or None,
             background=self._config.background,
@@ -134,12 +124,17 @@ class ChunkScene(EncodedScene):
                 f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
                 "chunk again, or take the scene out of index.json"
             ) from error
-        _check_aspect(record, frame, (image.height, image.width))
+        # intrinsics were cropped for the size that the scene gives
+        height, width = record.image_sizes[frame]
+        if abs(image.width * height / (image.height * width) - 1) > _SAME_ASPECT:
+            raise ValueError(
+                f"{record.place(frame)} is {image.width} x {image.height} pixels, and its scene's "
+                f"images are {width} x {height}, another aspect ratio: chunks of mixed sizes need "
+                "'sizes', which `qgs data pack` writes"
+            )
         return CropResize((image.height, image.width), self._config.image_size).image(image)
 
-    def _mask(self, record: Record, frame: int) -> np.ndarray:
-        assert record.masks is not None
-        data = record.masks[frame]
+    def _mask(self, record: Record, data: Tensor, frame: int) -> np.ndarray:
         if not len(data):
             return np.full(self._config.image_size, 255, np.uint8)
         try:
@@ -151,48 +146,27 @@ class ChunkScene(EncodedScene):
         return CropResize((mask.height, mask.width), self._config.image_size).image(mask)
 
 
-def _intrinsics(record: Record, target: Size) -> Tensor:
-    """fx, fy, cx, cy (V, 4) float64 in pixels of the delivered images."""
-    intrinsics = record.cameras[:, :4].double()
-    sizes = torch.tensor(record.image_sizes)
-    for height, width in set(record.image_sizes):
-        alike = (sizes == torch.tensor([height, width])).all(1)
-        pixels = intrinsics[alike] * torch.tensor([width, height, width, height])
-        intrinsics[alike] = CropResize((height, width), target).intrinsics(pixels)
-    return intrinsics
-
-
-def _check_aspect(record: Record, frame: int, size: tuple[int, int]) -> None:
-    """Intrinsics were cropped for the size that the scene tells; another aspect breaks them."""
-    height, width = record.image_sizes[frame]
-    if abs(size[1] * height / (size[0] * width) - 1) > _SAME_ASPECT:
-        raise ValueError(
-            f"{record.place(frame)} is {size[1]} x {size[0]} pixels, and its scene's images are "
-            f"{width} x {height}, another aspect ratio: chunks of mixed sizes need 'sizes', "
-            "which `qgs data pack` writes"
-        )
-
-
 class ChunkScenes(LazyScenes):
     """The scenes of a split, made when they are asked for."""
 
-    def __init__(self, store: ChunkStore, files: Mapping[str, UPath], config: ChunksConfig) -> None:
-        self._store, self._files, self._config = store, files, config
-        self._keys = list(files)
+    def __init__(
+        self, chunks: BoundedCache[Chunk], files: Mapping[str, UPath], config: ChunksConfig
+    ) -> None:
+        self._chunks, self._files, self._config = chunks, list(files.items()), config
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self._files)
 
     def scene(self, place: int) -> ChunkScene:
         """See `LazyScenes`."""
-        key = self._keys[place]
-        return ChunkScene(self._store, self._files[key], key, self._config)
+        key, file = self._files[place]
+        return ChunkScene(self._chunks, file, key, self._config)
 
     def groups(self) -> list[list[int]]:
         """Indices of the scenes of each file."""
         by_file: dict[str, list[int]] = {}
-        for place, key in enumerate(self._keys):
-            by_file.setdefault(str(self._files[key]), []).append(place)
+        for place, (_, file) in enumerate(self._files):
+            by_file.setdefault(str(file), []).append(place)
         return list(by_file.values())
 
 
@@ -200,9 +174,8 @@ class ChunksSource(SceneSource):
     """Chunks under PATH/train and PATH/test; a folder without these is the training split.
 
     A data set without test chunks is evaluated on the held-out frames of its training scenes,
-    where there are any.
-
-    missing: keys that an index.json names and whose chunks do not exist, by split.
+    where there are any. Scenes that an index.json names and whose chunks do not exist are left out,
+    counted and named in a warning.
     """
 
     name = "chunks"
@@ -210,18 +183,19 @@ class ChunksSource(SceneSource):
 
     def __init__(self, config: ChunksConfig) -> None:
         super().__init__(config)
-        store = ChunkStore()
-        folders = _folders(opened_path(config.path))
-        listings: dict[Split, Listing] = {
-            split: list_scenes(folder) for split, folder in folders.items()
-        }
-        self.missing = {split: list(listing.missing) for split, listing in listings.items()}
+        chunks: BoundedCache[Chunk] = BoundedCache(_OPEN)
         self._splits: dict[Split, ChunkScenes] = {
-            split: ChunkScenes(store, _chosen(store, listing, config), config)
-            for split, listing in listings.items()
+            split: ChunkScenes(chunks, _chosen(chunks, folder, config), config)
+            for split, folder in _folders(opened_path(config.path)).items()
         }
-        self._nothing = ChunkScenes(store, {}, config)
-        self._splits.setdefault("train", self._nothing)
+        self._nothing = ChunkScenes(chunks, {}, config)
+
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """Chunk files or an index.json in train or test, or chunk files in the folder itself."""
+        inside = [path, *path.iterdir()] if path.is_dir() else []
+        splits = [item for item in inside if item.name in ("train", "test")]
+        return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`.
@@ -231,9 +205,9 @@ class ChunksSource(SceneSource):
         return self._split(split)
 
     def _split(self, split: Split) -> ChunkScenes:
-        if split in self._splits:
-            return self._splits[split]
-        train = self._splits["train"]
+        train = self._splits.get("train", self._nothing)
+        if split == "train" or split in self._splits:
+            return self._splits.get(split, train)
         first = next(iter(train.groups()), [])
         return train if any(train[index].held_out for index in first) else self._nothing
 
@@ -247,10 +221,8 @@ def _folders(path: UPath) -> dict[Split, UPath]:
         raise FileNotFoundError(
             f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
         )
-    splits: tuple[Split, ...] = ("train", "test")
-    found: dict[Split, UPath] = {
-        split: path / split for split in splits if has_chunks(path / split)
-    }
+    folders: dict[Split, UPath] = {"train": path / "train", "test": path / "test"}
+    found = {split: folder for split, folder in folders.items() if has_chunks(folder)}
     if not found and has_chunks(path):
         return {"train": path}
     if not found:
@@ -262,21 +234,18 @@ def _folders(path: UPath) -> dict[Split, UPath]:
     return found
 
 
-def _chosen(store: ChunkStore, listing: Listing, config: ChunksConfig) -> dict[str, UPath]:
+def _chosen(chunks: BoundedCache[Chunk], folder: UPath, config: ChunksConfig) -> dict[str, UPath]:
     """The scenes that the options leave; those with too few frames are counted and named."""
-    files = dict(listing.files)
+    files = list_scenes(folder)
     if config.min_frames:
-        frames = {key: store.chunk(file).frames(key) for key, file in _by_file(files)}
+        by_file = sorted(files.items(), key=lambda item: str(item[1]))
+        frames = {key: len(ChunkScene(chunks, file, key, config)) for key, file in by_file}
         short = {key: count for key, count in frames.items() if count < config.min_frames}
         if short:
-            _log.warning(
-                "%d of %d scenes of %s have fewer than %d frames (min_frames) and are left out: %s",
-                len(short), len(files), listing.folder, config.min_frames,
-                ", ".join(f"{key} ({count})" for key, count in short.items()),
-            )  # fmt: skip
+            names = ", ".join(f"{key} ({count})" for key, count in short.items())
+            warn_once(
+                f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
+                f"{config.min_frames} frames (min_frames) and are left out: {names}"
+            )
         files = {key: file for key, file in files.items() if key not in short}
     return dict(list(files.items())[: config.max_scenes or None])
-
-
-def _by_file(files: Mapping[str, UPath]) -> list[tuple[str, UPath]]:
-    return sorted(files.items(), key=lambda item: str(item[1]))
