@@ -26,6 +26,7 @@ from qgs.contracts import (
     Loss,
     Metric,
     ModelDims,
+    Optimizer,
     Plugin,
     RecipeContext,
     SceneSource,
@@ -73,6 +74,10 @@ class Recipe:
     def build_metrics(self) -> dict[str, Metric]:
         """What evaluations measure, by the names that the recipe gives."""
         return self._build_named("metrics")
+
+    def build_optimizer(self) -> Optimizer:
+        """The optimiser; raises ValueError where `training` is too short for it."""
+        return build(self.parts["optimizer",], self.training)
 
     def build_data(self) -> SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""

@@ -38,6 +38,7 @@ SLOTS = {
         Slot(contracts.Renderer, "qgs/auto"),
         Slot(contracts.Loss, None),
         Slot(contracts.Metric, None),
+        Slot(contracts.Optimizer, "qgs/adamw"),
         Slot(contracts.SceneSource, None),
     )
 }
@@ -68,6 +69,7 @@ SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
     "metrics": Section(named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
+    "optimizer": Section(),
 }
 
 

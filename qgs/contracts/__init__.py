@@ -25,6 +25,7 @@ from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
 from qgs.contracts.head import Centers, Head
 from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
+from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
 from qgs.contracts.plugin import (
     CONTRACT_VERSION,
     ENTRY_POINT_GROUP,
@@ -61,7 +62,10 @@ __all__ = [
     "MetricInput",
     "ModelComponent",
     "ModelDims",
+    "Optimizer",
+    "OptimizerConfig",
     "OptionError",
+    "ParameterGroup",
     "Plugin",
     "Problem",
     "Queries",

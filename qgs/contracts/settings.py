@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal
 
 from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
-
-Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
 class ViewsConfig(ComponentConfig):
@@ -44,43 +42,36 @@ class ViewsConfig(ComponentConfig):
 
 
 class TrainingConfig(ComponentConfig):
-    """The optimisation (LocusGS release, base stage).
-
-    steps: optimiser steps. seconds: a time budget; when set, training ends at whichever of the two
-    comes first and the schedule follows the larger of the two fractions. batch_size: scenes per
-    step and process. accumulate: batches per optimiser step. learning_rate: peak of the one-cycle
-    cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
-    final_divisor: first rate over last rate (torch's OneCycleLR). betas, weight_decay: of AdamW.
-    clip: gradient norm. precision: autocast dtype. save_every: steps between checkpoints, 0 for
-    none but at the end and before evaluations. collapse_window: steps of background-only output
-    after which training stops. workers: processes that decode data, 0 for a thread of this one.
-    render_views: target views rendered at a time, 0 for all; bounds memory and changes no gradient.
-    ema: decay of an exponential moving average of the weights, saved and evaluated beside them.
-    on_nonfinite: after a NaN or infinite loss or gradient, whose batch and weights are saved,
-    training stops or skips the step. evaluate_every: steps between evaluations with pictures, 0 for
-    none. trackers: where metrics go besides the run's own history.
-    """
+    """How a model is trained, the optimiser aside (defaults: LocusGS release, base stage)."""
 
     steps: int = Field(default=150_000, ge=1)
+    """Optimiser steps."""
     seconds: float | None = Field(default=None, gt=0)
+    """Time budget; training ends when this or `steps` is used up. null: `steps` alone."""
     batch_size: int = Field(default=16, ge=1)
+    """Scenes per batch and process."""
     accumulate: int = Field(default=1, ge=1)
-    learning_rate: float = Field(default=4e-4, gt=0)
-    warmup: int = Field(default=2000, ge=0)
-    initial_divisor: float = Field(default=25.0, ge=1)
-    final_divisor: float = Field(default=1000.0, ge=1)
-    betas: tuple[Decay, Decay] = (0.9, 0.95)
-    weight_decay: float = Field(default=0.05, ge=0)
+    """Batches per optimiser step."""
     clip: float = Field(default=1.0, gt=0)
+    """Largest norm of the gradient; a larger one is scaled down to it."""
     precision: Literal["float32", "bf16"] = "bf16"
+    """What the model computes in; bf16 is torch's autocast, weights stay float32."""
     save_every: int = Field(default=1000, ge=0)
+    """Steps between checkpoints; 0 saves at the end and before evaluations only."""
     collapse_window: int = Field(default=50, ge=10, le=100)
+    """Steps in a row without signs of life (empty renderings, no gradient) that end training."""
     workers: int = Field(default=0, ge=0)
+    """Processes that decode data; 0 for a thread of the training process."""
     render_views: int = Field(default=0, ge=0)
+    """Target views rendered at a time, which bounds memory and changes no gradient; 0 for all."""
     ema: float | None = Field(default=None, gt=0, lt=1)
+    """Decay of a moving average of the weights, saved and evaluated beside them; null for none."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
+    """What a step with a NaN or infinite loss or gradient does; its batch and weights are saved."""
     evaluate_every: int = Field(default=0, ge=0)
+    """Steps between evaluations with pictures; 0 for none."""
     trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    """Where numbers and pictures go besides the folder of the run."""
 
 
 class EvaluationConfig(ComponentConfig):

@@ -220,7 +220,7 @@ def test_imported_weights_grow_too(tmp_path: Path) -> None:
 
 def test_training_starts_from_a_run(tiny: Tiny, tmp_path: Path) -> None:
     base = train(tiny("locus"), tmp_path / "base", device="cpu")
-    still = ("training.learning_rate=1e-9", "training.weight_decay=0.0")
+    still = ("optimizer.learning_rate=1e-9", "optimizer.weight_decay=0.0")
     grown = tiny("locus", "model.queries.count=32", f"init_from={tmp_path / 'base'}", *still)
     console = Console(file=StringIO(), width=300)
     result = train(grown, tmp_path / "grown", device="cpu", console=console)

@@ -125,7 +125,7 @@ def _step(
 ) -> Task:
     losses, render_views = recipe.build_losses(), recipe.training.render_views
     objective = Objective(model, losses, render_views).to(workload.device)
-    optimizer = make_optimizer(objective, recipe.training)
+    optimizer = make_optimizer(objective, recipe.build_optimizer())
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
