@@ -219,11 +219,12 @@ def advice(recipe: Recipe, expected: WeightLayout | None, shapes: Shapes) -> lis
     except (LayoutError, RecipeError) as error:
         return [*lines, f"no recipe fits the shapes: {error}"]
     differing = differing_options(recipe.tree, fitting.tree)
-    options = [
-        f"  {path}: {wanted} ({f'the recipe has {has}' if has else 'not in it'})"
-        for path, (has, wanted) in ((p, differing.get(p, (None, None))) for p in layout.read_options)
-        if wanted is not None
-    ]
+    options = []
+    for path in layout.read_options:
+        has, wanted = differing.get(path, (None, None))
+        if wanted is not None:
+            found = f"the recipe has {has}" if has else "not in it"
+            options.append(f"  {path}: {wanted} ({found})")
     if options:
         lines += ["options that would fit, by names and shapes:", *options]
         lines += ["names and shapes cannot tell:", *(f"  {line}" for line in layout.undecided)]
