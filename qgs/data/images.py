@@ -49,7 +49,7 @@ class CropResize:
         self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
     ) -> np.ndarray:
         """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel."""
-        return np.array(image.resize(self.target[::-1], kernel, box=self.box))
+        return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
 
 
 @contextmanager
