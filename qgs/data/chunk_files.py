@@ -75,10 +75,7 @@ class Record:
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image: as the chunk says, else all as the first image's header says.
-
-        Raises ValueError when that is no readable image.
-        """
+        """(H, W) of every image: as the chunk says, else all as `stored_size` of the first."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)
@@ -101,10 +98,9 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """The scene that `data`, an entry of the chunk `file`, describes.
+    """The scene that `data`, an entry of the chunk `file`, describes; numbers are not judged.
 
-    Raises ValueError, naming key and entry, where its structure is not that of the format; numbers
-    are not judged.
+    Raises ValueError, naming key and entry, where its structure is not that of the format.
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
@@ -324,8 +320,8 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
     """The scenes of a folder by key, in the index's order, with their chunk files.
 
     They are read from index.json alone where there is one; else chunks are opened.
-    Scenes whose chunk does not exist are counted and named in a warning. Raises FileNotFoundError
-    when no scene is left, ValueError for an index or a chunk that cannot be read.
+    Scenes whose chunk does not exist are left out and logged. Raises FileNotFoundError when no
+    scene is left, ValueError for an index or a chunk that cannot be read.
     """
     if not (folder / INDEX).is_file():
         return _scanned(folder)

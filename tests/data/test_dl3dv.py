@@ -253,7 +253,7 @@ def test_paths_inside_archives(tmp_path):
     archive(tmp_path / "a.zip", {"top/x.txt": b"hello", "top/sub/y.txt": b""})
     top = ArchivePath(UPath(tmp_path / "a.zip")) / "top"
     assert [item.name for item in top.iterdir()] == ["sub", "x.txt"]
-    assert (top / "x.txt").read_text() == "hello"
+    assert (top / "x.txt").open("rb").read() == b"hello"
     assert (top / "x.txt").parent == top
     assert (top / "sub").is_dir()
     assert not (top / "sub").is_file()

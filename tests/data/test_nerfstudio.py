@@ -14,12 +14,7 @@ from qgs.contracts import ViewsConfig
 from qgs.data import PhotosSource, read_photos
 from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
-from qgs.data.photos.checks import (
-    frame_problems,
-    intrinsics_problems,
-    pose_problems,
-    size_problems,
-)
+from qgs.data.photos.checks import frame_problems, intrinsics_problems, pose_problems, size_problems
 from qgs.data.photos.nerfstudio import image_name, read_transforms
 from qgs.data.photos.source import PhotoScene
 from qgs.data.sampling import make_sample
