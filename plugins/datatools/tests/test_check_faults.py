@@ -211,7 +211,7 @@ def test_pixels_in_a_chunk(chunks):
     chunks.chunk(scaled)
     assert told(chunks.path) == [
         "error: a, frames 0-5 (0 to 5): the intrinsics (145, 147, 89, 61) look like pixels: chunks "
-        "hold fx and cx divided by the image's width, fy and cy by its height"
+        "hold fx and cx divided once by the image's width, fy and cy by its height"
     ]
 
 

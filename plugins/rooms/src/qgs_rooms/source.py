@@ -18,8 +18,10 @@ from qgs.data.lazy import LazyScenes
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
+from qgs.data.scenes import LazyScenes
 from qgs.types import Cameras
 from qgs_rooms.path import camera_path
+from qgs_rooms.plan import furnish
 from qgs_rooms.shapes import Room
 
 _SHADOW_CELLS = 80
