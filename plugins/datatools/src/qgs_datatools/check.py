@@ -18,7 +18,7 @@ from qgs_datatools.decoding import DecodedScene, decode_scene, file_findings, si
 from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
-from qgs_datatools.indices import Held, IndexSummary, found_indices, index_findings
+from qgs_datatools.indices import Held, found_indices, index_findings
 from qgs_datatools.sources import kind_of, source_scenes, sources
 
 _PHOTO_FORMATS = {reader.name: reader.listing for reader in READERS}
@@ -82,13 +82,13 @@ class SceneReport:
 @dataclass(frozen=True)
 class CheckReport:
     """What was found. general: findings about files of the data set. judged: scenes whose poses
-    were to be judged against photos. notes: what was not done, and why.
+    were to be judged against photos. indices: each in words. notes: what was not done, and why.
     """
 
     path: str
     scenes: Sequence[SceneReport]
     general: Sequence[Finding]
-    indices: Sequence[IndexSummary]
+    indices: Sequence[str]
     judged: int
     notes: Sequence[str]
 
@@ -133,7 +133,7 @@ def check(
         report = check_scene(candidate, options, with_geometry=number in judged)
         scenes.append(report)
         held[report.scene].append(Held(report.split, report.listed - report.missing or None))
-    summaries: list[IndexSummary] = []
+    summaries: list[str] = []
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         findings, summary = index_findings(file, held, told)
         general += findings
