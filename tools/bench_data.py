@@ -39,6 +39,7 @@ from upath import UPath
 
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene
+from qgs.data.scenes import EncodedFrame, EncodedScene
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.objective import Gradients, Objective

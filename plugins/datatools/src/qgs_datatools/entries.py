@@ -16,6 +16,8 @@ from torch import Tensor
 
 from qgs.contracts import Scene
 from qgs.data.images import decode_gray, decode_rgb
+from qgs.data.lenses import undistorted
+from qgs.data.scenes import EncodedFrame, EncodedScene
 
 ChunkEntry: TypeAlias = dict[str, Any]
 
