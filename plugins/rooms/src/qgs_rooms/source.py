@@ -14,7 +14,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 from pydantic import Field, model_validator
-from qgs.data.lazy import LazyScenes
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
