@@ -171,6 +171,7 @@ def _opened(
     from qgs.composer import resolve
     from qgs.data.paths import opened_path
     from qgs.data.recognition import recognised
+    from qgs_datatools.sources import sources
 
     recipe: Any = path
     if Path(path).suffix not in {".yaml", ".yml"}:

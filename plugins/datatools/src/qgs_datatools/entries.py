@@ -10,8 +10,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 from PIL import Image
-from qgs.data.photos.frames import undistorted
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from torch import Tensor
 
 from qgs.contracts import Scene

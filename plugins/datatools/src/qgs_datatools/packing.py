@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, TypeAlias, get_args
 
 import torch
-from qgs.data.chunks.files import INDEX, SUFFIX
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
