@@ -12,10 +12,10 @@ from typing import Any
 
 from guide_docstrings import entries, joined
 
-from qgs.composer.recipe import dump
 from qgs.composer.registry import Registry, load_registry
 from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.composer.slots import DEFAULT_LOSSES, SLOTS, slot_at
+from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
 PLUGINS = ("locus", "ellipsoid")

@@ -74,7 +74,8 @@ BROKEN = {
     "fields of different frames": (
         HEAD + "model:\n  queries: {type: spatial/placed}\n  decoder:\n"
         "    refinement: {type: spatial/local}\n",
-        6, "model.decoder.refinement", "camera frame, `spatial/placed` at model.queries (recipe.yaml:4) writes",
+        6, "model.decoder.refinement",
+        "camera frame, `spatial/placed` at model.queries (recipe.yaml:4) writes",
         "choose another component",
     ),
     "duplicate key": (
