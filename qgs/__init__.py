@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,6 +22,14 @@ if TYPE_CHECKING:
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
 
 __version__ = "0.1.0"
+
+if list(Path(__file__).parents[1].glob("qgs-[0-9]*-info")):
+    raise ImportError(
+        "PyPI's `qgs`, a climate model, is installed in the same folder as query-gaussians, and "
+        "both have a package called `qgs`: run `pip uninstall qgs`, then "
+        "`pip install --force-reinstall --no-deps query-gaussians`, and keep them in separate "
+        "environments"
+    )
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 """PyTorch's CPU allocator then asks for huge pages for large tensors, if qgs is imported before it

@@ -1,11 +1,10 @@
-"""The model: photos to image memory, queries through the decoder, queries to Gaussians."""
+"""The model: views to image memory, queries through the decoder layers, states to Gaussians."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from einops import rearrange
 from torch import Tensor, nn
 
 from qgs.components.blocks import LayerScale
@@ -34,7 +33,7 @@ from qgs.types import (
 
 
 class DecoderLayer(nn.Module):
-    """Cross-attention, self-attention, MLP, each a LayerScale residual (TokenGS release)."""
+    """Cross-attention, self-attention, MLP; each update is scaled and added (TokenGS release)."""
 
     def __init__(
         self,
@@ -53,7 +52,7 @@ class DecoderLayer(nn.Module):
         self.feed_forward_scale = LayerScale(width, layer_scale)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> QueryState:
-        """The state with updated features; fields pass through."""
+        """The state with updated features (B, N, D) and the same fields."""
         x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
         state = state.replace(x_BND)
         x_BND = x_BND + self.self_scale(self.self_attention(state))
@@ -107,7 +106,7 @@ class QueryGaussianModel(nn.Module):
     ) -> Prediction:
         """Reconstruct every scene of `views`.
 
-        layers, state: see `predict`; by default the scenes start from the learned queries.
+        layers: see `predict`. state: the initial state; None for the learned queries.
         """
         initial = self.queries(views.images.shape[0]) if state is None else state
         return self.predict(self.encoder(views), initial, layers)
@@ -115,13 +114,12 @@ class QueryGaussianModel(nn.Module):
     def predict(
         self, memory: ImageMemory, state: QueryState, layers: Collection[int] | None = None
     ) -> Prediction:
-        """Take the queries through the decoder and read the Gaussians off them.
+        """Run all decoder layers and decode Gaussians after the chosen ones.
 
-        memory: what `encoder` made of the views. state: the queries before the first layer, of as
-            many scenes.
-        layers: numbers of the decoder layers to decode besides the last (1 is the first); None
-            decodes the supervised ones while training and only the last otherwise.
-        Raises ValueError for a layer that does not exist and for states of other scenes.
+        memory: the encoder's output. state: the queries before the first layer, of as many scenes.
+        layers: numbers of the layers to decode besides the last (1 is the first); None for the
+            supervised ones in training, and for the last alone in evaluation.
+        Raises ValueError for a layer that does not exist and for another number of scenes.
         """
         wanted = self._decoded_layers(layers)
         scenes, given = memory.features.shape[0], state.features.shape[0]
@@ -136,19 +134,14 @@ class QueryGaussianModel(nn.Module):
         return Prediction(decoded[self.depth].gaussians, state, decoded)
 
     def decode(self, state: QueryState) -> Gaussians:
-        """The Gaussians that a state stands for, query by query."""
+        """The Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
-        means = self.centers(attributes.offsets, state)
-
-        def flat(x: Tensor) -> Tensor:
-            return rearrange(x, "b n k c -> b (n k) c")
-
         return Gaussians(
-            means=flat(means),
-            scales=flat(attributes.scales),
-            quats=flat(attributes.quats),
-            opacities=rearrange(attributes.opacities, "b n k -> b (n k)"),
-            colors=flat(attributes.colors),
+            means=self.centers(attributes.offsets, state).flatten(1, 2),  # N, K -> G
+            scales=attributes.scales.flatten(1, 2),
+            quats=attributes.quats.flatten(1, 2),
+            opacities=attributes.opacities.flatten(1, 2),
+            colors=attributes.colors.flatten(1, 2),
         )
 
     def render(

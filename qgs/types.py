@@ -1,10 +1,14 @@
 """The containers that travel between components.
 
-Shapes: B scenes, V views, H x W pixels, N queries, D width, h heads, M image tokens,
-K Gaussians per query, G = N*K Gaussians. Frames: "world" is the frame of the first input camera
-once poses are normalised; cameras are OpenCV (x right, y down, z forward).
+Axes: B scenes, V views, H x W pixels, N queries, K Gaussians per query, G = N*K Gaussians,
+M image tokens, D width, h heads, d = D/h. Model code ends the names of tensors with their axes,
+such as `x_BND`, a digit for a fixed size; fields of containers and arguments that a contract names
+go without.
 
-Every container is frozen. A component returns a new one and never writes into the old.
+Frames: "world" is the frame of the first input camera once poses are normalised; cameras are OpenCV
+(x right, y down, z forward).
+
+Containers are frozen. A component returns a new one and never writes into the one it was given.
 """
 
 from __future__ import annotations
@@ -22,20 +26,19 @@ class TensorContainer:
     """A frozen dataclass of tensors, containers and mappings of them."""
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Return a copy with every tensor moved as by `Tensor.to`.
+        """The container with every tensor moved as by `Tensor.to`.
 
         A dtype converts every tensor, poses, rays and other geometry included, which then is no
         longer the float32 that components count on.
         """
-
-        copy = {name: map_tensors(lambda x: x.to(*args, **kwargs), v) for name, v in _items(self)}
-        return replace(cast(Any, self), **copy)
+        return map_tensors(lambda x: x.to(*args, **kwargs), self)
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
     """`value` with `function(tensor)` in place of every tensor.
 
-    Goes into containers, mappings, lists and tuples; whatever holds no changed tensor is itself.
+    Goes into containers, mappings, lists and tuples. A part in which no tensor changes is returned
+    itself, not copied.
     """
     if isinstance(value, Tensor):
         return function(value)
@@ -49,13 +52,13 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
         return replace(cast(Any, value), **dict(mapped))
     if isinstance(value, Mapping):
         return dict(mapped)
-    return getattr(value, "_make", type(value))([item for _, item in mapped])
+    return getattr(value, "_make", type(value))([item for _, item in mapped])  # _make: namedtuple
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """Every tensor in `value` with its dotted name, such as `gaussians.means`.
 
-    Goes where `map_tensors` goes. name: of `value` itself.
+    Goes where `map_tensors` goes. name: that of `value` itself, put before the others.
     """
     if isinstance(value, Tensor):
         yield name, value
@@ -71,20 +74,34 @@ def _items(value: Any) -> Iterator[tuple[Any, Any]]:
         yield from value.items() if isinstance(value, Mapping) else enumerate(value)
 
 
-def _expect(name: str, tensor: Tensor, trailing: tuple[int | None, ...]) -> None:
-    """Raise ValueError unless `tensor` ends with `trailing` (None matches any size)."""
-    tail = tuple(tensor.shape[-len(trailing) :])
-    matches = len(tail) == len(trailing) and all(
-        want is None or want == have for want, have in zip(trailing, tail, strict=True)
-    )
-    if not matches:
-        wanted = ", ".join("*" if size is None else str(size) for size in trailing)
-        raise ValueError(f"{name} must have shape (..., {wanted}), got {tuple(tensor.shape)}")
+def _check_shapes(
+    container: TensorContainer, known: Mapping[str, int] | None = None, **shapes: str
+) -> None:
+    """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
 
-
-def _expect_shape(name: str, tensor: Tensor, wanted: tuple[int, ...]) -> None:
-    if tuple(tensor.shape) != wanted:
-        raise ValueError(f"{name} must have shape {wanted}, got {tuple(tensor.shape)}")
+    A letter is one size wherever it occurs, "..." the same leading axes; `known` gives the sizes of
+    some letters. Fields that are None pass.
+    """
+    sizes: dict[str, Any] = dict(known or {})
+    for name, spec in shapes.items():
+        tensor, axes = getattr(container, name), spec.split()
+        if tensor is None:
+            continue
+        given = shape = tuple(tensor.shape)
+        if axes[0] == "...":  # counts as one axis, whose size is a tuple
+            leading = max(len(shape) - len(axes) + 1, 0)
+            given = (shape[:leading], *shape[leading:])
+        wanted = [int(axis) if axis.isdigit() else sizes.get(axis, axis) for axis in axes]
+        if len(given) != len(wanted) or any(
+            not isinstance(want, str) and want != size
+            for want, size in zip(wanted, given, strict=True)
+        ):
+            flat = [n for want in wanted for n in (want if isinstance(want, tuple) else [want])]
+            message = f"must have shape ({', '.join(map(str, flat))}), got {shape}"
+            if axes[0] == "B" and len(shape) == len(axes) - 1:
+                message += "; add a leading dimension for a single scene"
+            raise ValueError(f"{type(container).__name__}.{name} {message}")
+        sizes.update(zip(axes, given, strict=True))
 
 
 @dataclass(frozen=True)
@@ -101,13 +118,7 @@ class Cameras(TensorContainer):
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        _expect("Cameras.c2w", self.c2w, (4, 4))
-        _expect("Cameras.intrinsics", self.intrinsics, (4,))
-        if self.c2w.shape[:-2] != self.intrinsics.shape[:-1]:
-            raise ValueError(
-                "Cameras.c2w and Cameras.intrinsics must share their batch shape, got "
-                f"{tuple(self.c2w.shape)} and {tuple(self.intrinsics.shape)}"
-            )
+        _check_shapes(self, c2w="... 4 4", intrinsics="... 4")
 
     @property
     def shape(self) -> torch.Size:
@@ -122,7 +133,7 @@ class Cameras(TensorContainer):
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
 
     def __getitem__(self, index: Any) -> Cameras:
-        return Cameras(self.c2w[index], self.intrinsics[index], self.size)
+        return map_tensors(lambda x: x[index], self)
 
 
 @dataclass(frozen=True)
@@ -138,12 +149,8 @@ class Views(TensorContainer):
     masks: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if self.images.ndim != 5:
-            raise ValueError(
-                f"Views.images must have shape (B, V, 3, H, W), got {tuple(self.images.shape)}; "
-                "add a leading dimension for a single scene"
-            )
-        _expect("Views.images", self.images, (3, *self.cameras.size))
+        size = dict(zip("HW", self.cameras.size, strict=True))
+        _check_shapes(self, size, images="B V 3 H W", masks="B V 1 H W")
         if not self.images.is_floating_point():
             raise ValueError(
                 f"Views.images must be floating-point numbers in [0, 1], got {self.images.dtype}; "
@@ -154,14 +161,10 @@ class Views(TensorContainer):
                 f"Views.images has {tuple(self.images.shape[:2])} scenes and views, "
                 f"Views.cameras {tuple(self.cameras.shape)}"
             )
-        if self.masks is not None:
-            single = (*self.images.shape[:2], 1, *self.cameras.size)
-            _expect_shape("Views.masks", self.masks, single)
 
     def select(self, index: Any) -> Views:
         """The views at `index` of every scene (a slice or a list of ints)."""
-        masks = None if self.masks is None else self.masks[:, index]
-        return Views(self.images[:, index], self.cameras[:, index], masks)
+        return map_tensors(lambda x: x[:, index], self)
 
 
 @dataclass(frozen=True)
@@ -185,29 +188,19 @@ class ImageMemory(TensorContainer):
     )
 
     def __post_init__(self) -> None:
-        _expect("ImageMemory.patch_rays", self.patch_rays, (6,))
-        if self.features.ndim != 3 or self.keys.ndim != 4:
-            raise ValueError(
-                "ImageMemory.features must have shape (B, M, D) and .keys (B, h, M, D/h), got "
-                f"{tuple(self.features.shape)} and {tuple(self.keys.shape)}"
-            )
-        batch, tokens, _ = self.features.shape
-        _expect_shape("ImageMemory.patch_rays", self.patch_rays, (batch, tokens, 6))
-        _expect_shape("ImageMemory.values", self.values, tuple(self.keys.shape))
-        if (self.keys.shape[0], self.keys.shape[2]) != (batch, tokens):
-            raise ValueError(
-                f"ImageMemory.keys must be of the {batch} scenes and {tokens} tokens of .features, "
-                f"got {tuple(self.keys.shape)}"
-            )
+        _check_shapes(
+            self, features="B M D", keys="B h M D/h", values="B h M D/h", patch_rays="B M 6"
+        )
+        tokens = self.features.shape[1]
         if math.prod(self.grid) != tokens:
             raise ValueError(f"ImageMemory.grid {self.grid} must hold the {tokens} tokens")
 
     def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """What `compute` makes of this memory, computed by the first layer that asks for `name`.
+        """`compute()` of the first layer that asks for `name`, kept for the other layers.
 
-        A memo, and no part of the value: copies start without it. `name` belongs to the caller,
-        who prefixes it with the plugin's name. What was computed without gradients, or in
-        inference mode, is computed again where they are wanted.
+        `compute` reads this memory alone. Start `name` with your plugin's name. Copies of the
+        memory start with nothing kept. What was computed without gradients, or in inference mode,
+        is computed again where gradients are wanted.
         """
         key = (name, torch.is_grad_enabled(), torch.is_inference_mode_enabled())
         if key not in self._derived:
@@ -223,10 +216,7 @@ class QueryState(TensorContainer):
     fields: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.features.ndim != 3:
-            raise ValueError(
-                f"QueryState.features must have shape (B, N, D), got {tuple(self.features.shape)}"
-            )
+        _check_shapes(self, features="B N D")
         count = tuple(self.features.shape[:2])
         for name, tensor in self.fields.items():
             if tuple(tensor.shape[:2]) != count:
@@ -266,10 +256,9 @@ class GaussianAttributes(TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        count = tuple(self.offsets.shape[:-1])
-        _expect_shape("GaussianAttributes.opacities", self.opacities, count)
-        for name, size in (("offsets", 3), ("scales", 3), ("quats", 4), ("colors", 3)):
-            _expect_shape(f"GaussianAttributes.{name}", getattr(self, name), (*count, size))
+        _check_shapes(
+            self, offsets="... 3", scales="... 3", quats="... 4", opacities="...", colors="... 3"
+        )
 
 
 @dataclass(frozen=True)
@@ -287,10 +276,9 @@ class Gaussians(TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        count = tuple(self.means.shape[:-1])
-        for name, size in (("means", 3), ("scales", 3), ("quats", 4), ("colors", 3)):
-            _expect_shape(f"Gaussians.{name}", getattr(self, name), (*count, size))
-        _expect_shape("Gaussians.opacities", self.opacities, count)
+        _check_shapes(
+            self, means="... 3", scales="... 3", quats="... 4", opacities="...", colors="... 3"
+        )
 
     @property
     def count(self) -> int:
@@ -298,7 +286,7 @@ class Gaussians(TensorContainer):
         return self.means.shape[-2]
 
     def __getitem__(self, index: Any) -> Gaussians:
-        return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return map_tensors(lambda x: x[index], self)
 
 
 @dataclass(frozen=True)
@@ -314,14 +302,7 @@ class Rendering(TensorContainer):
     depth: Tensor
 
     def __post_init__(self) -> None:
-        if self.rgb.ndim != 5:
-            raise ValueError(
-                f"Rendering.rgb must have shape (B, V, 3, H, W), got {tuple(self.rgb.shape)}"
-            )
-        _expect("Rendering.rgb", self.rgb, (3, *self.rgb.shape[-2:]))
-        single = (*self.rgb.shape[:2], 1, *self.rgb.shape[-2:])
-        _expect_shape("Rendering.alpha", self.alpha, single)
-        _expect_shape("Rendering.depth", self.depth, single)
+        _check_shapes(self, rgb="B V 3 H W", alpha="B V 1 H W", depth="B V 1 H W")
 
 
 @dataclass(frozen=True)
@@ -335,8 +316,7 @@ class SpatialSupport(TensorContainer):
     axes: Tensor
 
     def __post_init__(self) -> None:
-        _expect("SpatialSupport.centers", self.centers, (3,))
-        _expect_shape("SpatialSupport.axes", self.axes, (*self.centers.shape, 3))
+        _check_shapes(self, centers="... 3", axes="... 3 3")
 
 
 @dataclass(frozen=True)

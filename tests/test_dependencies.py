@@ -11,6 +11,7 @@ import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,11 @@ import pytest
 from qgs.cli.new_plugin import rendered
 
 ROOT = Path(__file__).parents[1]
+PLUGINS = ("locus", "ellipsoid", "rooms", "datatools")
 DISTRIBUTIONS = {
     "PIL": "pillow",
-    "griffe": "mkdocstrings",
     "qgs": "query-gaussians",
-    **{f"qgs_{name}": f"query-gaussians-{name}" for name in ("locus", "ellipsoid")},
+    **{f"qgs_{name}": f"query-gaussians-{name}" for name in PLUGINS},
     "mpl_toolkits": "matplotlib",
     "pydantic_core": "pydantic",
     "skimage": "scikit-image",
@@ -66,6 +67,18 @@ class Source:
     def imported(self, module: str) -> dict[str, bool]:
         """Full name of what a file imports, to whether that happens when it is imported itself."""
         return dict(sorted(_imports(ast.parse(self.files[module]), True), key=lambda x: x[1]))
+
+    @property
+    def modules(self) -> dict[str, str]:
+        """Name of every module to its path."""
+        names = (path.removesuffix(".py").removesuffix("/__init__") for path in self.files)
+        return dict(zip((name.replace("/", ".") for name in names), self.files, strict=True))
+
+    @property
+    def imported_at_once(self) -> dict[str, set[str]]:
+        """Name of every module to the full names that it imports when it is imported itself."""
+        imported = {module: self.imported(path) for module, path in self.modules.items()}
+        return {m: {name for name, now in found.items() if now} for m, found in imported.items()}
 
     def third_party(self, module: str) -> dict[str, bool]:
         """Distribution of what a file imports of others, to whether that happens at once."""
@@ -124,7 +137,6 @@ def plugin(name: str) -> Source:
     return source(folder / "pyproject.toml", folder / "src" / f"qgs_{name}")
 
 
-PLUGINS = ("locus", "ellipsoid", "rooms", "datatools")
 SOURCES = {
     "query-gaussians": source(ROOT / "pyproject.toml", ROOT / "qgs"),
     **{f"query-gaussians-{name}": plugin(name) for name in PLUGINS},
@@ -152,14 +164,7 @@ def test_what_is_required_is_imported(name: str) -> None:
 def test_an_extra_is_imported_where_it_is_used_alone(name: str) -> None:
     """A module that imports an extra at once, or such a module, is imported by no first one."""
     package = SOURCES[name]
-    modules = {
-        path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): path
-        for path in package.files
-    }
-    at_once = {
-        module: {found for found, now in package.imported(path).items() if now}
-        for module, path in modules.items()
-    }
+    modules, at_once = package.modules, package.imported_at_once
     needy = {
         module
         for module, path in modules.items()
@@ -168,11 +173,21 @@ def test_an_extra_is_imported_where_it_is_used_alone(name: str) -> None:
     while more := {module for module in modules if at_once[module] & needy} - needy:
         needy |= more
     if name == "query-gaussians":
-        assert "qgs.renderers.jit" in needy
+        assert "qgs.renderers.cpu_kernels" in needy
         assert not needy & {m for m in modules if m.startswith("qgs.cli")}
         assert not needy & set(FIRST_TO_BE_IMPORTED)
     else:
         assert not needy
+
+
+def test_no_modules_import_each_other() -> None:
+    imported = {m: names for s in SOURCES.values() for m, names in s.imported_at_once.items()}
+    graph: dict[str, set[str]] = {}
+    for module, names in imported.items():
+        homes = {name: name.rpartition(".")[0] for name in names}
+        used = {home for name, home in homes.items() if name not in imported}
+        graph[module] = used | (names - {*homes.values()})
+    TopologicalSorter(graph).prepare()  # raises CycleError with the modules of a circle
 
 
 def test_the_tests_of_a_new_plugin_require_what_they_import() -> None:
@@ -185,9 +200,9 @@ def test_the_tests_of_a_new_plugin_require_what_they_import() -> None:
 def test_the_tests_of_qgs_require_what_they_import() -> None:
     folders = [ROOT / "tests", ROOT / "tools", *ROOT.glob("plugins/*/tests")]
     tests = source(ROOT / "pyproject.toml", *folders)
-    ours = {Path(path).stem for path in tests.files} | {"qgs", *(f"qgs-{name}" for name in PLUGINS)}
+    ours = {Path(path).stem for path in tests.files}
     ours |= {part for path in tests.files for part in Path(path).parts}
-    ours = {name.replace("_", "-") for name in ours}
+    ours = {name.replace("_", "-") for name in ours} | set(SOURCES)
     used = {found for module in tests.files for found in tests.third_party(module)}
     used -= ours | MADE_UP
     assert "pytest" in used

@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from qgs.cli import app
-from qgs.composer.slots import DEFAULT_LOSSES, SLOTS
+from qgs.composer.slots import SECTIONS, SLOTS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -25,10 +25,11 @@ def test_overlay_is_the_recipe() -> None:
 
 
 def test_slots_and_their_defaults() -> None:
-    rows = re.findall(r"^\| `([\w.]+)` \| [^|]* \| ([^|]*) \|", section("Slots"), re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", section("Slots"), re.MULTILINE)
     shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
-    defaults = {name: [slot.default] for name, slot in SLOTS.items()}
-    assert shown == {**defaults, "losses": list(DEFAULT_LOSSES.values())}
+    defaults = {name: [slot.default] if slot.default else [] for name, slot in SLOTS.items()}
+    defaults |= {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.named}
+    assert shown == defaults
 
 
 def test_commands() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-HEAVY = {"accelerate", "gsplat", "kornia", "matplotlib", "numba", "pydantic", "scipy"}
+HEAVY = {"accelerate", "gsplat", "matplotlib", "numba", "pydantic", "scipy"}
 
 
 def imported_by(code: str) -> set[str]:

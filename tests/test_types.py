@@ -15,6 +15,8 @@ from qgs.types import (
     Rendering,
     SpatialSupport,
     Views,
+    map_tensors,
+    named_tensors,
 )
 
 
@@ -69,6 +71,13 @@ def test_state_fields_share_scenes_and_queries() -> None:
         QueryState(torch.zeros(2, 3, 4), {"place": torch.zeros(2, 4, 3)})
 
 
+def test_cameras_share_their_leading_axes() -> None:
+    with pytest.raises(ValueError, match=r"Cameras\.intrinsics must have shape \(2, 3, 4\), got"):
+        Cameras(torch.eye(4).expand(2, 3, 4, 4), torch.ones(3, 4), (8, 8))
+    with pytest.raises(ValueError, match=r"Cameras\.c2w must have shape \(\.\.\., 4, 4\), got"):
+        Cameras(torch.eye(3), torch.ones(4), (8, 8))
+
+
 def test_attributes_share_scenes_queries_and_gaussians() -> None:
     three, four, one = torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 5, 4), torch.zeros(1, 2, 5)
     GaussianAttributes(three, three, four, one, three)
@@ -82,7 +91,7 @@ def test_images_of_a_rendering_have_one_size() -> None:
     rgb, alpha = torch.zeros(1, 2, 3, 4, 5), torch.zeros(1, 2, 1, 4, 5)
     with pytest.raises(ValueError, match=r"Rendering\.depth"):
         Rendering(rgb, alpha, alpha[..., :4])
-    with pytest.raises(ValueError, match=r"Rendering\.rgb"):
+    with pytest.raises(ValueError, match=r"Rendering\.rgb .*add a leading dimension for a single"):
         Rendering(rgb[0], alpha[0], alpha[0])
 
 
@@ -95,3 +104,25 @@ def test_a_state_knows_its_fields_by_name() -> None:
     state = QueryState(torch.zeros(2, 3, 4), {"place": torch.zeros(2, 3, 1)})
     assert "place" in state
     assert "elsewhere" not in state
+
+
+def test_every_nested_tensor_is_mapped_and_named() -> None:
+    state = QueryState(torch.zeros(1, 2, 4), {"place": torch.ones(1, 2, 3)})
+    value = {"state": state, 3: [torch.ones(2), "text", (torch.zeros(1), None)]}
+    assert [name for name, _ in named_tensors(value, "value")] == [
+        "value.state.features",
+        "value.state.fields.place",
+        "value.3.0",
+        "value.3.2.0",
+    ]
+    doubled = map_tensors(lambda x: 2 * x if x.any() else x, value)
+    assert torch.equal(doubled["state"]["place"], torch.full((1, 2, 3), 2.0))
+    assert doubled["state"].features is state.features
+    assert doubled[3][1:] == ["text", value[3][2]]
+    assert doubled[3][2] is value[3][2]  # no tensor in it changed
+    assert map_tensors(lambda x: x, value) is value
+
+
+def test_named_tuples_stay_named_tuples() -> None:
+    found = torch.tensor([3.0, 1.0]).sort()
+    assert map_tensors(lambda x: x + 1, found).indices.tolist() == [2, 1]

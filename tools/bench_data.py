@@ -1,12 +1,17 @@
-"""How fast chunks are decoded, and that memory does not grow with the samples drawn.
+"""How fast chunks are decoded and loaded, and that memory does not grow with the samples drawn.
 
-    python tools/bench_data.py [--path CHUNKS] [--samples 10000] [--size 256]
+    python tools/bench_data.py [--path CHUNKS] [--samples 10000] [--size 256] [--workers 2]
 
 Without --path it writes chunks of synthetic photos (JPEG, 640 x 360) to a temporary folder. Prints
-images/s with one and with two threads, both in turn, the median of five rounds, and the resident
-memory every thousand samples of two input and two target views: `anonymous` is the program's own,
-`mapped` are pages of open chunks, which the system takes back when it needs them. Exit code 1 when
-the program's own memory grows by more than 5 % after the first fifth of the samples.
+
+- images/s decoded with one and with two threads, both in turn, the median of five rounds;
+- images/s that workers load, over those that training the tiny TokenGS recipe on two threads
+  consumes, in turn, medians of three rounds;
+- the own (anonymous) memory of this process and its workers over many samples of the recipe's
+  views, drawn in this process and by workers.
+
+Exit code 1 when the workers load less than five times what training consumes, or memory grows by
+more than 5 % after the first fifth of the samples.
 """
 
 from __future__ import annotations
@@ -16,28 +21,35 @@ import io
 import json
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from itertools import islice
+from multiprocessing import active_children
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 from PIL import Image
-from qgs_datatools.packing import chunk_entry
+from process_memory import megabytes
+from qgs.data.photos.scene import EncodedFrame, EncodedScene
+from qgs_datatools.entries import chunk_entry
 from upath import UPath
 
-from qgs.contracts import Scene, ViewsConfig
-from qgs.data import ChunksSource
-from qgs.data.chunks.source import ChunksConfig
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
-from qgs.data.stream import SampleStream
+from qgs.composer import Recipe, resolve
+from qgs.contracts import Scene
+from qgs.data.stream import training_batches
+from qgs.engine.distributed import make_accelerator
+from qgs.engine.objective import Gradients, Objective
+from qgs.engine.optimizer import make_optimizer
 from qgs.io.files import opened_replacing, write_bytes
 
+TINY = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 CHUNKS, SCENES, FRAMES = 24, 8, 16
-ROUNDS, IMAGES, GROWTH = 5, 160, 1.05
 PHOTO = (360, 640)
+IMAGES, STEPS, BATCHES = 160, 3, 60
+RATIO, GROWTH = 5.0, 1.05
 
 
 def main() -> int:
@@ -45,40 +57,44 @@ def main() -> int:
     parser.add_argument("--path")
     parser.add_argument("--samples", type=int, default=10_000)
     parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    torch.set_num_threads(1)
     with chunks_at(options.path) as path:
-        config = ChunksConfig(path=path, image_size=(options.size, options.size))
-        source = ChunksSource(config)
-        report_speed(source.scenes("train"))
-        return report_memory(source, options.samples)
+        size = [options.size, options.size]
+        data = {"type": "qgs/chunks", "path": path, "image_size": size}
+        recipe = resolve({**resolve(TINY).tree, "data": data})
+        torch.set_num_threads(1)
+        report_decoding(recipe.build_data().scenes("train"))
+        ratio = loaded_over_consumed(recipe, options.workers)
+        torch.set_num_threads(1)
+        growths = [growth(recipe, workers, options.samples) for workers in (0, options.workers)]
+    return int(ratio < RATIO or max(growths) > GROWTH)
 
 
 @contextmanager
 def chunks_at(path: str | None) -> Iterator[str]:
-    """`path` itself, or for None a temporary folder of synthetic chunks."""
+    """`path` itself, or for None a temporary folder of smooth pictures with some noise.
+
+    They compress about as photos do.
+    """
     if path is not None:
         yield path
         return
-    with TemporaryDirectory() as folder:
-        write_synthetic(UPath(folder))
-        yield folder
-
-
-def write_synthetic(folder: UPath) -> None:
-    """Chunks of smooth pictures with some noise, which compress about as photos do."""
-    index: dict[str, str] = {}
     photos = [_photo(seed) for seed in range(32)]
-    for chunk in range(CHUNKS):
-        entries = []
-        for scene in range(SCENES):
-            frames = [_frame(i, photos[(7 * scene + i + chunk) % 32]) for i in range(FRAMES)]
-            entries.append(chunk_entry(f"{chunk:03d}_{scene}", frames, ()))
-        file = f"{chunk:06d}.torch"
-        with opened_replacing(folder / "train" / file) as opened:
-            torch.save(entries, opened)
-        index |= {entry["key"]: file for entry in entries}
-    write_bytes(folder / "train" / "index.json", json.dumps(index).encode())
+    index: dict[str, str] = {}
+    with TemporaryDirectory() as name:
+        folder = UPath(name) / "train"
+        for chunk in range(CHUNKS):
+            entries = []
+            for scene in range(SCENES):
+                frames = [_frame(i, photos[(7 * scene + i + chunk) % 32]) for i in range(FRAMES)]
+                entries.append(chunk_entry(f"{chunk:03d}_{scene}", frames, ()))
+            file = f"{chunk:06d}.torch"
+            with opened_replacing(folder / file) as opened:
+                torch.save(entries, opened)
+            index |= {entry["key"]: file for entry in entries}
+        write_bytes(folder / "index.json", json.dumps(index).encode())
+        yield name
 
 
 def _photo(seed: int) -> bytes:
@@ -97,56 +113,84 @@ def _frame(number: int, data: bytes) -> EncodedFrame:
     return EncodedFrame(str(number), data, c2w, (500.0, 500.0, 320.0, 180.0), PHOTO)
 
 
-def report_speed(scenes: Sequence[Scene]) -> None:
+def report_decoding(scenes: Sequence[Scene]) -> None:
     """Images per second with one and two threads, measured in turn."""
-    scene = scenes[0]
-    assert isinstance(scene, EncodedScene)
-    kilobytes = len(scene.encoded(0).data) / 1000
     rates: dict[int, list[float]] = {1: [], 2: []}
-    for _ in range(ROUNDS):
+    for _ in range(5):
         for threads, measured in rates.items():
-            measured.append(_rate(scenes, threads))
+            measured.append(IMAGES / seconds(lambda threads=threads: _decode(scenes, threads)))
     for threads, measured in rates.items():
         print(f"{threads} thread(s): {statistics.median(measured):.0f} images/s")
     begin = time.process_time()
-    _rate(scenes, 1)
+    _decode(scenes, 1)
     print(f"{1000 * (time.process_time() - begin) / IMAGES:.2f} ms of processor time an image")
-    height, width = scene.encoded(0).size
-    print(f"of {width} x {height} pixels and {kilobytes:.0f} kB")
+    assert isinstance(scenes[0], EncodedScene)
+    frame = scenes[0].encoded(0)
+    print(f"of {frame.size[1]} x {frame.size[0]} pixels and {len(frame.data) / 1000:.0f} kB")
 
 
-def _rate(scenes: Sequence[Scene], threads: int) -> float:
+def _decode(scenes: Sequence[Scene], threads: int) -> None:
     each = min(8, len(scenes[0]))
     with ThreadPoolExecutor(threads) as pool:
-        begin = time.perf_counter()
         list(pool.map(lambda k: scenes[k % len(scenes)].images(range(each)), range(IMAGES // each)))
-        return IMAGES / (time.perf_counter() - begin)
 
 
-def report_memory(source: ChunksSource, samples: int) -> int:
-    """Memory every thousand samples; 1 when it grows."""
-    views = ViewsConfig(inputs=2, targets=2, gap=(2, 10), mirror=0.5)
-    stream = SampleStream(source, views, seed=0)
-    step = max(samples // 10, 1)
+def seconds(work: Callable[[], object]) -> float:
+    """Wall time of `work`."""
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+def loaded_over_consumed(recipe: Recipe, workers: int) -> float:
+    """Images/s of the loader over images/s that training consumes."""
+    each = 2 * (recipe.views.inputs + recipe.views.targets)
+    train = _training_step(recipe)
+    consumed, loaded = [], []
+    for _ in range(3):
+        consumed.append(each * STEPS / seconds(lambda: [train() for _ in range(STEPS)]))
+        stream = training_batches(recipe.build_data(), recipe.views, 2, 0, workers=workers)
+        with closing(stream):
+            list(islice(stream, 4 * workers + 2))  # processes are up and their queues are empty
+            loaded.append(each * BATCHES / seconds(lambda s=stream: list(islice(s, BATCHES))))
+    consumes, loads = statistics.median(consumed), statistics.median(loaded)
+    print(f"training consumes {consumes:.1f} images/s, {workers} workers load {loads:.0f} images/s")
+    print(f"that is {loads / consumes:.1f} times as many")
+    return loads / consumes
+
+
+def _training_step(recipe: Recipe) -> Callable[[], None]:
+    torch.set_num_threads(2)
+    objective = Objective(recipe.build_model().train(), recipe.build_losses(), 0)
+    optimizer = make_optimizer(objective, recipe.training)
+    gradients = Gradients(make_accelerator("cpu"), objective, recipe.training)
+    with closing(training_batches(recipe.build_data(), recipe.views, 2, 0)) as stream:
+        batch = next(stream)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        gradients.compute([batch])
+        optimizer.step()
+
+    step()
+    return step
+
+
+def growth(recipe: Recipe, workers: int, samples: int) -> float:
+    """Largest memory after the first fifth of the samples over that at its end."""
     own: list[float] = []
     begin = time.perf_counter()
-    for number in range(samples):
-        stream.batch([number])
-        if (number + 1) % step == 0:
-            anonymous, mapped = _memory()
-            own.append(anonymous)
-            print(f"{number + 1:6d} samples: anonymous {anonymous:.0f} MB, mapped {mapped:.0f} MB")
-    rate = 4 * samples / (time.perf_counter() - begin)
-    growth = max(own[2:], default=own[-1]) / own[min(1, len(own) - 1)]
-    print(f"growth after the first fifth: {100 * (growth - 1):+.1f} %; {rate:.0f} images/s")
-    return int(growth > GROWTH)
-
-
-def _memory() -> tuple[float, float]:
-    """Anonymous and file-backed resident memory of this process, MB."""
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    anonymous, mapped = (int(status[key].split()[0]) / 1000 for key in ("RssAnon", "RssFile"))
-    return anonymous, mapped
+    with closing(training_batches(recipe.build_data(), recipe.views, 1, 0, workers=workers)) as it:
+        for number, _ in zip(range(1, samples + 1), it, strict=False):
+            if number % max(samples // 10, 1) == 0:
+                children = [child.pid for child in active_children() if child.pid]
+                own.append(sum(megabytes("RssAnon", process) for process in ("self", *children)))
+                print(f"{number:6d} samples, {workers} workers: {own[-1]:.0f} MB", flush=True)
+    images = samples * (recipe.views.inputs + recipe.views.targets)
+    rate = images / (time.perf_counter() - begin)
+    grown = max(own[2:], default=own[-1]) / own[min(1, len(own) - 1)]
+    print(f"growth after the first fifth: {100 * (grown - 1):+.1f} %; {rate:.0f} images/s")
+    return grown
 
 
 if __name__ == "__main__":

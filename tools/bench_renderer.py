@@ -10,7 +10,6 @@ is the growth of the peak resident size over a process that has rendered a small
 from __future__ import annotations
 
 import argparse
-import json
 import subprocess
 import sys
 from dataclasses import fields
@@ -19,6 +18,7 @@ from statistics import median
 from time import perf_counter
 
 import torch
+from process_memory import megabytes
 
 from qgs.contracts import Renderer, RendererConfig
 from qgs.renderers import CpuRenderer, TorchRenderer
@@ -91,14 +91,7 @@ def timed(case: tuple[int, int, int, float, int], repeats: int) -> str:
 def extra_megabytes(case: tuple[int, int, int, float, int], threads: int) -> float:
     """Growth of peak memory by one forward and backward pass, in a process of its own."""
     code = f"import bench_renderer as b; b.report_memory({case!r}, {threads})"
-    found = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(__file__).parent,
-    )
-    return json.loads(found.stdout)
+    return float(subprocess.check_output([sys.executable, "-c", code], cwd=Path(__file__).parent))
 
 
 def report_memory(case: tuple[int, int, int, float, int], threads: int) -> None:
@@ -107,15 +100,9 @@ def report_memory(case: tuple[int, int, int, float, int], threads: int) -> None:
     renderer = CpuRenderer(RendererConfig())
     step(renderer, *make_scene(64, 256, 2, 0.03))
     gaussians, cameras = make_scene(*case[:4])
-    before = peak_kilobytes()
+    before = megabytes("VmHWM")  # unlike getrusage's peak, it does not start at the parent's
     step(renderer, gaussians, cameras)
-    print((peak_kilobytes() - before) / 1024)
-
-
-def peak_kilobytes() -> int:
-    """Peak resident size (Linux); unlike getrusage's, it does not start at the parent's."""
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0])
+    print(megabytes("VmHWM") - before)
 
 
 def first_call(threads: int) -> float:
@@ -136,11 +123,9 @@ def main() -> None:
     for case in CASES:
         print(timed(case, options.repeats), flush=True)
     for case in CASES:
-        megabytes = extra_megabytes(case, options.threads)
-        print(
-            f"extra memory, {case[0]} px, {case[1]} Gaussians, {case[2]} cameras: "
-            f"{megabytes:.0f} MB"
-        )
+        extra = extra_megabytes(case, options.threads)
+        pixels, count, views, *_ = case
+        print(f"extra memory, {pixels} px, {count} Gaussians, {views} cameras: {extra:.0f} MB")
 
 
 if __name__ == "__main__":

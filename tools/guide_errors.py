@@ -41,31 +41,26 @@ SMALL = {
 
 def updated(page: str) -> str:
     """`page` with every block of text replaced by the message that belongs there."""
-    with (
-        TemporaryDirectory() as folder,
-        chdir(folder),
-        _restored_path(),
-        _only_plugins(Path(folder)),
-    ):
+    message = ""
+
+    def replaced(block: re.Match[str]) -> str:
+        nonlocal message
+        kind, title, text = block.groups()
+        missing = (title or "").partition("without ")[2]
+        if kind == "text":
+            site = rf"{re.escape(str(folder))}/\w+/"
+            return f"```text\n{re.sub(site, 'site-packages/', message)}\n```"
+        if kind == "python" and missing:
+            with patch.dict(sys.modules, {missing: None}), _plugins_of(folder, but=missing):
+                message = _message(kind, "example", text)
+        elif kind == "python" and title:
+            _install(title, text, folder)
+        else:
+            message = _message(kind, title or "recipe.yaml", text)
+        return block.group(0)
+
+    with TemporaryDirectory() as name, chdir(name), _plugins_of(folder := Path(name)):
         qgs.save(qgs.compose(SMALL), "model.safetensors")
-        message = ""
-
-        def replaced(block: re.Match[str]) -> str:
-            nonlocal message
-            kind, title, text = block.groups()
-            if kind == "text":
-                site = rf"{re.escape(folder)}/\w+/"
-                return f"```text\n{re.sub(site, 'site-packages/', message)}\n```"
-            missing = (title or "").partition("without ")[2]
-            if kind == "python" and missing:
-                with _without(missing, Path(folder)):
-                    message = _message(kind, "example", text)
-            elif kind == "python" and title:
-                _install(title, text, Path(folder))
-            else:
-                message = _message(kind, title or "recipe.yaml", text)
-            return block.group(0)
-
         return BLOCK.sub(replaced, page)
 
 
@@ -99,36 +94,28 @@ def _install(distribution: str, source: str, folder: Path) -> None:
 
 
 @contextmanager
-def _without(name: str, folder: Path) -> Iterator[None]:
-    """The package or the plugin `name` is not installed meanwhile."""
-    with patch.dict(sys.modules, {name: None}), _only_plugins(folder, but=name):
-        yield
+def _plugins_of(folder: Path, but: str = "") -> Iterator[None]:
+    """Of all plugins there are those of the repository and those in `folder`, not the one `but`.
 
-
-@contextmanager
-def _only_plugins(folder: Path, but: str = "") -> Iterator[None]:
-    """Of all plugins there are those of the repository and those in `folder`, not the one `but`."""
+    Afterwards `sys.path` and the imported plugins are as before; nothing goes to standard error.
+    """
 
     def found(group: str) -> list[EntryPoint]:
         there = [entry for entry in entry_points(group=group) if entry.name != but]
         return [e for e in there if e.name in PLUGINS or (folder / e.module).is_dir()]
 
-    with patch("qgs.composer.registry.entry_points", found):
-        yield
-
-
-@contextmanager
-def _restored_path() -> Iterator[None]:
-    """`sys.path` and the imported modules as they were, and nothing on standard error."""
-    path, modules = list(sys.path), set(sys.modules)
+    modules = set(sys.modules)
     try:
-        with redirect_stderr(StringIO()):
+        with (
+            patch("qgs.composer.registry.entry_points", found),
+            patch.object(sys, "path", [*sys.path]),
+            redirect_stderr(StringIO()),
+        ):
             yield
     finally:
         for name in set(sys.modules) - modules:
             if name.startswith("qgs_"):
                 del sys.modules[name]
-        sys.path[:] = path
 
 
 if __name__ == "__main__":

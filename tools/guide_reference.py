@@ -10,63 +10,35 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from guide_docstrings import entries, joined
-
+from qgs.composer import slots
 from qgs.composer.registry import Registry, load_registry
 from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
-from qgs.composer.slots import DEFAULT_LOSSES, SLOTS, slot_at
+from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
-PLUGINS = ("locus", "ellipsoid")
+PLUGINS = ("locus", "ellipsoid", "rooms")
 
-SECTIONS: tuple[tuple[str, type[ComponentConfig], str], ...] = (
-    ("Top level", RecipeSettings, ""),
-    ("model", ModelSettings, "Sizes that all components share, and the slots below."),
-    ("model.decoder", DecoderSettings, "The decoder's template, and its slots below."),
-    ("views", ViewsConfig, ""),
-    ("training", TrainingConfig, ""),
-    ("evaluation", EvaluationConfig, ""),
-)
-
-PLACES = {
-    "encoder": ("model", "encoder"),
-    "queries": ("model", "queries"),
-    "cross_attention": ("model", "decoder", "cross_attention"),
-    "self_attention": ("model", "decoder", "self_attention"),
-    "feed_forward": ("model", "decoder", "feed_forward"),
-    "refinement": ("model", "decoder", "refinement"),
-    "head": ("model", "head"),
-    "centers": ("model", "centers"),
-    "supervision": ("model", "supervision"),
-    "renderer": ("model", "renderer"),
-    "losses": ("losses", "NAME"),
-    "data": ("data",),
+SECTIONS: Mapping[str, type[ComponentConfig]] = {
+    "Top level": RecipeSettings,
+    "model": ModelSettings,
+    "model.decoder": DecoderSettings,
+    "views": ViewsConfig,
+    "training": TrainingConfig,
+    "evaluation": EvaluationConfig,
 }
-"""Slot to the place of a recipe that holds it."""
-
-INTRODUCTION = """# Recipe reference
-
-Every key that a recipe may have, written from the options of `qgs`, `qgs-locus` and `qgs-ellipsoid`
-when this site was built. Defaults are in YAML's notation. An option that nothing reads, because of
-another one, is refused unless it has its default.
-
-Besides what stands below, a recipe has `extends` (one recipe or a list, relative to the file),
-`plugins` (a list of names), `swap` (pattern of places to component) and `decoder.layers` (0-based
-index to components of that layer alone). [The five ideas](ideas.md) explains them.
-"""
+"""Settings that are no components, by their place in a recipe."""
 
 
 def reference() -> str:
-    """The whole page, Markdown."""
+    """Tables of all sections and of all components by slot, Markdown."""
     registry = load_registry(PLUGINS)
-    parts = [INTRODUCTION]
-    for title, config, text in SECTIONS:
-        heading = title if title == "Top level" else f"`{title}`"
-        parts.append(f"## {heading}\n\n{text}\n\n{option_table(config)}\n")
-    for slot in SLOTS:
-        parts.append(_slot_section(slot, registry))
-    return re.sub(r"\n{3,}", "\n\n", "\n".join(parts))
+    parts = [
+        f"## {name if name == 'Top level' else f'`{name}`'}\n\n{option_table(config)}\n"
+        for name, config in SECTIONS.items()
+    ]
+    parts += [_slot_section(slot, registry) for slot in SLOTS]
+    return "\n".join(parts)
 
 
 def option_table(config: type[ComponentConfig]) -> str:
@@ -74,50 +46,29 @@ def option_table(config: type[ComponentConfig]) -> str:
     schema = config.model_json_schema()
     if not schema.get("properties"):
         return "No options."
-    meanings = {name: in_yaml(text, config) for name, text in option_meanings(config).items()}
     rows = ["| option | values | default | meaning |", "|---|---|---|---|"]
     for name, option in schema["properties"].items():
-        option_schema = _resolved(option, schema.get("$defs", {}))
+        values = values_of(_resolved(option, schema.get("$defs", {})))
         default = f"`{_yaml(option['default'])}`" if "default" in option else "must be given"
-        rows.append(
-            f"| `{name}` | {_escaped(values_of(option_schema))} | {_escaped(default)} "
-            f"| {_escaped(meanings.get(name, ''))} |"
-        )
+        meaning = " ".join((config.model_fields[name].description or "").split())
+        cells = (cell.replace("|", "\\|") for cell in (f"`{name}`", values, default, meaning))
+        rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows)
 
 
-def option_meanings(config: type[ComponentConfig]) -> dict[str, str]:
-    """What the docstrings of `config` and its bases say of each option."""
-    found: dict[str, str] = {}
-    for base in config.__mro__:
-        text = joined(inspect.cleandoc(base.__doc__ or "").replace("\n\n", "\n"))
-        own: dict[str, str] = {}
-        names: list[str] = []
-        for line in text.splitlines():
-            for listed, meaning in entries(line, config.model_fields):
-                names = listed.split(", ") if listed else names
-                own |= {name: f"{own.get(name, '')} {meaning}".strip() for name in names}
-        found = own | found
-    return found
+def _yaml(value: Any) -> str:
+    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
 
 
-def in_yaml(text: str, config: type[ComponentConfig]) -> str:
-    """`text` of a docstring with Python's words for values of `config` as a recipe has them."""
-    for python, yaml in {"None": "null", "True": "true", "False": "false"}.items():
-        text = re.sub(rf"(?<![\w`]){python}(?![\w`])", f"`{yaml}`", text)
-    for word in _choices(config.model_json_schema()):
-        text = text.replace(f'"{word}"', f"`{word}`")
-    return text
-
-
-def _choices(schema: Any) -> set[str]:
-    """Every word that `schema` lets an option choose."""
+def _resolved(schema: Any, definitions: Mapping[str, Any]) -> Any:
+    """`schema` with what its references lead to in their place."""
     if isinstance(schema, list):
-        return {word for item in schema for word in _choices(item)}
+        return [_resolved(item, definitions) for item in schema]
     if not isinstance(schema, dict):
-        return set()
-    own = {value for value in schema.get("enum", ()) if isinstance(value, str)}
-    return own | {word for item in schema.values() for word in _choices(item)}
+        return schema
+    if "$ref" in schema:
+        return _resolved(definitions[schema["$ref"].rsplit("/", 1)[1]], definitions)
+    return {key: _resolved(item, definitions) for key, item in schema.items()}
 
 
 def values_of(schema: Mapping[str, Any]) -> str:
@@ -144,63 +95,6 @@ def values_of(schema: Mapping[str, Any]) -> str:
             return " ".join([words.get(str(kind), "true or false"), *_bounds(schema)])
 
 
-def _slot_section(slot: str, registry: Registry) -> str:
-    place = PLACES[slot]
-    assert slot_at(place) is SLOTS[slot]
-    default = f"Default: `{SLOTS[slot].default}`."
-    if slot == "losses":
-        listed = ", ".join(f"`{name}: {{type: {kind}}}`" for name, kind in DEFAULT_LOSSES.items())
-        default = f"Names are free. Default: {listed}."
-    elif slot == "data":
-        kind = SLOTS[slot].default
-        default = f"A recipe without `data` has none; `data` without a `type` is `{kind}`."
-    parts = [
-        f"## Slot `{'.'.join(place)}`",
-        "",
-        inspect.cleandoc(_contract_line(slot)),
-        "",
-        default,
-    ]
-    for name, component in registry.components(slot).items():
-        summary = in_yaml(_summary(component), component.Config)
-        parts += ["", f"### `{name}` {{ #{slot}-{name.replace('/', '-')} }}", "", summary, ""]
-        parts += [option_table(component.Config), "", *_fields_of(component)]
-    return "\n".join(parts) + "\n"
-
-
-def _summary(component: type[Component]) -> str:
-    """The docstring, but for paragraphs on attributes, which are no options."""
-    paragraphs = inspect.cleandoc(component.__doc__ or "").split("\n\n")
-    return "\n\n".join(text for text in paragraphs if not re.match(r"\w+: ", text))
-
-
-def _contract_line(slot: str) -> str:
-    return (SLOTS[slot].contract.__doc__ or "").split("\n\n")[0]
-
-
-def _fields_of(component: type[Component]) -> Iterator[str]:
-    if any(field.is_required() for field in component.Config.model_fields.values()):
-        return
-    config = component.Config()
-    for verb, fields in (
-        ("requires", component.requires(config)),
-        ("provides", component.provides(config)),
-    ):
-        if fields:
-            listed = ", ".join(f"`{name}` ({spec})" for name, spec in fields.items())
-            yield f"By default it {verb} {listed}.\n"
-
-
-def _resolved(schema: Any, definitions: Mapping[str, Any]) -> Any:
-    if isinstance(schema, list):
-        return [_resolved(item, definitions) for item in schema]
-    if not isinstance(schema, dict):
-        return schema
-    if "$ref" in schema:
-        return _resolved(definitions[schema["$ref"].rsplit("/", 1)[1]], definitions)
-    return {key: _resolved(item, definitions) for key, item in schema.items()}
-
-
 def _bounds(schema: Mapping[str, Any]) -> Iterator[str]:
     signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
     found = [f"{sign} {_bound(schema[key])}" for key, sign in signs.items() if key in schema]
@@ -213,12 +107,38 @@ def _bound(value: float) -> str:
     return f"2^{power}" if power > 30 and value == 2.0**power else f"{value:g}"
 
 
-def _yaml(value: Any) -> str:
-    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
+def _slot_section(slot: str, registry: Registry) -> str:
+    section = slots.SECTIONS.get(slot)
+    if section is None:
+        place = f"model.{slot}" if slot in slots.MODEL_SLOTS else f"model.decoder.{slot}"
+    else:
+        place = f"{slot}.NAME" if section.named else slot
+    default = f"There is none unless `{slot}` is written."
+    if SLOTS[slot].default:
+        default = f"Default: `{SLOTS[slot].default}`."
+    elif section and section.named:
+        listed = ", ".join(f"`{name}: {{type: {kind}}}`" for name, kind in section.defaults.items())
+        default = f"Names are free. Default: {listed}."
+        if section.defaults_stay:
+            default += " These stay beside what is written; `NAME: null` drops one."
+    contract = inspect.cleandoc(SLOTS[slot].contract.__doc__ or "").split("\n\n")[0]
+    parts = [f"## Slot `{place}`", contract, default]
+    for name, component in registry.components(slot).items():
+        parts.append(f"### `{name}` {{ #{slot}-{name.replace('/', '-')} }}")
+        paragraphs = inspect.cleandoc(component.__doc__ or "").split("\n\n")
+        parts += [text for text in paragraphs if not re.match(r"\w+: ", text)]  # no attributes
+        parts += [option_table(component.Config), *_fields_of(component)]
+    return "\n\n".join(parts) + "\n"
 
 
-def _escaped(cell: str) -> str:
-    return cell.replace("|", "\\|")
+def _fields_of(component: type[Component]) -> Iterator[str]:
+    if any(field.is_required() for field in component.Config.model_fields.values()):
+        return
+    config = component.Config()
+    for verb in ("requires", "provides"):
+        if fields := getattr(component, verb)(config):
+            listed = ", ".join(f"`{name}` ({spec})" for name, spec in fields.items())
+            yield f"By default it {verb} {listed}."
 
 
 if __name__ == "__main__":

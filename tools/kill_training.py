@@ -40,7 +40,7 @@ def recipe_of(width: int, steps: int, save_every: int) -> Recipe:
             "data.samples=1",
             "training.seconds=null",
             f"training.steps={steps}",
-            "training.warmup=2",
+            "optimizer.warmup=2",
             f"training.save_every={save_every}",
         ],
     )

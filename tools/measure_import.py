@@ -22,10 +22,9 @@ WRITE = """
 import sys, torch
 from safetensors.torch import save_file
 from qgs.composer import resolve
-from qgs.io.published import layout_of, names_in
+from qgs.io.published import names_of
 recipe = resolve(sys.argv[1])
-layout = layout_of(recipe)
-names = names_in(recipe, layout)
+names = names_of(recipe)
 tensors = {theirs: torch.randn(names.shapes[ours]) for ours, theirs in names.published.items()}
 tensors |= {name: torch.zeros(recipe.dims.width) for name in names.unused}
 if sys.argv[2].endswith(".pt"):

@@ -18,6 +18,7 @@ import sys
 from pathlib import Path
 
 import torch
+from process_memory import megabytes
 
 from qgs.composer import resolve
 from qgs.data.stream import training_batches
@@ -26,11 +27,10 @@ from qgs.engine.objective import Objective
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 SIDE = 256
 QUERIES, GAUSSIANS_PER_QUERY = 512, 64
-MIB = 2**20
 
 
 def step_memory(views: int, render_views: int, device: str) -> dict[str, float]:
-    """MiB before and at the peak of one forward and backward pass in this process."""
+    """MB before and at the peak of one forward and backward pass in this process."""
     recipe = resolve(
         RECIPE,
         [
@@ -59,22 +59,17 @@ def step_memory(views: int, render_views: int, device: str) -> dict[str, float]:
 
 
 def restart_peak(device: str) -> float:
-    """Forget the peak so far; MiB held now."""
+    """Forget the peak so far; MB held now."""
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
-        return torch.cuda.memory_allocated() / MIB
+        return torch.cuda.memory_allocated() / 1e6
     Path("/proc/self/clear_refs").write_text("5")
-    return _status("VmRSS")
+    return megabytes("VmRSS")
 
 
 def peak(device: str) -> float:
-    """MiB at the peak since `restart_peak`."""
-    return torch.cuda.max_memory_allocated() / MIB if device == "cuda" else _status("VmHWM")
-
-
-def _status(field: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(f"{field}:")) / 1024
+    """MB at the peak since `restart_peak`."""
+    return torch.cuda.max_memory_allocated() / 1e6 if device == "cuda" else megabytes("VmHWM")
 
 
 def in_own_process(views: int, render_views: int, device: str) -> dict[str, float]:
@@ -95,7 +90,7 @@ def main() -> None:
         views, render_views, device = options.alone
         print(json.dumps(step_memory(int(views), int(render_views), device)))
         return
-    print(f"{QUERIES * GAUSSIANS_PER_QUERY} Gaussians, {SIDE} x {SIDE} pixels, MiB")
+    print(f"{QUERIES * GAUSSIANS_PER_QUERY} Gaussians, {SIDE} x {SIDE} pixels, MB")
     for render_views in (0, options.render_views):
         found = [in_own_process(views, render_views, options.device) for views in options.views]
         for views, memory in zip(options.views, found, strict=True):

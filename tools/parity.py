@@ -3,10 +3,10 @@
     python tools/parity.py FILE…
 
 A file of a model: the model is composed from the options in the file's metadata, given the file's
-weights and run on its photos. A file of losses: the loss components are run on its tensors. Every
-tensor of the file is compared but inputs and weights, one row for each. Exit status 1 if any is
-beyond rtol 1e-4 + atol 5e-5, has no counterpart here, or cannot be computed. Options of the file
-that are unknown here are listed below its table.
+weights and run on its photos. A file of losses: the loss components are run on its tensors. All
+tensors of the file but inputs and weights are compared. Exit status 1 if one is beyond rtol 1e-4 +
+atol 5e-5, has no counterpart here, or cannot be computed. Options of the file that are unknown here
+are listed below its table.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from published.models import golden_tensors
 def rows_of(path: Path) -> list[Row]:
     """A row for every tensor of the file at `path` that is no input and no weight.
 
-    Raises ValueError for a file that says or holds something which cannot be computed here.
+    Raises ValueError for a file that cannot be computed here.
     """
     return compared(read_golden(path))
 

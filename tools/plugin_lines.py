@@ -1,4 +1,4 @@
-"""What the lines of a plugin are for: its mathematics, its options, or being a plugin.
+"""How many lines of a plugin are mathematics, options, declarations, registration or imports.
 
     python tools/plugin_lines.py plugins/ellipsoid/src
 
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 DECLARING = ("requires", "provides")
-LAYOUT = {
+NO_CODE = {
     tokenize.COMMENT,
     tokenize.NL,
     tokenize.NEWLINE,
@@ -31,7 +31,7 @@ LAYOUT = {
 def code_lines(source: str) -> set[int]:
     """Numbers of the lines that hold code."""
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    spans = [(t.start[0], t.end[0]) for t in tokens if t.type not in LAYOUT]
+    spans = [(t.start[0], t.end[0]) for t in tokens if t.type not in NO_CODE]
     lines = {line for first, last in spans for line in range(first, last + 1)}
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
@@ -72,7 +72,7 @@ def _of_component(node: ast.ClassDef) -> dict[int, str]:
 
 
 def _declares_state(node: ast.stmt) -> bool:
-    """Whether it names a field of the state, or says what such a field holds."""
+    """Whether it defines the name of a state field or its FieldSpec."""
     if isinstance(node, ast.Assign):
         return isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
     said = node.returns if isinstance(node, ast.FunctionDef) else None

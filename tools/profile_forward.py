@@ -18,7 +18,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from qgs.cli.options import parse_size
 from qgs.composer import resolve
-from qgs.engine.bench import workload_of
+from qgs.engine.bench.work import workload_of
 
 PRODUCTS = ("aten::addmm", "aten::mm", "aten::_scaled_dot_product_flash_attention_for_cpu")
 

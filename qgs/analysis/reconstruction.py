@@ -1,4 +1,4 @@
-"""Which frames of a photo folder are reconstructed from, and which are compared with."""
+"""Reconstruction of one scene: which frames, a camera path, scores, and the files written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from torch import Tensor
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
-    Picture,
     depth_picture,
     depth_range,
     finer,
@@ -31,6 +30,16 @@ from qgs.io.ply import write_ply
 from qgs.metrics import mean_colour, nearest_input, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering
+
+ORBIT_FRAMES = 48
+ORBIT_SIDE = 320
+FRAMES_PER_SECOND = 16
+OVERVIEW_COLUMNS = 8
+
+KINDS = ("input", "novel", "seen in training")
+"""A compared view of a folder that the model was trained on is novel if it was held out."""
+
+BASELINES = {"nearest input": nearest_input, "mean colour": mean_colour}
 
 
 def choose_frames(
@@ -52,21 +61,26 @@ def choose_frames(
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
     usable = [frame for frame in range(total) if frame not in held_out]
-    chosen = _middle(usable, inputs, max(span, inputs)) if frames is None else tuple(frames)
+    if frames is None:
+        if inputs > len(usable):
+            raise ValueError(
+                f"{inputs} input views were asked for, but there are {len(usable)} photos"
+            )
+        span = min(max(span, inputs), len(usable))
+        first = (len(usable) - span) // 2
+        frames = _evenly(usable[first : first + span], inputs)
     if compare is None:
-        between = [f for f in range(min(chosen), max(chosen) + 1) if f not in chosen]
+        between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
         compare = _evenly(between, min(novel, len(between)))
-    _check([*chosen, *compare], total)
-    return chosen, tuple(compare)
-
-
-def _middle(frames: Sequence[int], count: int, span: int) -> tuple[int, ...]:
-    if count > len(frames):
-        raise ValueError(f"{count} input views were asked for, but there are {len(frames)} photos")
-    span = min(span, len(frames))
-    first = (len(frames) - span) // 2
-    return _evenly(frames[first : first + span], count)
+    every = [*frames, *compare]
+    missing = [frame for frame in every if not 0 <= frame < total]
+    if missing:
+        raise ValueError(f"frames {missing} do not exist; the photos are 0..{total - 1}")
+    twice = sorted({frame for frame in every if every.count(frame) > 1})
+    if twice:
+        raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
+    return tuple(frames), tuple(compare)
 
 
 def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
@@ -76,13 +90,12 @@ def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
     return tuple(frames[int(place)] for place in places)
 
 
-def _check(frames: Sequence[int], total: int) -> None:
-    missing = [frame for frame in frames if not 0 <= frame < total]
-    if missing:
-        raise ValueError(f"frames {missing} do not exist; the photos are 0..{total - 1}")
-    twice = sorted({frame for frame in frames if list(frames).count(frame) > 1})
-    if twice:
-        raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
+def orbit_path(
+    inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
+) -> Cameras:
+    """`orbit` about the middle of the rendered `depths`, at least `side` pixels large."""
+    near, far = depth_range(depths)
+    return finer(orbit(inputs, (near + far) / 2, frames), side)
 
 
 def orbit(inputs: Cameras, depth: float, frames: int, sway: float = 0.12) -> Cameras:
@@ -92,15 +105,19 @@ def orbit(inputs: Cameras, depth: float, frames: int, sway: float = 0.12) -> Cam
     camera sways by `sway` times `depth`, and looks at what lies `depth` world units ahead.
     """
     angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
-    poses = _smoothed(inputs.c2w[0], (1 - angles.cos()) / 2)
-    right, down, forward, centre = poses[:, :3].unbind(-1)
-    focus = centre + depth * forward
+    count = inputs.shape[1]
+    # From 0, the first input, to count - 1, the last, and back.
+    times_T = (1 - angles.cos()) / 2 * (count - 1)
+    distances_TV = times_T[:, None] - torch.arange(count, device=times_T.device)
+    weights_TV = torch.softmax(-0.5 * (distances_TV / 0.6) ** 2, -1)
+    mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
+    _, down, forward, centre = mean[:, :3].unbind(-1)
+    right, down, forward, centre = look_at(centre, forward, down)[:, :3].unbind(-1)
     reach = sway * depth
     eye = centre + reach * angles.sin()[:, None] * right
     eye = eye - reach / 2 * angles.cos()[:, None] * down
-    c2w = look_at(eye, focus - eye, down)
-    intrinsics = inputs.intrinsics[:, :1].expand(1, frames, 4)
-    return Cameras(c2w[None], intrinsics, inputs.size)
+    c2w = look_at(eye, centre + depth * forward - eye, down)
+    return Cameras(c2w[None], inputs.intrinsics[:, :1].expand(1, frames, 4), inputs.size)
 
 
 def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
@@ -111,27 +128,6 @@ def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     top = torch.stack([right, down, forward, eye], -1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
-
-
-def _smoothed(c2w_V44: Tensor, times_T: Tensor) -> Tensor:
-    """Poses (T, 4, 4) at times from 0, the first input, to 1, the last."""
-    count = c2w_V44.shape[0]
-    steps = times_T[:, None] * (count - 1) - torch.arange(count, device=times_T.device)
-    weights_TV = torch.softmax(-0.5 * (steps / 0.6) ** 2, -1)
-    mean = torch.einsum("tv,vij->tij", weights_TV, c2w_V44)
-    _, down, forward, centre = mean[:, :3].unbind(-1)
-    return look_at(centre, forward, down)
-
-
-ORBIT_FRAMES = 48
-ORBIT_SIDE = 320
-FRAMES_PER_SECOND = 16
-OVERVIEW_COLUMNS = 8
-
-KINDS = ("input", "novel", "seen in training")
-"""A compared view of a folder that the model was trained on is novel if it was held out."""
-
-BASELINES = {"nearest input": nearest_input, "mean colour": mean_colour}
 
 
 @dataclass(frozen=True)
@@ -146,11 +142,6 @@ class ViewScore:
     kind: str
     psnr: float
     baselines: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def is_input(self) -> bool:
-        """Whether the model saw this photo as an input."""
-        return self.kind == "input"
 
 
 @dataclass(frozen=True)
@@ -185,28 +176,27 @@ def reconstruct(
     """
     gaussians: Gaussians = model(sample.inputs).gaussians if tuned is None else tuned
     rendering = model.render(gaussians, _cameras(sample))
-    photos = torch.cat([sample.inputs.images, sample.targets.images], 1)
-    quality = psnr(rendering.rgb[0], photos[0]).tolist()
-    inputs = len(sample.input_frames)
-    scores = [
-        ViewScore(frame, "input", value)
-        for frame, value in zip(sample.input_frames, quality[:inputs], strict=True)
-    ]
-    baselines = _baselines(sample)
-    for index, frame in enumerate(sample.target_frames):
-        kind = "seen in training" if frame in seen else "novel"
-        others = {name: values[index] for name, values in baselines.items()}
-        scores.append(ViewScore(frame, kind, quality[inputs + index], others))
-    return Reconstruction(sample, gaussians, rendering, scores, world, tuning)
-
-
-def _baselines(sample: Sample) -> dict[str, list[float]]:
-    """PSNR of each baseline on each target."""
     truth = sample.targets.images
-    return {
+    photos = torch.cat([sample.inputs.images, truth], 1)
+    quality = psnr(rendering.rgb[0], photos[0]).tolist()
+    baselines = {
         name: psnr(baseline(sample.inputs, sample.targets.cameras), truth)[0].tolist()
         for name, baseline in BASELINES.items()
     }
+    inputs = zip(sample.input_frames, quality, strict=False)
+    scores = [ViewScore(frame, "input", value) for frame, value in inputs]
+    for index, frame in enumerate(sample.target_frames):
+        kind = "seen in training" if frame in seen else "novel"
+        others = {name: values[index] for name, values in baselines.items()}
+        value = quality[len(sample.input_frames) + index]
+        scores.append(ViewScore(frame, kind, value, others))
+    return Reconstruction(sample, gaussians, rendering, scores, world, tuning)
+
+
+def _cameras(sample: Sample) -> Cameras:
+    a, b = sample.inputs.cameras, sample.targets.cameras
+    intrinsics = torch.cat([a.intrinsics, b.intrinsics], 1)
+    return Cameras(torch.cat([a.c2w, b.c2w], 1), intrinsics, a.size)
 
 
 def write_reconstruction(
@@ -218,10 +208,13 @@ def write_reconstruction(
     in which cameras.json tells the cameras, and how that world lies in the photos'. Earlier files
     and folders of these names are replaced, all at the end.
     """
+    path = orbit_path(reconstruction.sample.inputs.cameras, reconstruction.rendering.depth)
+    with torch.no_grad():
+        frames = model.render(reconstruction.gaussians, path).rgb[0]
     with replacing_entries(out) as fresh:
         write_ply(reconstruction.gaussians, fresh / "gaussians.ply")
         _write_views(reconstruction, fresh)
-        path = _write_orbit(model, reconstruction, fresh / "orbit.gif")
+        write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif", FRAMES_PER_SECOND)
         record = json.dumps(_camera_record(reconstruction, path), indent=1)
         write_text(fresh / "cameras.json", record)
         names = sorted(entry.name for entry in fresh.iterdir())
@@ -229,69 +222,29 @@ def write_reconstruction(
 
 
 def _write_views(reconstruction: Reconstruction, out: Path) -> None:
+    """Every view as a file, and an overview of at most OVERVIEW_COLUMNS: inputs stay longest."""
     sample, rendering = reconstruction.sample, reconstruction.rendering
-    photos = [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])]
-    renders = [rgb_picture(image) for image in rendering.rgb[0]]
+    scores, kinds = reconstruction.scores, [s.kind.split()[0] for s in reconstruction.scores]
     near, far = depth_range(rendering.depth)
-    depths = [depth_picture(depth, near, far) for depth in rendering.depth[0]]
-    for score, photo, render, depth in zip(
-        reconstruction.scores, photos, renders, depths, strict=True
-    ):
-        name = f"{score.frame:05d}_{score.kind.split()[0]}.png"
-        write_png(side_by_side([photo, render]), out / "views" / name)
-        write_png(depth, out / "depth" / name)
-    rows = {"photo": photos, "render": renders, "depth": depths}
-    overview = _overview(reconstruction.scores, rows, near, far)
+    rows = {
+        "photo": [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])],
+        "render": [rgb_picture(image) for image in rendering.rgb[0]],
+        "depth": [depth_picture(depth, near, far) for depth in rendering.depth[0]],
+    }
+    for i, (score, kind) in enumerate(zip(scores, kinds, strict=True)):
+        name = f"{score.frame:05d}_{kind}.png"
+        write_png(side_by_side([rows["photo"][i], rows["render"][i]]), out / "views" / name)
+        write_png(rows["depth"][i], out / "depth" / name)
+    shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
+    titles = [f"frame {scores[i].frame}, {kinds[i]}\n{scores[i].psnr:.1f} dB" for i in shown]
+    chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
+    overview = figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
     write_png(overview, out / "overview.png")
 
 
-def _overview(
-    scores: list[ViewScore], rows: dict[str, list[Picture]], near: float, far: float
-) -> Picture:
-    """At most OVERVIEW_COLUMNS views, the inputs last to be left out."""
-    shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
-    titles = [
-        f"frame {scores[i].frame}, {scores[i].kind.split()[0]}\n{scores[i].psnr:.1f} dB"
-        for i in shown
-    ]
-    chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
-    return figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
-
-
-def _write_orbit(model: QueryGaussianModel, reconstruction: Reconstruction, file: Path) -> Cameras:
-    path = orbit_path(reconstruction.sample.inputs.cameras, reconstruction.rendering.depth)
-    with torch.no_grad():
-        frames = model.render(reconstruction.gaussians, path).rgb[0]
-    write_gif([rgb_picture(frame) for frame in frames], file, FRAMES_PER_SECOND)
-    return path
-
-
-def orbit_path(
-    inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
-) -> Cameras:
-    """The loop of `qgs.analysis.reconstruction` about the middle of the rendered depths."""
-    near, far = depth_range(depths)
-    return finer(orbit(inputs, (near + far) / 2, frames), side)
-
-
-def _cameras(sample: Sample) -> Cameras:
-    a, b = sample.inputs.cameras, sample.targets.cameras
-    intrinsics = torch.cat([a.intrinsics, b.intrinsics], 1)
-    return Cameras(torch.cat([a.c2w, b.c2w], 1), intrinsics, a.size)
-
-
 def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, Any]:
-    cameras = _cameras(reconstruction.sample)
     reference, scale = reconstruction.world
-    views = [
-        {
-            "frame": s.frame,
-            "kind": s.kind,
-            "psnr": round(s.psnr, 3),
-            **_plain(cameras[:, [i]]),
-        }
-        for i, s in enumerate(reconstruction.scores)
-    ]
+    cameras = _plain(_cameras(reconstruction.sample))
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
@@ -301,14 +254,17 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
             "reference_c2w": reference.tolist(),
             "scale": float(scale),
         },
-        "views": views,
-        "orbit": [_plain(path[:, [i]]) for i in range(path.shape[1])],
+        "views": [
+            {"frame": s.frame, "kind": s.kind, "psnr": round(s.psnr, 3), **camera}
+            for s, camera in zip(reconstruction.scores, cameras, strict=True)
+        ],
+        "orbit": _plain(path),
     }
 
 
-def _plain(camera: Cameras) -> dict[str, Any]:
-    return {
-        "c2w": camera.c2w[0, 0].tolist(),
-        "intrinsics": camera.intrinsics[0, 0].tolist(),
-        "size": list(camera.size),
-    }
+def _plain(cameras: Cameras) -> list[dict[str, Any]]:
+    c2w, intrinsics = cameras.c2w[0].tolist(), cameras.intrinsics[0].tolist()
+    return [
+        {"c2w": pose, "intrinsics": lens, "size": list(cameras.size)}
+        for pose, lens in zip(c2w, intrinsics, strict=True)
+    ]

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from typing import Any
 
 import torch
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
 from torch import Tensor
 
 from qgs.analysis.reconstruction import orbit_path
 from qgs.analysis.trace import trace
+from qgs.contracts import Column
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
 from qgs.drawing.images import (
@@ -23,9 +21,10 @@ from qgs.drawing.images import (
     depth_range,
     enlarged,
     finer,
-    png_bytes,
+    png_uri,
     rgb_picture,
     side_by_side,
+    webp_uri,
 )
 from qgs.drawing.queries import (
     Token,
@@ -37,24 +36,20 @@ from qgs.drawing.queries import (
 )
 from qgs.metrics import psnr
 from qgs.model import QueryGaussianModel
-from qgs.types import Prediction, Rendering
+from qgs.types import Prediction
 
 
 @dataclass(frozen=True)
 class Contender:
     """A trained model and its figures.
 
-    psnr (dB) and ssim: means over unseen views. dispersion_mean, dispersion_median: distance of
-    Gaussians to their token's centroid, world units. gaussians: per scene. seconds: of training.
-    recipe: the resolved recipe as YAML.
+    scores: means over unseen scenes of `Report.columns`. gaussians: per scene. seconds: of
+    training. recipe: the resolved recipe as YAML.
     """
 
     name: str
     model: QueryGaussianModel
-    psnr: float
-    ssim: float
-    dispersion_mean: float
-    dispersion_median: float
+    scores: Mapping[str, float | None]
     gaussians: int
     parameters: int
     seconds: float
@@ -64,22 +59,23 @@ class Contender:
 
 @dataclass(frozen=True)
 class Baseline:
-    """What needs no model: its mean PSNR (dB) and SSIM on the same views."""
+    """What needs no model: its `Report.columns` on the same views."""
 
     name: str
-    psnr: float
-    ssim: float
+    scores: Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
 class Report:
     """A comparison.
 
-    contenders: in the order in which they are shown. samples: the unseen scenes to picture. depths:
-    for each of them the true depth (T, 1, H, W) of its targets in the model's units, where known.
-    facts: name to value, what was run where.
+    columns: name of each score to how it is shown. contenders: in the order in which they are
+    shown. samples: the unseen scenes to picture. depths: for each of them the true depth
+    (T, 1, H, W) of its targets in the model's units, where known. facts: name to value, what was
+    run where.
     """
 
+    columns: Mapping[str, Column]
     title: str
     contenders: Sequence[Contender]
     baselines: Sequence[Baseline]
@@ -94,146 +90,60 @@ SIDE = 256
 TOKENS = 5
 ANCHORS = 12
 ORBIT_FRAMES = 32
+TARGETS = 2
+"""Target views of each scene that are shown."""
 
 
 @dataclass(frozen=True)
-class Tile:
-    """A picture and its caption."""
+class Shown:
+    """A contender and what it predicts for the first sample, which most sections picture."""
 
-    picture: Picture
-    caption: str
+    contender: Contender
+    prediction: Prediction
+    sample: Sample
 
-
-@dataclass(frozen=True)
-class SceneGallery:
-    """One unseen scene: the inputs, and for each target view what `columns` say."""
-
-    name: str
-    inputs: list[Tile]
-    columns: list[str]
-    rows: list[list[Tile]]
+    @property
+    def model(self) -> QueryGaussianModel:
+        """The contender's."""
+        return self.contender.model
 
 
 @dataclass(frozen=True)
-class TokenGallery:
-    """Single tokens of one model in one view, and what stands out about each."""
+class Figure:
+    """A picture, or the frames of an animation. legend: tokens in it, in their colours."""
 
-    name: str
-    picture: Picture
-    tokens: list[Token]
+    image: Picture | list[Picture]
+    caption: str = ""
+    legend: Sequence[Token] = ()
 
 
-def scene_gallery(
-    sample: Sample,
-    predictions: Sequence[tuple[str, QueryGaussianModel, Prediction]],
-    depth: torch.Tensor | None = None,
-    targets: int = 2,
-) -> SceneGallery:
-    """Renders and depth beside truth for the first `targets` target views.
+@dataclass(frozen=True)
+class Section:
+    """A heading, a paragraph, and figures below the name of their model.
 
-    depth: the true one (T, 1, H, W), where it is known.
+    width: least width of a figure on the page, CSS pixels.
     """
-    shown = sample.targets.select(slice(targets))
-    renderings = [model.render(p.gaussians, shown.cameras) for _, model, p in predictions]
-    names = [name for name, _, _ in predictions]
-    depths = {f"{n}, depth": r.depth[0] for n, r in zip(names, renderings, strict=True)}
-    if depth is not None:
-        depths = {"Truth, depth": depth[:targets]} | depths
-    near, far = depth_range(torch.cat(list(depths.values())))
-    columns = [_photo_tiles(shown.images[0], sample.target_frames)]
-    columns += [_render_tiles(rendering, shown.images[0]) for rendering in renderings]
-    columns += [
-        [Tile(depth_picture(depth, near, far), "") for depth in column]
-        for column in depths.values()
-    ]
-    return SceneGallery(
-        name=sample.scene,
-        inputs=_photo_tiles(sample.inputs.images[0], sample.input_frames),
-        columns=["Truth", *names, *depths],
-        rows=[list(row) for row in zip(*columns, strict=True)],
-    )
 
-
-def _photo_tiles(images: torch.Tensor, frames: Sequence[int]) -> list[Tile]:
-    return [
-        Tile(rgb_picture(image), f"frame {frame}")
-        for image, frame in zip(images, frames, strict=False)
-    ]
-
-
-def _render_tiles(rendering: Rendering, truth: torch.Tensor) -> list[Tile]:
-    return [
-        Tile(rgb_picture(image), f"{float(psnr(image, target)):.1f} dB")
-        for image, target in zip(rendering.rgb[0], truth, strict=True)
-    ]
-
-
-def token_gallery(contender: Contender, prediction: Prediction, sample: Sample) -> TokenGallery:
-    """The most notable tokens of a model, seen from the first target view."""
-    cameras = finer(sample.targets.cameras[:, :1], SIDE)
-    tokens = notable_tokens(contender.model, prediction.gaussians, cameras, TOKENS)
-    picture = token_picture(contender.model, prediction.gaussians, tokens, cameras)
-    return TokenGallery(contender.name, picture, tokens)
-
-
-def anchor_tiles(contender: Contender, sample: Sample) -> list[Tile]:
-    """Supports on the first input view, before the decoder and after each layer.
-
-    Empty for queries without a place in space.
-    """
-    model = contender.model
-    start = model.queries(1)
-    if model.queries.support(start) is None:
-        return []
-    prediction = model(sample.inputs, layers=range(1, model.depth + 1))
-    camera = sample.inputs.cameras[:, :1]
-    tokens = notable_tokens(model, prediction.gaussians, camera, ANCHORS)
-    colors = {token.query: token.color for token in tokens}
-    photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE, smooth=True)
-    states = {"learned start": start} | {
-        f"after layer {number}": layer.state for number, layer in prediction.layers.items()
-    }
-    tiles = []
-    for caption, state in states.items():
-        support = model.queries.support(state)
-        assert support is not None
-        tiles.append(Tile(support_picture(photo, support, camera, colors), caption))
-    return tiles
-
-
-def attention_tiles(contender: Contender, prediction: Prediction, sample: Sample) -> list[Tile]:
-    """Where the heaviest token looks in the input views: content, geometry, both; mean of heads."""
-    model = contender.model
-    token = notable_tokens(model, prediction.gaussians, sample.targets.cameras[:, :1], 1)[0]
-    with trace(model, layers=[model.depth], queries=[token.query]) as record:
-        model(sample.inputs)
-    weights = record.layers[model.depth].cross_attention
-    if weights is None or record.grid is None:
-        return []
-    parts = {"content logits": weights.content, "geometry bias": weights.geometry}
-    parts["attention"] = weights.weights
-    photos = [
-        enlarged(rgb_picture(image), SIDE // 2, smooth=True) for image in sample.inputs.images[0]
-    ]
-    tiles = []
-    for caption, part in parts.items():
-        if part is not None:
-            maps = patch_maps(part[0, :, 0].mean(0), record.grid)
-            tiles.append(Tile(side_by_side(attention_pictures(photos, maps)), caption))
-    return tiles
-
-
-def orbit_frames(contender: Contender, prediction: Prediction, sample: Sample) -> list[Picture]:
-    """A loop past the input cameras, around what they see."""
-    model, cameras = contender.model, sample.inputs.cameras
-    depths = model.render(prediction.gaussians, cameras).depth
-    path = orbit_path(cameras, depths, ORBIT_FRAMES, SIDE)
-    return [rgb_picture(image) for image in model.render(prediction.gaussians, path).rgb[0]]
+    title: str
+    text: str
+    figures: Mapping[str, Sequence[Figure]]
+    width: int = 300
 
 
 @torch.no_grad()
 def report_html(report: Report) -> str:
     """The whole page; it needs no other file and no network."""
+    first = report.samples[0]
+    shown = [Shown(c, c.model(first.inputs), first) for c in report.contenders]
+    depths = zip(report.samples, report.depths, strict=True)
+    content: dict[str, Any] = {
+        "report": report,
+        "scenes": [scene_columns(report.contenders, sample, depth) for sample, depth in depths],
+        # A new section of figures: a function that returns a Section, and its name here.
+        "sections": [
+            section(shown) for section in (orbit, tokens, anchors, attention, training_curves)
+        ],
+    }
     environment = Environment(
         loader=PackageLoader("qgs.analysis", "template"),
         autoescape=True,
@@ -241,53 +151,150 @@ def report_html(report: Report) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(png=png_uri, animation=animation_uri, hex=hex_color)
-    return environment.get_template("report.html").render(_contents(report))
+    environment.filters.update(uri=_uri, hex=hex_color)
+    return environment.get_template("report.html").render(content)
 
 
-def _contents(report: Report) -> dict[str, Any]:
-    first = report.samples[0]
-    predictions = [
-        [(c.name, c.model, c.model(sample.inputs)) for c in report.contenders]
-        for sample in report.samples
-    ]
-    of_first = {name: prediction for name, _, prediction in predictions[0]}
-    curves = {contender.name: contender.curves for contender in report.contenders}
-    return {
-        "report": report,
-        "scenes": [
-            scene_gallery(sample, of_sample, depth)
-            for sample, of_sample, depth in zip(
-                report.samples, predictions, report.depths, strict=True
-            )
-        ],
-        "tokens": [token_gallery(c, of_first[c.name], first) for c in report.contenders],
-        "anchors": {c.name: anchor_tiles(c, first) for c in report.contenders},
-        "attention": {
-            c.name: attention_tiles(c, of_first[c.name], first) for c in report.contenders
-        },
-        "orbits": {c.name: orbit_frames(c, of_first[c.name], first) for c in report.contenders},
-        "curves": figure_picture(curves_figure(curves), dpi=144),
-    }
+def _uri(image: Picture | list[Picture]) -> str:
+    return webp_uri(image) if isinstance(image, list) else png_uri(image)
 
 
-def png_uri(picture: Picture) -> str:
-    """A picture as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(png_bytes(picture)).decode()
+def scene_columns(
+    contenders: Sequence[Contender], sample: Sample, depth: Tensor | None
+) -> dict[str, Any]:
+    """Of one unseen scene the name, the input photos, and by heading: truth, renders, depths.
+
+    depth: the true one (T, 1, H, W), where it is known.
+    """
+    shown = sample.targets.select(slice(TARGETS))
+    frames = [f"frame {frame}" for frame in (*sample.input_frames, *sample.target_frames)]
+    inputs = len(sample.input_frames)
+    truth = shown.images[0]
+    columns = {"Truth": _photos(truth, frames[inputs:])}
+    depths = {} if depth is None else {"Truth, depth": depth[:TARGETS]}
+    for contender in contenders:
+        gaussians = contender.model(sample.inputs).gaussians
+        rendering = contender.model.render(gaussians, shown.cameras)
+        quality = [
+            f"{float(psnr(*pair)):.1f} dB" for pair in zip(rendering.rgb[0], truth, strict=True)
+        ]
+        columns[contender.name] = _photos(rendering.rgb[0], quality)
+        depths[f"{contender.name}, depth"] = rendering.depth[0]
+    near, far = depth_range(torch.cat(list(depths.values())))
+    for name, maps in depths.items():
+        columns[name] = [Figure(depth_picture(depth, near, far)) for depth in maps]
+    photos = _photos(sample.inputs.images[0], frames[:inputs])
+    return {"name": sample.scene, "inputs": photos, "columns": columns}
 
 
-def animation_uri(frames: list[Picture], milliseconds: int = 90) -> str:
-    """Frames as an endless animated WebP data URI."""
-    buffer = BytesIO()
-    first, *rest = [Image.fromarray(frame) for frame in frames]
-    first.save(
-        buffer,
-        format="WEBP",
-        save_all=True,
-        append_images=rest,
-        duration=milliseconds,
-        loop=0,
-        quality=80,
-        method=2,
+def _photos(images: Tensor, captions: Sequence[str]) -> list[Figure]:
+    return [Figure(rgb_picture(i), caption) for i, caption in zip(images, captions, strict=False)]
+
+
+def orbit(shown: Sequence[Shown]) -> Section:
+    """A loop past the input cameras, around what they see."""
+    figures = []
+    for one in shown:
+        cameras, gaussians = one.sample.inputs.cameras, one.prediction.gaussians
+        depths = one.model.render(gaussians, cameras).depth
+        path = orbit_path(cameras, depths, ORBIT_FRAMES, SIDE)
+        frames = [rgb_picture(image) for image in one.model.render(gaussians, path).rgb[0]]
+        figures.append(Figure(frames, one.contender.name))
+    return Section(
+        "A walk through the reconstruction",
+        "The first scene above from a loop past its input cameras. Nothing here is a photo.",
+        {"": figures},
     )
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def tokens(shown: Sequence[Shown]) -> Section:
+    """The most notable tokens of each model, seen from the first target view."""
+    figures = []
+    for one in shown:
+        cameras = finer(one.sample.targets.cameras[:, :1], SIDE)
+        chosen = notable_tokens(one.model, one.prediction.gaussians, cameras, TOKENS)
+        picture = token_picture(one.model, one.prediction.gaussians, chosen, cameras)
+        figures.append(Figure(picture, one.contender.name, chosen))
+    return Section(
+        "What single tokens stand for",
+        "All Gaussians of five tokens in colour, over the scene in grey. Lines lead from each "
+        "Gaussian to the centroid of its token. The tokens are the heaviest in this view that also "
+        "stand apart from each other.",
+        {"": figures},
+    )
+
+
+def anchors(shown: Sequence[Shown]) -> Section:
+    """Supports on the first input view, before the decoder and after each layer.
+
+    Queries without a place in space have none.
+    """
+    figures: dict[str, list[Figure]] = {}
+    for one in shown:
+        model, inputs = one.model, one.sample.inputs
+        prediction = model(inputs, layers=range(1, model.depth + 1))
+        camera = inputs.cameras[:, :1]
+        chosen = notable_tokens(model, prediction.gaussians, camera, ANCHORS)
+        colors = {token.query: token.color for token in chosen}
+        photo = enlarged(rgb_picture(inputs.images[0, 0]), SIDE, smooth=True)
+        states = {"learned start": model.queries(1)} | {
+            f"after layer {number}": layer.state for number, layer in prediction.layers.items()
+        }
+        for caption, state in states.items():
+            support = model.queries.support(state)
+            if support is not None:
+                picture = support_picture(photo, support, camera, colors)
+                figures.setdefault(one.contender.name, []).append(Figure(picture, caption))
+    return Section(
+        "Where queries look",
+        "Every query’s anchor on the first input view, as a dot; twelve that matter to this view "
+        "with their support, where all of it lies before the camera. Photos move the anchors from "
+        "their learned start, the same for every scene, layer by layer.",
+        figures,
+        width=180,
+    )
+
+
+def attention(shown: Sequence[Shown]) -> Section:
+    """Where the heaviest token looks in the input views: content, geometry, both; mean of heads."""
+    figures: dict[str, list[Figure]] = {}
+    for one in shown:
+        model, sample = one.model, one.sample
+        view = sample.targets.cameras[:, :1]
+        (token,) = notable_tokens(model, one.prediction.gaussians, view, 1)
+        with trace(model, layers=[model.depth], queries=[token.query]) as record:
+            model(sample.inputs)
+        weights = record.layers[model.depth].cross_attention
+        if weights is None or record.grid is None:
+            continue
+        parts = {"content logits": weights.content, "geometry bias": weights.geometry}
+        parts["attention"] = weights.weights
+        photos = [
+            enlarged(rgb_picture(image), SIDE // 2, smooth=True)
+            for image in sample.inputs.images[0]
+        ]
+        figures[one.contender.name] = [
+            Figure(
+                side_by_side(
+                    attention_pictures(photos, patch_maps(part[0, :, 0].mean(0), record.grid))
+                ),
+                caption,
+            )
+            for caption, part in parts.items()
+            if part is not None
+        ]
+    return Section(
+        "What one query reads",
+        "Cross-attention of the heaviest token over the patches of both input views in the last "
+        "layer, averaged over heads, dark to bright within each picture. A geometry bias, where "
+        "there is one, is added to the content logits before the softmax.",
+        figures,
+        width=240,
+    )
+
+
+def training_curves(shown: Sequence[Shown]) -> Section:
+    """Loss and PSNR against seconds for every model."""
+    curves = {one.contender.name: one.contender.curves for one in shown}
+    picture = figure_picture(curves_figure(curves), dpi=144)
+    return Section("Training", "", {"": [Figure(picture)]}, width=600)

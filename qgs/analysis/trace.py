@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils.hooks import RemovableHandle
 
 from qgs.contracts import AttentionWeights, CrossAttention, SelfAttention
 from qgs.model import DecoderLayer, QueryGaussianModel
-from qgs.types import ImageMemory, QueryState
+from qgs.types import ImageMemory, QueryState, map_tensors
 
 
 @dataclass
@@ -64,7 +66,8 @@ def trace(
     indices = _checked(queries, range(model.queries.count), "queries")
     record = Trace(torch.tensor(indices, dtype=torch.long))
     with ExitStack() as hooks:
-        _Recorder(model, record, set(layers)).attach(hooks)
+        for handle in _Recorder(record, layers).hook_into(model):
+            hooks.callback(handle.remove)
         yield record
 
 
@@ -82,69 +85,47 @@ def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list
 class _Recorder:
     """The hooks of one `trace` block. Layers run in order, so refinements may share a module."""
 
-    def __init__(self, model: QueryGaussianModel, record: Trace, layers: set[int]) -> None:
-        self.model = model
+    def __init__(self, record: Trace, layers: Collection[int]) -> None:
         self.record = record
-        self.wanted = layers
+        self.layers = layers
         self.current = 0
 
-    def attach(self, stack: ExitStack) -> None:
-        def hook(handle: torch.utils.hooks.RemovableHandle) -> None:
-            stack.callback(handle.remove)
-
-        hook(self.model.register_forward_pre_hook(self._start))
-        for number, layer in enumerate(self.model.decoder, start=1):
+    def hook_into(self, model: QueryGaussianModel) -> Iterator[RemovableHandle]:
+        """Register the hooks, each when asked for the next one."""
+        yield model.register_forward_pre_hook(self._start)
+        for number, layer in enumerate(model.decoder, start=1):
             assert isinstance(layer, DecoderLayer)
-            hook(layer.register_forward_pre_hook(self._entering(number)))
-            if number in self.wanted:
-                hook(layer.cross_attention.register_forward_pre_hook(self._cross))
-                hook(layer.self_attention.register_forward_pre_hook(self._self))
-        for refinement in self.model.refinements:
-            hook(refinement.register_forward_hook(self._refined))
+            yield layer.register_forward_pre_hook(partial(self._enter, number))
+            if number in self.layers:
+                for part in ("cross_attention", "self_attention"):
+                    hook = partial(self._explain, part)
+                    yield getattr(layer, part).register_forward_pre_hook(hook)
+        for refinement in model.refinements:
+            yield refinement.register_forward_hook(self._leave)
 
     def _start(self, module: nn.Module, args: Any) -> None:
         self.record.layers.clear()
         self.record.grid = None
 
-    def _entering(self, number: int) -> Any:
-        def enter(module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-            state, memory = args
-            self.current = number
-            self.record.grid = memory.grid
-            if number in self.wanted:
-                self.record.layers[number] = LayerTrace(before=self._chosen(state))
-
-        return enter
+    def _enter(self, number: int, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
+        state, memory = args
+        self.current = number
+        self.record.grid = memory.grid
+        if number in self.layers:
+            self.record.layers[number] = LayerTrace(before=self._chosen(state))
 
     @torch.no_grad()
-    def _cross(self, module: CrossAttention, args: tuple[QueryState, ImageMemory]) -> None:
+    def _explain(self, part: str, module: CrossAttention | SelfAttention, args: Any) -> None:
         layer = self.record.layers[self.current]
-        layer.cross_attention = module.explain(*args, self._indices(args[0]))
-        self._note_absence(layer, "cross_attention", module, layer.cross_attention)
+        weights = module.explain(*args, self.record.queries.to(args[0].features.device))
+        setattr(layer, part, weights)
+        if weights is None:
+            layer.absent[part] = f"{type(module).__name__}.explain tells nothing (returned None)"
 
-    @torch.no_grad()
-    def _self(self, module: SelfAttention, args: tuple[QueryState]) -> None:
-        layer = self.record.layers[self.current]
-        layer.self_attention = module.explain(*args, self._indices(args[0]))
-        self._note_absence(layer, "self_attention", module, layer.self_attention)
-
-    def _refined(self, module: nn.Module, args: Any, state: QueryState) -> None:
-        if self.current in self.wanted:
+    def _leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
+        if self.current in self.layers:
             self.record.layers[self.current].after = self._chosen(state)
 
     def _chosen(self, state: QueryState) -> QueryState:
-        index = self._indices(state)
-        return QueryState(
-            state.features.detach()[:, index],
-            {name: value.detach()[:, index] for name, value in state.fields.items()},
-        )
-
-    def _indices(self, state: QueryState) -> Tensor:
-        return self.record.queries.to(state.features.device)
-
-    @staticmethod
-    def _note_absence(
-        layer: LayerTrace, part: str, module: nn.Module, weights: AttentionWeights | None
-    ) -> None:
-        if weights is None:
-            layer.absent[part] = f"{type(module).__name__}.explain tells nothing (returned None)"
+        index = self.record.queries.to(state.features.device)
+        return map_tensors(lambda tensor: tensor.detach()[:, index], state)

@@ -1,4 +1,4 @@
-"""The `qgs` command. Groups of commands register themselves; heavy imports wait for a command."""
+"""The `qgs` command; heavy imports wait until one of its commands runs."""
 
 from __future__ import annotations
 
@@ -29,10 +29,23 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_RECIPES = (inspect, train, evaluate, reconstruct, weights, bench, demo)
-_PLUGINS = (new_plugin, check_plugin)
-for _group in (*_RECIPES, *_PLUGINS):
-    _group.register(app)
+COMMANDS = {
+    "list": inspect.list_components,
+    "compose": inspect.compose,
+    "diff": inspect.diff,
+    "schema": inspect.schema,
+    "train": train.train,
+    "eval": evaluate.evaluate,
+    "reconstruct": reconstruct.reconstruct,
+    "import": weights.import_,
+    "export": weights.export,
+    "bench": bench.bench,
+    "demo": demo.demo,
+    "new-plugin": new_plugin.new_plugin,
+    "check-plugin": check_plugin.check_plugin,
+}
+for _name, _command in COMMANDS.items():
+    app.command(_name)(_command)
 
 
 def main() -> None:
@@ -43,24 +56,16 @@ def main() -> None:
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
-        if not _is_a_users_mistake(error):
+        if os.environ.get("QGS_DEBUG") or not _is_users_mistake(error):
             raise
-        if os.environ.get("QGS_DEBUG"):
-            raise
-        for line in (f"error: {error}", *_notes(error)):
+        # A note of several lines is the traceback of another process.
+        notes = [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
+        for line in (f"error: {error}", *notes, "(QGS_DEBUG=1 shows where it was raised)"):
             print(line, file=sys.stderr)
-        print("(QGS_DEBUG=1 shows where it was raised)", file=sys.stderr)
         raise SystemExit(2) from None
 
 
-def _notes(error: Exception) -> list[str]:
-    """What was added to the message, but for traces of other processes."""
-    return [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
-
-
-def _is_a_users_mistake(error: Exception) -> bool:
-    if not isinstance(error, RuntimeError):
-        return True
+def _is_users_mistake(error: Exception) -> bool:
     from qgs.contracts.component import MissingExtraError
 
-    return isinstance(error, MissingExtraError)
+    return isinstance(error, MissingExtraError) or not isinstance(error, RuntimeError)

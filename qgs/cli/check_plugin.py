@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from qgs.testing import Outcome
+    from qgs.testing import CheckResult
 
 
 def register(app: typer.Typer) -> None:
@@ -31,7 +31,7 @@ def check_plugin(
     from rich.console import Console
 
     from qgs.composer.registry import load_plugin
-    from qgs.testing import check_plugin as outcomes_of
+    from qgs.testing import check_plugin as results_of
     from qgs.testing.plugins import without_case
     from qgs.testing.registry import TIERS
 
@@ -42,55 +42,55 @@ def check_plugin(
         f"plugin {name} of {installed.released_as}, contract version "
         f"{installed.plugin.contract_version}"
     )
-    outcomes: list[Outcome] = []
-    made = outcomes_of(name, ("core",) if core else TIERS)
-    for _, group in groupby(made, key=lambda outcome: id(outcome.case)):
+    results: list[CheckResult] = []
+    made = results_of(name, ("core",) if core else TIERS)
+    for _, group in groupby(made, key=lambda result: id(result.case)):
         of_case = list(group)
         _summarise(console, of_case)
-        outcomes += of_case
+        results += of_case
     unchecked = without_case(installed)
     for component, why in unchecked.items():
         label = f"{component.slot}/{component.name}"
         fix = "list a Config of it in `examples` of the Plugin"
         console.print(f"not checked: {label}: {why}; {fix}")
-    console.print(_total(outcomes))
-    if unchecked or any(outcome.leaves_unchecked or not outcome.ok for outcome in outcomes):
+    console.print(_total(results))
+    if unchecked or any(result.leaves_unchecked or not result.ok for result in results):
         raise SystemExit(1)
 
 
-def _summarise(console: Console, outcomes: list[Outcome]) -> None:
-    """One line for a case, and what is to be known of each check that did not simply pass."""
-    good = all(outcome.ok for outcome in outcomes)
-    unchecked = any(outcome.leaves_unchecked for outcome in outcomes)
+def _summarise(console: Console, results: list[CheckResult]) -> None:
+    """One line for a case, and a line for each check that did not simply pass."""
+    good = all(result.ok for result in results)
+    unchecked = any(result.leaves_unchecked for result in results)
     verdict = "FAILED" if not good else "not checked" if unchecked else "ok    "
-    passed = sum(outcome.verdict == "passed" for outcome in outcomes)
-    label = outcomes[0].case.label
-    console.print(f"{verdict} {label}: {passed} of {len(outcomes)} pass")
-    for outcome in outcomes:
-        if outcome.verdict == "expected failure":
-            console.print(f"  expected to fail: {outcome.check.name}: {outcome.message}")
-        elif not outcome.ok:
-            console.print("\n".join(f"  {line}" for line in outcome.message.splitlines()))
-    skipped = [outcome for outcome in outcomes if outcome.verdict == "skipped"]
-    for reason in dict.fromkeys(outcome.message for outcome in skipped):
-        alike = [outcome for outcome in skipped if outcome.message == reason]
-        names = ", ".join(outcome.check.name for outcome in alike)
-        many = alike[0].cause or any(outcome.leaves_unchecked for outcome in alike)
+    passed = sum(result.verdict == "passed" for result in results)
+    label = results[0].case.label
+    console.print(f"{verdict} {label}: {passed} of {len(results)} pass")
+    for result in results:
+        if result.verdict == "expected failure":
+            console.print(f"  expected to fail: {result.check.name}: {result.message}")
+        elif not result.ok:
+            console.print("\n".join(f"  {line}" for line in result.message.splitlines()))
+    skipped = [result for result in results if result.verdict == "skipped"]
+    for reason in dict.fromkeys(result.message for result in skipped):
+        alike = [result for result in skipped if result.message == reason]
+        names = ", ".join(result.check.name for result in alike)
+        many = alike[0].cause or any(result.leaves_unchecked for result in alike)
         console.print(f"  skipped: {f'{len(alike)} checks' if many else names}: {reason}")
 
 
-def _total(outcomes: list[Outcome]) -> str:
+def _total(results: list[CheckResult]) -> str:
     counts = {
-        "failed": sum(not outcome.ok for outcome in outcomes),
-        "expected to fail": sum(outcome.verdict == "expected failure" for outcome in outcomes),
-        "skipped": sum(outcome.verdict == "skipped" for outcome in outcomes),
+        "failed": sum(not result.ok for result in results),
+        "expected to fail": sum(result.verdict == "expected failure" for result in results),
+        "skipped": sum(result.verdict == "skipped" for result in results),
     }
-    unchecked = {o.case.label for o in outcomes if o.leaves_unchecked}
+    unchecked = {o.case.label for o in results if o.leaves_unchecked}
     if unchecked:
         counts["not checked"] = len(unchecked)
-    components = len({outcome.case.component for outcome in outcomes})
-    told = ", ".join(f"{count} {what}" for what, count in counts.items())
-    return f"{_count(components, 'component')}, {_count(len(outcomes), 'check')}, {told}"
+    components = len({result.case.component for result in results})
+    summary = ", ".join(f"{count} {what}" for what, count in counts.items())
+    return f"{_count(components, 'component')}, {_count(len(results), 'check')}, {summary}"
 
 
 def _count(number: int, what: str) -> str:

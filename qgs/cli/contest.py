@@ -12,21 +12,16 @@ import torch
 import yaml
 from rich import box
 from rich.table import Table
-from torch import Tensor
 
 from qgs.analysis.report import Baseline, Contender, Report
 from qgs.composer import Recipe, resolve
-from qgs.contracts import SceneSource
-from qgs.data.evaluation import evaluation_samples
-from qgs.data.sampling import Sample
+from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
 from qgs.engine import Evaluation, RunFolder, evaluate, train
 from qgs.io.ply import write_ply
 
-SAME = ("data", "views", "evaluation", "training")
+SAME = ("data", "views", "evaluation", "metrics", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
-
-NO_STEP_LIMIT = 1_000_000_000
 
 
 class StoppedError(Exception):
@@ -47,11 +42,7 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 
     Raises ValueError when two files share a name, or differ in anything but the model and losses.
     """
-    overrides = [
-        f"training.seconds={seconds}",
-        f"training.steps={NO_STEP_LIMIT}",
-        f"seed={seed}",
-    ]
+    overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
     recipes = {file.stem: resolve(file, overrides) for file in files}
     if len(recipes) < len(files):
         raise ValueError(f"recipes are told apart by file name, got {[f.name for f in files]}")
@@ -73,14 +64,10 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
         raise StoppedError(result.stopped_by)
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
-    dispersion = evaluation.summary()["dispersion_over_gaussians"]
     contender = Contender(
         name=name,
         model=result.model.cpu(),
-        psnr=mean_of(evaluation, "psnr"),
-        ssim=mean_of(evaluation, "ssim"),
-        dispersion_mean=dispersion["mean"]["mean"],
-        dispersion_median=dispersion["median"]["median"],
+        scores=evaluation.means(),
         gaussians=evaluation.gaussians,
         parameters=sum(p.numel() for p in result.model.parameters()),
         seconds=result.seconds,
@@ -98,58 +85,41 @@ def curves_of(folder: RunFolder) -> Curves:
     return Curves(*([record[name] for record in history] for name in names))
 
 
-def mean_of(evaluation: Evaluation, metric: str, method: str = "model") -> float:
-    """The mean over scenes. Raises ValueError for a metric that these images do not have."""
-    value = evaluation.mean(metric, method)
-    if value is None:
-        raise ValueError(
-            f"a contest compares {metric}, which is empty here ({evaluation.empty[metric]}): raise "
-            "data.image_size"
-        )
-    return value
-
-
 def baselines(entry: Entry) -> list[Baseline]:
     """What needs no model, on the views that `entry` was judged on."""
-    return [
-        Baseline(
-            name, mean_of(entry.evaluation, "psnr", key), mean_of(entry.evaluation, "ssim", key)
-        )
-        for name, key in (("Nearest input", "nearest_input"), ("Mean colour", "mean_colour"))
-    ]
+    named = (("Nearest input", "nearest_input"), ("Mean colour", "mean_colour"))
+    return [Baseline(name, entry.evaluation.means(method)) for name, method in named]
 
 
 def table_of(entries: Sequence[Entry]) -> Table:
     """The comparison as a table for the terminal."""
     rows = [entry.contender for entry in entries]
-    caption = "median, mean: token dispersion in world units; best in green"
+    columns = entries[0].evaluation.columns
     table = Table(
         title="Unseen scenes",
-        caption=caption,
+        caption="best in green",
         box=box.SIMPLE_HEAD,
         collapse_padding=True,
         pad_edge=False,
     )
     table.add_column("", no_wrap=True)
-    for column in ("PSNR", "SSIM", "median", "mean", "Gaussians", "parameters", "seconds"):
-        table.add_column(column, justify="right", no_wrap=True)
-    best = (
-        max(c.psnr for c in rows),
-        max(c.ssim for c in rows),
-        min(c.dispersion_median for c in rows),
-        min(c.dispersion_mean for c in rows),
-    )
+    headings = [column.title for column in columns.values()]
+    for heading in (*headings, "Gaussians", "parameters", "seconds"):
+        table.add_column(heading, justify="right")
+    best = {name: column.best(c.scores[name] for c in rows) for name, column in columns.items()}
     for c in rows:
-        scores = (c.psnr, c.ssim, c.dispersion_median, c.dispersion_mean)
         cells = [
-            f"[green]{value:.{digits}f}[/green]" if value == top else f"{value:.{digits}f}"
-            for value, top, digits in zip(scores, best, (2, 3, 3, 3), strict=True)
+            f"[green]{column.shown(c.scores[name])}[/green]"
+            if c.scores[name] is not None and c.scores[name] == best[name]
+            else column.shown(c.scores[name])
+            for name, column in columns.items()
         ]
         cells += [f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}"]
         table.add_row(c.name, *cells)
     table.add_section()
     for b in baselines(entries[0]):
-        table.add_row(b.name, f"{b.psnr:.2f}", f"{b.ssim:.3f}", *["–"] * 5, style="dim")
+        cells = [column.shown(b.scores[name]) for name, column in columns.items()]
+        table.add_row(b.name, *cells, *["–"] * 3, style="dim")
     return table
 
 
@@ -164,6 +134,7 @@ def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
     samples = evaluation_samples(source, recipe.views, few)[:PICTURED_SCENES]
     names = [entry.contender.name for entry in entries]
     return Report(
+        columns=entries[0].evaluation.columns,
         title=" and ".join(names) + f", {seconds:g} seconds of training each",
         contenders=[entry.contender for entry in entries],
         baselines=baselines(entries[0]),
@@ -171,22 +142,6 @@ def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
         depths=[true_depth(source, sample) for sample in samples],
         facts=_facts([entry.recipe for entry in entries], seconds, seed),
     )
-
-
-def true_depth(source: SceneSource, sample: Sample) -> Tensor | None:
-    """Depth (T, 1, H, W) of the targets in the sample's units; None where the scene has none."""
-    scene = next(scene for scene in source.scenes("test") if scene.name == sample.scene)
-    depth = scene.depths(sample.target_frames)
-    if depth is None:
-        return None
-    frames = [sample.input_frames[0], *sample.target_frames]
-    own = scene.cameras[frames].c2w[:, :3, 3]
-    cameras = sample.inputs.cameras.c2w[0, :1], sample.targets.cameras.c2w[0]
-    return depth * float(_extent(torch.cat(cameras)[:, :3, 3]) / _extent(own))
-
-
-def _extent(centres: Tensor) -> Tensor:
-    return (centres - centres[0]).norm(dim=-1).amax()
 
 
 @torch.no_grad()
@@ -202,16 +157,13 @@ def _facts(recipes: Sequence[Recipe], seconds: float, seed: int) -> dict[str, st
     height, width = data["image_size"]
     plugins = {name: version for r in recipes for name, version in r.plugin_versions.items()}
     versions = [f"{name} {version}" for name, version in plugins.items()]
+    device = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
+    if torch.cuda.is_available():
+        device = torch.cuda.get_device_name()
     return {
         "Data": f"{data['type']}, {width} × {height} pixels",
         "Views": f"{views.inputs} inputs, judged on the views between them",
         "Budget": f"{seconds:g} seconds of training each, seed {seed}",
-        "Machine": f"{_device()}, {torch.get_num_threads()} threads, {platform.system()}",
+        "Machine": f"{device}, {torch.get_num_threads()} threads, {platform.system()}",
         "Software": ", ".join([f"torch {torch.__version__}", *versions]),
     }
-
-
-def _device() -> str:
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return f"CPU with {os.cpu_count()} cores ({platform.machine()})"

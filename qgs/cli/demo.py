@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from qgs.cli.options import Device
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from qgs.cli.contest import Entry
-
 DEFAULT_RECIPES = ("tokengs.yaml", "locus.yaml")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("demo")(demo)
 
 
 def demo(
@@ -42,39 +33,34 @@ def demo(
     files = recipes or default_recipes(folder)
     target = new_folder(out)
 
-    from rich.console import Console
-
     from qgs.analysis.report import report_html
-    from qgs.cli.contest import (
-        StoppedError,
-        compete,
-        report_of,
-        resolve_fairly,
-        table_of,
-        write_examples,
-    )
+    from qgs.cli import contest
     from qgs.engine import TrainingError
     from qgs.io.files import write_text
 
     console = Console()
-    resolved = resolve_fairly(files, seconds, seed)
+    resolved = contest.resolve_fairly(files, seconds, seed)
     entries = []
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
         try:
-            entries.append(compete(name, recipe, target / name, device))
-        except StoppedError as stop:
+            entries.append(contest.compete(name, recipe, target / name, device))
+        except contest.StoppedError as stop:
             typer.echo(f"stopped by {stop}; no report", err=True)
             raise typer.Exit(128 + signal.Signals[str(stop)]) from None
         except TrainingError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
-    console.print(table_of(entries))
+    console.print(contest.table_of(entries))
     console.print("Writing the report", style="dim")
-    report = report_of(entries, seconds, seed)
-    write_text(target / "report.html", report_html(report))
-    write_examples(report, target)
-    _say_where(console, target, entries)
+    report = contest.report_of(entries, seconds, seed)
+    page = target / "report.html"
+    write_text(page, report_html(report))
+    contest.write_examples(report, target)
+    console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)
+    for entry in entries:
+        run = target / entry.contender.name
+        console.print(f"{run.name}: {run}/checkpoint.safetensors, {run}/example.ply")
 
 
 def default_recipes(folder: Path | None) -> list[Path]:
@@ -90,7 +76,7 @@ def default_recipes(folder: Path | None) -> list[Path]:
         files = [place / name for name in DEFAULT_RECIPES]
         if all(file.is_file() for file in files):
             return files
-    looked = ", ".join(str(place) for place in places)
+    looked = ", ".join(map(str, places))
     raise FileNotFoundError(
         f"found no {' and '.join(DEFAULT_RECIPES)} in {looked}; run this in a clone of the "
         "repository, or give --recipe-folder FOLDER or the recipe files themselves"
@@ -100,17 +86,8 @@ def default_recipes(folder: Path | None) -> list[Path]:
 def new_folder(out: Path | None) -> Path:
     """`out`, refused when it holds anything; None takes the first of demo, demo-2, ... not used."""
     if out is None:
-        number, out = 1, Path("demo")
-        while out.exists():
-            number += 1
-            out = Path(f"demo-{number}")
+        names = (Path("demo" if number == 1 else f"demo-{number}") for number in count(1))
+        return next(name for name in names if not name.exists())
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")
     return out
-
-
-def _say_where(console: Console, target: Path, entries: Sequence[Entry]) -> None:
-    console.print(f"\n[bold]Report:[/bold] {(target / 'report.html').resolve()}", soft_wrap=True)
-    for entry in entries:
-        run = target / entry.contender.name
-        console.print(f"{entry.contender.name}: {run}/checkpoint.safetensors, {run}/example.ply")

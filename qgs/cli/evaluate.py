@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import Progress
 
 from qgs.cli.options import Device, Overrides, Threads, use_threads
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from qgs.composer import Recipe
     from qgs.engine.results import Evaluation
     from qgs.model import QueryGaussianModel
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("eval")(evaluate)
 
 
 def evaluate(
@@ -68,24 +64,37 @@ def evaluate(
 
     With --compare nothing is evaluated: the results in several RUNs are compared, scene by scene.
     """
-    from rich.console import Console
-
-    settings = [*(overrides or ()), *_short_forms(index, tune)]
+    settings = list(overrides or ())
+    if index is not None:
+        settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
+    if tune is not None:
+        settings.append(f"evaluation.tuning_steps={tune}")
+    console = Console()
     if compare:
-        more = [f"--batch {batch}"] * (batch > 1) + ["--strict"] * strict
-        _refuse_settings([*settings, *more])
-        compare_results(runs, across_protocols, out, Console())
+        idle = [*settings, *[f"--batch {batch}"] * (batch > 1), *["--strict"] * strict]
+        if idle:
+            raise ValueError(
+                f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
+                "evaluate each run with these settings first"
+            )
+        compare_results(runs, across_protocols, out, console)
         return
     if len(runs) > 1 or across_protocols:
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
     from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
-    from qgs.engine.folder import checkpoint_of
+    from qgs.engine.evaluation import SECTIONS
+    from qgs.engine.folder import RunFolder, checkpoint_of
     from qgs.io.checkpoint import load, load_extra, load_recipe
 
     use_threads(threads)
-    _refuse_other_sections(settings)
+    for setting in settings:
+        if setting.split(".")[0].split("=")[0] not in SECTIONS:
+            raise ValueError(
+                f"--set {setting} would change the trained model; an evaluation can only set "
+                + ", ".join(SECTIONS)
+            )
     checkpoint = checkpoint_of(runs[0])
     recipe = load_recipe(checkpoint)
     if settings:
@@ -93,10 +102,11 @@ def evaluate(
     model = load(checkpoint, choose_device(device))
     folder = out or evaluation_folder(checkpoint, bool(settings))
     step = load_extra(checkpoint).get("step")
-    step, console = None if step is None else int(step), Console()
-    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
-    for line in _about_averaged_weights(checkpoint):
-        console.print(line, soft_wrap=True, markup=False)
+    evaluation = evaluate_into(model, recipe, int(step) if step else None, folder, console, batch)
+    run = RunFolder(checkpoint.parent)
+    if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
+        hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
+        console.print(hint, soft_wrap=True, markup=False)
     if strict and not evaluation.is_complete:
         raise typer.Exit(1)
 
@@ -123,8 +133,6 @@ def evaluate_into(
     batch: int = 1,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
-    from rich.progress import Progress
-
     from qgs import engine
 
     with Progress(console=console, transient=True) as progress:
@@ -147,51 +155,14 @@ def compare_results(
 
     out: folder for comparison.json and comparison.md; None writes nothing.
     """
-    from qgs.engine.comparison import Comparisons
+    from qgs.engine.comparison import compare
     from qgs.engine.results import read_results
 
     results = [read_results(run) for run in runs]
-    comparisons = Comparisons.of(results, across_protocols)
+    comparisons = compare(results, across_protocols)
     comparisons.show(console)
     if out is None:
         console.print("add --out FOLDER to keep this as JSON and Markdown")
         return
     comparisons.write(out)
     console.print(f"written to {out}", soft_wrap=True)
-
-
-def _about_averaged_weights(checkpoint: Path) -> Iterator[str]:
-    from qgs.engine.folder import RunFolder
-
-    run = RunFolder(checkpoint.parent)
-    if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
-        yield f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
-
-
-def _short_forms(index: str | None, tune: int | None) -> list[str]:
-    settings = [] if index is None else [f"evaluation.index={_quoted(index)}"]
-    return settings if tune is None else [*settings, f"evaluation.tuning_steps={tune}"]
-
-
-def _quoted(text: str) -> str:
-    """A YAML string, whatever is in it."""
-    return "'" + text.replace("'", "''") + "'"
-
-
-def _refuse_settings(settings: Sequence[str]) -> None:
-    if settings:
-        raise ValueError(
-            f"--compare reads results and evaluates nothing, so {settings[0]} has no effect; "
-            "evaluate each run with these settings first"
-        )
-
-
-def _refuse_other_sections(overrides: Sequence[str]) -> None:
-    from qgs.engine.evaluation import SECTIONS
-
-    for override in overrides:
-        if override.split(".")[0].split("=")[0] not in SECTIONS:
-            raise ValueError(
-                f"--set {override} would change the trained model; an evaluation can only set "
-                + ", ".join(SECTIONS)
-            )

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
+from rich.console import Console
 
-Overrides: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override, such as model.queries.count=128; repeatable."),
-]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("list")(list_components)
-    app.command("compose")(compose)
-    app.command("diff")(diff)
-    app.command("schema")(schema)
+from qgs.cli.options import Overrides
 
 
 def list_components(
-    slot: Annotated[str | None, typer.Argument(help="Only this slot.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="A slot, a component such as qgs/latent, or a section of settings."),
+    ] = None,
 ) -> None:
-    """Installed components by slot: options, requirements, origin."""
-    from rich.console import Console
+    """Installed components by slot; with NAME all options and what they mean."""
+    from qgs.cli.listing import details, overview
+    from qgs.composer.registry import load_sound_plugins
 
-    from qgs.cli.tables import component_tables
-
-    tables, broken = component_tables(slot)
-    console = Console()
-    for table in tables:
-        console.print(table)
+    registry, broken = load_sound_plugins()
+    for part in details(name, registry) if name else overview(registry):
+        Console().print(part, highlight=False)
     for message in broken:
         Console(stderr=True).print(f"plugin left out: {message}", markup=False)
 
@@ -45,8 +37,6 @@ def compose(
 
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
-    from rich.console import Console
-
     from qgs.cli.tables import parameter_table
     from qgs.composer import resolve
     from qgs.composer.recipe import annotated
@@ -67,8 +57,6 @@ def diff(
     ] = None,
 ) -> None:
     """Which slots and options of two recipes differ, and what that costs in parameters."""
-    from rich.console import Console
-
     from qgs.cli.tables import difference_tables
     from qgs.composer import resolve
 
@@ -86,16 +74,13 @@ def schema(
     ] = None,
 ) -> None:
     """JSON Schema of a recipe with everything that is installed."""
-    import json
-
     from qgs.composer.registry import load_sound_plugins
     from qgs.composer.schema import recipe_schema
+    from qgs.io.files import write_text
 
     registry, _ = load_sound_plugins()
     text = json.dumps(recipe_schema(registry), indent=1) + "\n"
     if out is None:
         typer.echo(text, nl=False)
-        return
-    partial = out.with_name(out.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(out)
+    else:
+        write_text(out, text)

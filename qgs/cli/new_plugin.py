@@ -8,24 +8,17 @@ import unicodedata
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution, entry_points
-from importlib.resources import files
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from importlib.resources.abc import Traversable
 
 TEMPLATE_SUFFIX = ".jinja"
 NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 LONGEST_NAME = 40
-RESERVED = {"con", "prn", "aux", "nul"} | {f"{d}{i}" for d in ("com", "lpt") for i in range(1, 10)}
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("new-plugin")(new_plugin)
+WINDOWS_DEVICES = {"con", "prn", "aux", "nul"} | {
+    f"{d}{i}" for d in ("com", "lpt") for i in "123456789"
+}
 
 
 def new_plugin(
@@ -50,11 +43,6 @@ def distribution_of(name: str) -> str:
     return f"qgs-{name.replace('_', '-')}"
 
 
-def package_of(name: str) -> str:
-    """The package that is imported for the plugin `name`."""
-    return f"qgs_{name.replace('-', '_')}"
-
-
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
     if not NAME.fullmatch(name):
@@ -74,38 +62,18 @@ def check_name(name: str) -> None:
             f"`{name}` begins like the framework's own name; the distribution is called "
             "qgs-NAME anyway, so leave `qgs` out"
         )
-    if name in RESERVED:
+    value = _read_as_yaml(name)
+    reason = ""
+    if name in WINDOWS_DEVICES:
+        reason = "is the name of a device on Windows, where no file can have it"
+    elif value != name:
+        reason = f"in a recipe's `plugins: [{name}]` would be read as {value!r} and not as a name"
+    if reason:
+        raise ValueError(f"`{name}` {reason}; choose another, such as `{name}-things`")
+    for entry in entry_points(group="qgs.plugins", name=name):
         raise ValueError(
-            f"`{name}` is the name of a device on Windows, where no file can have it; choose "
-            f"another, such as `{name}-things`"
-        )
-    read = _read_in_a_recipe(name)
-    if read != name:
-        raise ValueError(
-            f"`{name}` in a recipe's `plugins: [{name}]` would be read as {read!r} and not as a "
-            f"name; choose another, such as `{name}-things`"
-        )
-    _refuse_taken(name)
-
-
-def _read_in_a_recipe(name: str) -> object:
-    """What a YAML 1.2 reader takes `name` for when it stands without quotes."""
-    import yaml
-
-    from qgs.composer.yaml_text import Yaml12Loader, scalar_value
-
-    node = yaml.compose(f"[{name}]", Loader=Yaml12Loader).value[0]
-    return scalar_value(node.tag, node.value)
-
-
-def _refuse_taken(name: str) -> None:
-    """Raise ValueError if an installed plugin has this name or this distribution's name."""
-    taken = [entry for entry in entry_points(group="qgs.plugins") if entry.name == name]
-    if taken:
-        owner = taken[0].dist.name if taken[0].dist else "an unknown distribution"
-        raise ValueError(
-            f"the name `{name}` is taken by {owner}, which is installed; of two plugins with one "
-            "name qgs uses neither, so choose another"
+            f"the name `{name}` is taken by {entry.dist.name if entry.dist else 'a plugin'}, which "
+            "is installed; of two plugins with one name qgs uses neither, so choose another"
         )
     with suppress(PackageNotFoundError):
         installed = distribution(distribution_of(name))
@@ -116,13 +84,23 @@ def _refuse_taken(name: str) -> None:
         )
 
 
+def _read_as_yaml(name: str) -> object:
+    """What a YAML 1.2 reader takes `name` for when it stands without quotes."""
+    import yaml
+
+    from qgs.composer.yaml_text import Yaml12Loader, scalar_value
+
+    node = yaml.compose(name, Loader=Yaml12Loader)
+    return scalar_value(node.tag, node.value)
+
+
 def write_plugin(name: str, folder: Path) -> None:
     """Write the distribution of the plugin `name` into the new `folder`, whole or not at all.
 
     Raises FileExistsError if there is something at `folder`, whatever it is, and OSError if no
     folder can be made there.
     """
-    from qgs.io.files import new_folder
+    from qgs.io.files import new_folder, write_text
 
     if folder.exists() or folder.is_symlink():
         raise FileExistsError(
@@ -131,9 +109,7 @@ def write_plugin(name: str, folder: Path) -> None:
     try:
         with new_folder(folder) as fresh:
             for path, text in rendered(name):
-                target = fresh / path
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_text(text, encoding="utf-8")
+                write_text(fresh / path, text)
     except OSError as error:
         raise OSError(
             f"cannot write {folder}: {error.strerror or error}; choose another folder with "
@@ -153,20 +129,14 @@ def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
     values = {
         "name": name,
         "distribution": distribution_of(name),
-        "package": package_of(name),
+        "package": f"qgs_{name.replace('-', '_')}",
         "contract_version": CONTRACT_VERSION,
         "oldest_qgs": f"{major}.{minor}",
         "next_qgs": f"{major}.{int(minor) + 1}",
     }
-    for path, template in _templates(files("qgs.cli") / "plugin_template", PurePosixPath()):
+    folder = Path(__file__).with_name("plugin_template")
+    for file in sorted(folder.rglob(f"*{TEMPLATE_SUFFIX}")):
+        path = file.relative_to(folder).with_suffix("")
         parts = [values["package"] if part == "package" else part for part in path.parts]
-        yield PurePosixPath(*parts), environment.from_string(template).render(values)
-
-
-def _templates(folder: Traversable, path: PurePosixPath) -> Iterator[tuple[PurePosixPath, str]]:
-    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        if entry.is_dir():
-            yield from _templates(entry, path / entry.name)
-        elif entry.name.endswith(TEMPLATE_SUFFIX):
-            name = entry.name.removesuffix(TEMPLATE_SUFFIX)
-            yield path / name, entry.read_text(encoding="utf-8")
+        text = environment.from_string(file.read_text(encoding="utf-8")).render(values)
+        yield PurePosixPath(*parts), text

@@ -9,13 +9,19 @@ import typer
 
 Overrides: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Override, such as training.seconds=300; repeatable."),
+    typer.Option("--set", help="Override, such as model.queries.count=128; repeatable."),
 ]
 Threads: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="CPU threads; all cores if not given.")
 ]
 Device: TypeAlias = Annotated[
     str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
+]
+Size: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HxW", help="Height and width of the photos; the recipe's data.image_size."
+    ),
 ]
 
 

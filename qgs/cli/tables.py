@@ -1,60 +1,26 @@
-"""Tables for the terminal: components, parameters, differences of recipes."""
+"""Tables of `qgs compose` and `qgs diff`: parameters of recipes, and where two differ."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
-from torch import nn
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from qgs.composer import Recipe
-from qgs.composer.errors import did_you_mean
-from qgs.composer.recipe import flat
-from qgs.composer.registry import InstalledPlugin, default_config, load_sound_plugins
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
-from qgs.composer.yaml_text import dump
-from qgs.contracts import Component, ComponentConfig, Fields
-
-
-def component_tables(slot: str | None) -> tuple[list[Table], list[str]]:
-    """One table per slot, or that of `slot`; and why plugins were left out.
-
-    Raises ValueError for a slot that does not exist.
-    """
-    slot = slot.removeprefix("model.").removeprefix("decoder.") if slot else None
-    if slot is not None and slot not in SLOTS:
-        raise ValueError(f"there is no slot `{slot}`; {did_you_mean(slot, SLOTS, 'slots')}")
-    registry, broken = load_sound_plugins()
-    tables = []
-    for name in [slot] if slot else SLOTS:
-        default = SLOTS[name].default
-        title = f"{recipe_path(name)} (default {default})" if default else recipe_path(name)
-        table = Table(title=title, title_justify="left")
-        for column in ("type", "options", "requires", "provides", "origin"):
-            table.add_column(column, overflow="fold")
-        for kind, component in registry.components(name).items():
-            row = _row(component, registry.plugins[kind.split("/")[0]])
-            table.add_row(kind, *map(escape, row))
-        tables.append(table)
-    return tables, broken
-
-
-def recipe_path(slot: str) -> str:
-    """Where in a recipe the components of `slot` are written."""
-    if slot in MODEL_SLOTS:
-        return f"model.{slot}"
-    return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
+from qgs.composer.slots import LAYER_SLOTS
+from qgs.io.differences import differing_options
 
 
 def parameter_table(recipe: Recipe) -> Table:
-    """Parameters of each component; built on the meta device."""
+    """Parameters of each component."""
     table = Table("component", "type", "parameters", title="parameters", title_justify="left")
     table.columns[2].justify = "right"
     counts = parameter_counts(recipe)
     for name, count in counts.items():
-        table.add_row(name, _type_of(recipe, name), f"{count:,}")
+        table.add_row(name, _types(recipe, name), f"{count:,}")
     table.add_section()
     table.add_row("total", "", f"{sum(counts.values()):,}")
     return table
@@ -65,109 +31,69 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
 
     Options are compared where both recipes have the same component.
     """
-    ours, theirs = flat(first.tree), flat(second.tree)
-    paths = [*ours, *(path for path in theirs if path not in ours)]
-    differing = [p for p in paths if ours.get(p, _MISSING) != theirs.get(p, _MISSING)]
-    kinds = [path for path in differing if path.endswith(".type")]
-    swapped = tuple(path.removesuffix("type") for path in kinds)
-    options = [path for path in differing if not path.startswith(swapped)] if swapped else differing
-    slots, values = _differences("slot", a, b), _differences("option", a, b)
-    for path in kinds:
-        name = path.removesuffix(".type")
-        slots.add_row(name, escape(_word(ours, path)), escape(_word(theirs, path)))
-    for path in options:
-        values.add_row(path, escape(_word(ours, path)), escape(_word(theirs, path)))
-    return [slots, values, _parameter_differences(first, second, a, b)]
+    differing = differing_options(first.tree, second.tree)
+    kinds = {path.removesuffix(".type") for path in differing if path.endswith(".type")}
+    slots, options, parameters = (
+        Table(title=title, title_justify="left")
+        for title in ("slots that differ", "options that differ", "parameters")
+    )
+    for table, what in ((slots, "slot"), (options, "option"), (parameters, "component")):
+        justify = "right" if table is parameters else "left"
+        table.add_column(what, overflow="fold")
+        for header in (a, b):
+            table.add_column(escape(header), overflow="fold", justify=justify)
+    for path, values in differing.items():
+        cells = [escape("-" if value is None else value) for value in values]
+        if path.endswith(".type"):
+            slots.add_row(path.removesuffix(".type"), *cells)
+        elif not any(path.startswith(f"{kind}.") for kind in kinds):
+            options.add_row(path, *cells)
+    parameters.add_column("difference", justify="right", overflow="fold")
+    ours, theirs = parameter_counts(first), parameter_counts(second)
+    rows = [(name, count, theirs[name]) for name, count in ours.items()]
+    for name, x, y in [*rows, ("total", sum(ours.values()), sum(theirs.values()))]:
+        if name == "total":
+            parameters.add_section()
+        parameters.add_row(name, f"{x:,}", f"{y:,}", f"{y - x:+,}" if x != y else "")
+    return [slots, options, parameters]
+
+
+class _LargeWeightsUnwritten(TorchFunctionMode):
+    """Leaves large weights as they are allocated: to count them takes no time and no memory.
+
+    On the meta device torch would import its compiler first, which takes three seconds.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        draws = (Tensor.uniform_, Tensor.normal_)
+        if func in draws and args[0].numel() > 2**14:
+            return args[0]
+        return func(*args, **(kwargs or {}))
 
 
 def parameter_counts(recipe: Recipe) -> dict[str, int]:
     """Component to its number of parameters, decoder layers summed by slot."""
-    model = recipe.build_model("meta")
+    with _LargeWeightsUnwritten():
+        model = recipe.build_model()
     counts = {name: _count(getattr(model, name)) for name in ("encoder", "queries")}
-    for name in LAYER_SLOTS[:3]:
-        counts[f"decoder.{name}"] = sum(_count(getattr(layer, name)) for layer in model.decoder)
-    counts["decoder.refinement"] = _count(model.refinements)
-    counts["decoder.layer_scale"] = _count(model.decoder) - sum(
-        counts[f"decoder.{name}"] for name in LAYER_SLOTS[:3]
-    )
+    in_layers = {
+        f"decoder.{slot}": sum(_count(getattr(layer, slot)) for layer in model.decoder)
+        for slot in LAYER_SLOTS
+        if slot != "refinement"
+    }
+    scales = _count(model.decoder) - sum(in_layers.values())
+    counts |= in_layers | {"decoder.refinement": _count(model.refinements)}
+    counts["decoder.layer_scale"] = scales
     return counts | {name: _count(getattr(model, name)) for name in ("head", "centers")}
-
-
-_MISSING = object()
-
-
-def _differences(what: str, a: str, b: str) -> Table:
-    table = Table(title=f"{what}s that differ", title_justify="left")
-    for header in (what, a, b):
-        table.add_column(escape(header), overflow="fold")
-    return table
-
-
-def _parameter_differences(first: Recipe, second: Recipe, a: str, b: str) -> Table:
-    table = Table(title="parameters", title_justify="left")
-    table.add_column("component", overflow="fold")
-    for header in (a, b, "difference"):
-        table.add_column(escape(header), justify="right", overflow="fold")
-    counts, others = parameter_counts(first), parameter_counts(second)
-    for name, count in counts.items():
-        _add_difference(table, name, count, others[name])
-    table.add_section()
-    _add_difference(table, "total", sum(counts.values()), sum(others.values()))
-    return table
 
 
 def _count(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def _type_of(recipe: Recipe, name: str) -> str:
-    node: Any = recipe.tree["model"]
-    for key in name.split("."):
-        node = node.get(key, {}) if isinstance(node, Mapping) else {}
-    kinds = [node["type"]] if isinstance(node, Mapping) and "type" in node else []
+def _types(recipe: Recipe, name: str) -> str:
+    """The types of a component; of a part of the decoder, those of all layers."""
     slot = name.removeprefix("decoder.")
-    for layer in recipe.tree["model"]["decoder"].get("layers", {}).values():
-        kinds += [layer[slot]["type"]] if slot in layer else []
+    path, place = ("model", "decoder", "layers") if slot != name else ("model", slot), slot
+    kinds = [c.type for p, c in recipe.parts.items() if p[: len(path)] == path and p[-1] == place]
     return ", ".join(dict.fromkeys(kinds))
-
-
-def _add_difference(table: Table, name: str, ours: int, theirs: int) -> None:
-    table.add_row(name, f"{ours:,}", f"{theirs:,}", f"{theirs - ours:+,}" if ours != theirs else "")
-
-
-def _row(component: type[Component], plugin: InstalledPlugin) -> tuple[str, ...]:
-    options = []
-    for name, field in component.Config.model_fields.items():
-        default = "required" if field.is_required() else _plain(component, name)
-        options.append(f"{name}: {default}")
-    origin = f"{plugin.distribution} {plugin.version}"
-    config = default_config(component)
-    if config is None:
-        return _lines(options), "depends on options", "depends on options", origin
-    fields = [_fields(declare, config) for declare in (component.requires, component.provides)]
-    return _lines(options), *fields, origin
-
-
-def _fields(declare: Callable[[ComponentConfig], Fields], config: ComponentConfig) -> str:
-    """Declared fields, or why a plugin's code cannot tell them."""
-    try:
-        return _lines(f"{name}: {spec}" for name, spec in declare(config).items())
-    except Exception as error:
-        return f"fails: {type(error).__name__}: {error}"
-
-
-def _plain(component: type[Component], name: str) -> str:
-    schema = component.Config.model_json_schema()["properties"][name]
-    return _yaml(schema.get("default"))
-
-
-def _word(values: Mapping[str, Any], path: str) -> str:
-    return _yaml(values[path]) if path in values else "-"
-
-
-def _yaml(value: Any) -> str:
-    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
-
-
-def _lines(words: Iterable[str]) -> str:
-    return "\n".join(words) or "-"

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
 from qgs.cli.options import Device, Overrides, Threads, use_threads
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from qgs.composer import Recipe
-    from qgs.engine import TrainingResult
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("train")(train)
 
 
 def train(
@@ -39,8 +33,6 @@ def train(
     the same command goes on from there, or from the last save if the process was killed, as if it
     had never been interrupted.
     """
-    from rich.console import Console
-
     from qgs import engine
     from qgs.composer import resolve
     from qgs.engine.protocol import index_of
@@ -54,31 +46,23 @@ def train(
     except engine.TrainingError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
+    run, finished = result.folder, result.resumed_at == result.steps
     if result.main:
-        _conclude(result, resolved, console)
+        before = "was already finished: " if finished and not result.stopped_by else ""
+        console.print(f"{before}{result.steps} steps in {result.seconds:.0f} s, {run.checkpoint}")
+        if result.stopped_by:
+            console.print(f"stopped early by {result.stopped_by}; not evaluated")
+            console.print("continue with the same command and --resume", highlight=False)
+        elif finished and run.evaluation.exists():
+            console.print(f"evaluated before, see {run.evaluation}")
+        else:
+            evaluate_into(result.model, resolved, result.steps, run.evaluation, console)
     if result.stopped_by:
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 
 
-def _conclude(result: TrainingResult, recipe: Recipe, console: Console) -> None:
-    finished = result.resumed_at == result.steps
-    done = "was already finished: " if finished and not result.stopped_by else ""
-    console.print(
-        f"{done}{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
-    )
-    if result.stopped_by:
-        console.print(f"stopped early by {result.stopped_by}; not evaluated")
-        console.print("continue with the same command and --resume", highlight=False)
-        return
-    if finished and result.folder.evaluation.exists():
-        console.print(f"evaluated before, see {result.folder.evaluation}")
-        return
-    evaluate_into(result.model, recipe, result.steps, result.folder.evaluation, console)
-
-
 def with_absolute_path(recipe: Recipe) -> Recipe:
     """`recipe` with absolute paths of data and index, so that its run can be judged anywhere."""
-    from qgs.composer import resolve
     from qgs.data.paths import is_local, opened_path
 
     def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:
@@ -90,4 +74,4 @@ def with_absolute_path(recipe: Recipe) -> Recipe:
     tree = {**recipe.tree, "evaluation": absolute(recipe.tree["evaluation"], "index")}
     if tree.get("data"):
         tree["data"] = absolute(tree["data"], "path", "test_scenes")
-    return recipe if tree == recipe.tree else resolve(tree)
+    return replace(recipe, tree=tree)

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from qgs.cli.options import Overrides
+
 
 class Layout(StrEnum):
     """Layouts of a state dict besides our own."""
 
     published = "published"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("import")(import_)
-    app.command("export")(export)
 
 
 def import_(
@@ -30,10 +25,7 @@ def import_(
         str, typer.Option(help="Recipe file whose model they are; auto for the one that fits.")
     ],
     out: Annotated[Path, typer.Option(help="New checkpoint; never overwritten.")],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Override, such as model.head.scale_cap=0.1; repeatable."),
-    ] = None,
+    overrides: Overrides = None,
     to_float32: Annotated[
         bool,
         typer.Option("--to-float32", help="Convert other precisions instead of refusing them."),
@@ -50,18 +42,19 @@ def import_(
 
     resolved = None if recipe == "auto" else resolve(recipe, overrides or ())
     done = import_weights(weights, resolved, out, overrides=overrides or (), to_float32=to_float32)
-    _lines(done.notes)
-    typer.echo(f"{done.layout.name} ({done.layout.source}): {done.used} tensors used")
-    if done.dropped:
-        typer.echo(f"knowingly dropped, {done.layout.name} never reads these {len(done.dropped)}:")
-        _lines(f"  {name}" for name in done.dropped)
+    name = done.layout.name
+    lines = [*done.notes, f"{name} ({done.layout.source}): {done.count} tensors used"]
+    if done.unused:
+        lines.append(f"knowingly dropped, {name} never reads these {len(done.unused)}:")
+        lines += [f"  {tensor}" for tensor in done.unused]
     if done.settings:
-        typer.echo(f"the recipe differs from {done.layout.name} in options that no weight shows:")
-        _lines(f"  {setting}" for setting in done.settings)
-    typer.echo(f"wrote {out}")
+        lines.append(f"the recipe differs from {name} in options that no weight shows:")
+        lines += [f"  {setting}" for setting in done.settings]
+    lines.append(f"wrote {out}")
     if done.recipe_file:
-        typer.echo(f"wrote {done.recipe_file}; names and shapes could not tell:")
-        _lines(f"  {choice}" for choice in done.layout.undecided)
+        lines.append(f"wrote {done.recipe_file}; names and shapes could not tell:")
+        lines += [f"  {choice}" for choice in done.layout.undecided]
+    typer.echo("\n".join(lines))
 
 
 def export(
@@ -74,19 +67,15 @@ def export(
     from qgs.io.transfer import export_weights
 
     done = export_weights(checkpoint_of(checkpoint), out)
-    typer.echo(f"{done.layout.name} ({done.layout.source}): {done.written} tensors written")
+    name = done.layout.name
+    lines = [f"{name} ({done.layout.source}): {done.count} tensors written"]
     if done.settings:
-        typer.echo("the file does not carry these options; its reader must be given them:")
-        _lines(f"  {setting}" for setting in done.settings)
-    if done.absent:
-        typer.echo(
-            f"{done.layout.name} also stores {len(done.absent)} tensors that it never reads; they "
-            "are absent, so load with strict=False and expect exactly these to be missing:"
+        lines.append("the file does not carry these options; its reader must be given them:")
+        lines += [f"  {setting}" for setting in done.settings]
+    if done.unused:
+        lines.append(
+            f"{name} also stores {len(done.unused)} tensors that it never reads; they are absent, "
+            "so load with strict=False and expect exactly these to be missing:"
         )
-        _lines(f"  {name}" for name in done.absent)
-    typer.echo(f"wrote {out}")
-
-
-def _lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        typer.echo(line)
+        lines += [f"  {tensor}" for tensor in done.unused]
+    typer.echo("\n".join([*lines, f"wrote {out}"]))

@@ -10,6 +10,7 @@ from qgs.components.decoder import (
 )
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
+from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
 from qgs.components.weights import TOKENGS
@@ -25,6 +26,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     GaussianHead,
     FreeCenters,
     LayerSupervision,
+    OneCycleAdamW,
 )
 
 __all__ = [
@@ -43,6 +45,7 @@ __all__ = [
     "MlpFeedForward",
     "MultiViewViT",
     "NoRefinement",
+    "OneCycleAdamW",
     "SelfAttentionCore",
     "posact",
 ]

@@ -1,6 +1,6 @@
 """Building blocks that several components share; plugins may use them too.
 
-B batch, T tokens, D width, h heads, d = D/h.
+Axes: B scenes, T tokens, N queries, M image tokens, Q chosen queries, D width, h heads, d = D/h.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ NORM_EPS = 1e-5
 
 
 class LayerScale(nn.Module):
-    """Per-channel factor on a residual update, initialised at `init`."""
+    """Factor per channel on a residual update, (..., D) -> (..., D), initially `init`."""
 
     def __init__(self, width: int, init: float) -> None:
         super().__init__()
         self.gamma = nn.Parameter(torch.full((width,), init))
 
     def forward(self, update: Tensor) -> Tensor:
-        """(..., D) -> (..., D)."""
+        """The scaled update."""
         return update * self.gamma
 
 
 class Mlp(nn.Module):
-    """Linear, GELU, linear: (..., in) -> (..., out)."""
+    """Linear, GELU, linear: (..., inputs) -> (..., outputs)."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(hidden, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., in) -> (..., out)."""
+        """(..., inputs) -> (..., outputs)."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -51,12 +51,12 @@ def merge_heads(x_BhTd: Tensor) -> Tensor:
     return rearrange(x_BhTd, "b h t d -> b t (h d)")
 
 
-def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias: Tensor | None) -> AttentionWeights:
-    """What scaled dot-product attention computes on the way, spelled out in float32."""
+def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_B1QT: Tensor | None) -> AttentionWeights:
+    """The parts of scaled dot-product attention, computed in float32."""
     scale = q_BhQd.shape[-1] ** -0.5
-    content = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
-    logits = content if bias is None else content + bias
-    return AttentionWeights(content, bias, logits.softmax(-1))
+    content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
+    logits_BhQT = content_BhQT if bias_B1QT is None else content_BhQT + bias_B1QT
+    return AttentionWeights(content_BhQT, bias_B1QT, logits_BhQT.softmax(-1))
 
 
 class SelfAttentionCore(nn.Module):
@@ -72,22 +72,24 @@ class SelfAttentionCore(nn.Module):
 
     def project(self, x_BTD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (B, h, T, d), norms applied."""
-        q, k, v = (split_heads(part, self.heads) for part in self.qkv(x_BTD).chunk(3, -1))
-        return self.q_norm(q).to(v.dtype), self.k_norm(k).to(v.dtype), v
+        q_BhTd, k_BhTd, v_BhTd = (
+            split_heads(part_BTD, self.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
+        )
+        return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
     def forward(self, x_BTD: Tensor) -> Tensor:
         """(B, T, D) -> (B, T, D)."""
-        q, k, v = self.project(x_BTD)
-        return self.proj(merge_heads(F.scaled_dot_product_attention(q, k, v)))
+        q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
+        return self.proj(merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd)))
 
     def explain(self, x_BTD: Tensor, queries: Tensor) -> AttentionWeights:
         """Attention of the tokens with indices `queries` (Q,)."""
-        q, k, _ = self.project(x_BTD)
-        return attention_weights(q[:, :, queries], k, None)
+        q_BhTd, k_BhTd, _ = self.project(x_BTD)
+        return attention_weights(q_BhTd[:, :, queries], k_BhTd, None)
 
 
 class CrossAttentionCore(nn.Module):
-    """Pre-norm multi-head reading of given keys and values, with an additive bias on the logits."""
+    """Pre-norm multi-head attention to given keys and values, with a bias on the logits."""
 
     def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()
@@ -102,18 +104,19 @@ class CrossAttentionCore(nn.Module):
         return self.q_norm(split_heads(self.q_proj(self.norm(x_BND)), self.heads))
 
     def forward(
-        self, x_BND: Tensor, keys: Tensor, values: Tensor, bias_BNM: Tensor | None = None
+        self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias_BNM: Tensor | None = None
     ) -> Tensor:
-        """(B, N, D) read from keys, values (B, h, M, d); `bias_BNM` is shared by all heads."""
-        q = self.project(x_BND).to(values.dtype)
-        bias = None if bias_BNM is None else bias_BNM[:, None].to(values.dtype)
-        read = F.scaled_dot_product_attention(q, keys.to(values.dtype), values, attn_mask=bias)
-        return self.out_proj(merge_heads(read))
+        """(B, N, D); `bias_BNM` is shared by all heads."""
+        q_BhNd = self.project(x_BND).to(v_BhMd.dtype)
+        bias_B1NM = None if bias_BNM is None else bias_BNM[:, None].to(v_BhMd.dtype)
+        k_BhMd = k_BhMd.to(v_BhMd.dtype)
+        read_BhNd = F.scaled_dot_product_attention(q_BhNd, k_BhMd, v_BhMd, attn_mask=bias_B1NM)
+        return self.out_proj(merge_heads(read_BhNd))
 
     def explain(
-        self, x_BND: Tensor, keys: Tensor, queries: Tensor, bias_BNM: Tensor | None = None
+        self, x_BND: Tensor, k_BhMd: Tensor, queries: Tensor, bias_BNM: Tensor | None = None
     ) -> AttentionWeights:
         """Attention of the queries with indices `queries` (Q,)."""
-        q = self.project(x_BND)[:, :, queries]
-        bias = None if bias_BNM is None else bias_BNM[:, None, queries]
-        return attention_weights(q, keys, bias)
+        q_BhQd = self.project(x_BND)[:, :, queries]
+        bias_B1QM = None if bias_BNM is None else bias_BNM[:, None, queries]
+        return attention_weights(q_BhQd, k_BhMd, bias_B1QM)

@@ -1,4 +1,4 @@
-"""`qgs/free`: a Gaussian stands where the head says, anywhere in the world (TokenGS)."""
+"""`qgs/free`: means straight from the head's offsets, anywhere in the world (TokenGS)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ def posact(
 ) -> Tensor:
     """sign(t) (exp|t| - 1): linear near 0, exponential far out (TokenGS release).
 
-    input_limit clamps t, output_limit the result (LocusGS release: 100 and 1000; TokenGS: none).
-    The slope at 0 is 1, so that a head which starts at zero can learn; it is 0 beyond a limit.
+    input_limit: |t| is clamped to it. output_limit: the size of the result is (LocusGS release: 100
+    and 1000; TokenGS: none). The slope is 1 at 0, so that a head which starts at zero can learn,
+    and 0 beyond a limit.
     """
     if input_limit is not None:
         t = t.clamp(-input_limit, input_limit)

@@ -1,4 +1,4 @@
-"""The default decoder layer: attention by content alone, an MLP, nothing to refine (TokenGS)."""
+"""The default decoder layer: attention by content alone, an MLP, no refinement (TokenGS)."""
 
 from __future__ import annotations
 
@@ -98,10 +98,10 @@ class MlpFeedForward(FeedForward):
 
 
 class NoRefinement(Refinement):
-    """Passes the state on."""
+    """Returns the state unchanged."""
 
     name: ClassVar[str] = "none"
 
     def forward(self, state: QueryState) -> QueryState:
-        """The state, as it is."""
+        """The same state."""
         return state

@@ -1,4 +1,4 @@
-"""`qgs/multiview_vit`: one sequence of all views' patches through a small ViT (TokenGS release)."""
+"""`qgs/multiview_vit`: a small ViT over the patches of all views together (TokenGS release)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class PatchEmbedding(nn.Module):
-    """P x P convolution with stride P, then LayerNorm: (X, C, H, W) -> (X, H/P*W/P, D)."""
+    """P x P convolution with stride P, then LayerNorm: (X, C, H, W) -> (X, H/P*W/P, D).
+
+    X is B*V, the views of all scenes.
+    """
 
     def __init__(self, channels: int, width: int, patch_size: int, norm_eps: float) -> None:
         super().__init__()
@@ -53,7 +56,7 @@ class EncoderBlock(nn.Module):
 
 
 class MultiViewViT(Encoder):
-    """Patch and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
+    """RGB and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
 
     name: ClassVar[str] = "multiview_vit"
 
@@ -84,7 +87,7 @@ class MultiViewViT(Encoder):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """The patch must divide both sides of the image."""
+        """A patch that does not divide both sides of the image."""
         size, patch = context.image_size, config.patch_size
         if size and any(side % patch for side in size):
             nearest = [max(round(side / patch), 1) * patch for side in size]
@@ -95,40 +98,37 @@ class MultiViewViT(Encoder):
             )
 
     def forward(self, views: Views) -> ImageMemory:
-        """Encode; raises ValueError when the patch does not divide the images."""
+        """The memory of all views; raises ValueError when the patch does not divide the images."""
         view_count, _, height, width = views.images.shape[1:]
         if height % self.patch_size or width % self.patch_size:
             raise ValueError(
                 f"images of {height} x {width} cannot be cut into patches of {self.patch_size}; "
                 "resize the views, or compose the model with another patch_size"
             )
-        plucker = plucker_rays(views.cameras)
-        x_BMD = self.norm(self._encode(self.embed(views.images, plucker)))
-        keys, values = self.kv_proj(x_BMD).chunk(2, -1)
-        heads = self.dims.heads
-        values = split_heads(values, heads)
+        plucker_BV6HW = plucker_rays(views.cameras)
+        x_BMD = self.embed(views.images, plucker_BV6HW)
+        for block in self.blocks:
+            x_BMD = block(x_BMD)
+        x_BMD = self.norm(x_BMD)
+        k_BMD, v_BMD = self.kv_proj(x_BMD).chunk(2, -1)
+        v_BhMd = split_heads(v_BMD, self.dims.heads)
         return ImageMemory(
-            keys=self.k_norm(split_heads(keys, heads)).to(values.dtype),
-            values=values,
+            keys=self.k_norm(split_heads(k_BMD, self.dims.heads)).to(v_BhMd.dtype),
+            values=v_BhMd,
             features=x_BMD,
-            patch_rays=patch_rays(plucker, self.patch_size),
+            patch_rays=patch_rays(plucker_BV6HW, self.patch_size),
             grid=(view_count, height // self.patch_size, width // self.patch_size),
         )
 
     def embed(self, images: Tensor, plucker: Tensor) -> Tensor:
         """Images (B, V, 3, H, W) in [0, 1] and Plücker maps (B, V, 6, H, W) -> (B, M, D)."""
-        batch = images.shape[0]
-        tokens = self.rgb_embedding(_imagenet_normalised(images).flatten(0, 1))
-        tokens = tokens + self.ray_embedding(plucker.flatten(0, 1))
-        return rearrange(tokens, "(b v) p d -> b (v p) d", b=batch)
-
-    def _encode(self, x_BMD: Tensor) -> Tensor:
-        for block in self.blocks:
-            x_BMD = block(x_BMD)
-        return x_BMD
+        x_XPD = self.rgb_embedding(imagenet_normalised(images).flatten(0, 1))
+        x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
+        return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=images.shape[0])
 
 
-def _imagenet_normalised(images: Tensor) -> Tensor:
+def imagenet_normalised(images: Tensor) -> Tensor:
+    """(RGB - mean) / std of ImageNet, for images (..., 3, H, W) in [0, 1]."""
     options = {"dtype": images.dtype, "device": images.device}
     mean = torch.tensor(IMAGENET_MEAN, **options).view(3, 1, 1)
     std = torch.tensor(IMAGENET_STD, **options).view(3, 1, 1)

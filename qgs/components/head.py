@@ -13,15 +13,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS
-from qgs.contracts import (
-    ComponentConfig,
-    Head,
-    ModelDims,
-    Problem,
-    RecipeContext,
-    without_effect,
-)
-from qgs.geometry.precision import full_precision
+from qgs.contracts import ComponentConfig, Head, ModelDims, Problem, RecipeContext, without_effect
+from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import GaussianAttributes, QueryState
 
 CHANNELS = (3, 3, 3, 4, 1)
@@ -64,14 +57,14 @@ class GaussianHead(Head):
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
         if config.position_std is not None:
-            rows = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
-            nn.init.trunc_normal_(rows, std=config.position_std)
+            rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
+            nn.init.trunc_normal_(rows_K3D, std=config.position_std)
             with torch.no_grad():
-                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows
+                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """An epsilon needs its norm."""
+        """Options of a norm that there is not."""
         if not config.norm:
             yield from without_effect(config, ("norm_eps",), "`norm` is false")
 
@@ -82,12 +75,12 @@ class GaussianHead(Head):
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         """(B, N, D) -> attributes of (B, N, K) Gaussians."""
-        raw = self.linear(self.norm(state.features))
-        return self.activate(rearrange(raw, "b n (k c) -> b n k c", c=sum(CHANNELS)))
+        raw_BNC = self.linear(self.norm(state.features))
+        return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
-    def activate(self, raw: Tensor) -> GaussianAttributes:
-        """Raw channels (B, N, K, 14) to attributes."""
-        offsets, rgb, scale, rotation, opacity = _split(raw)
+    def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
+        """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
+        offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         return GaussianAttributes(
             offsets=offsets,
             scales=capped_exp(scale, self.config.scale_cap, self.config.scale_input_limit),
@@ -95,11 +88,6 @@ class GaussianHead(Head):
             opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
             colors=(torch.tanh(rgb) + 1) / 2,
         )
-
-
-@full_precision
-def _split(raw: Tensor) -> tuple[Tensor, ...]:
-    return raw.split(CHANNELS, -1)
 
 
 @full_precision

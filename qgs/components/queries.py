@@ -1,4 +1,4 @@
-"""`qgs/latent`: plain learned queries (TokenGS)."""
+"""`qgs/latent`: learned queries without a position (TokenGS)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from qgs.types import QueryState
 
 
 class LatentQueries(Queries):
-    """N learned vectors, shared by all scenes, without a place in space."""
+    """N learned vectors, shared by all scenes, without a position."""
 
     name: ClassVar[str] = "latent"
 

@@ -34,7 +34,7 @@ class LayerSupervision(Supervision):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Every supervised layer must exist."""
+        """Layers that do not exist."""
         beyond = [number for number in config.layers if number > context.dims.depth]
         if beyond:
             yield Problem(

@@ -43,9 +43,9 @@ BACKBONE_RENAMES = (
     Rename("decoder.{}.feed_forward_scale.", DECODER + "{}.mlp_scale."),
     Rename("head.linear.", "activation_head.deconv."),
 )
-"""What TokenGS and its descendants name alike."""
+"""Names that TokenGS and the models built on it share."""
 
-LEGIBLE = (
+READ_OPTIONS = (
     "model.width",
     "model.heads",
     "model.encoder.type",
@@ -63,13 +63,13 @@ LEGIBLE = (
     "model.head.type",
     "model.head.gaussians_per_query",
 )
-"""Options that names and shapes of their parameters tell."""
+"""Options that follow from the names and shapes of the parameters."""
 
 
 def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
-    """The `model` section as far as TokenGS and its descendants share it; raises LayoutError.
+    """The part of `model` that TokenGS and the models built on it share; raises LayoutError.
 
-    queries: the type of its queries.
+    queries: the `type` of its queries.
     """
     count, width = size_at(shapes, "gs_tokens", 0), size_at(shapes, "gs_tokens", 1)
     head_width = size_at(shapes, "enc_dec_backbone.k_proj_norm.weight", 0)
@@ -106,12 +106,8 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "refinement": {"type": "qgs/none"},
     }
     model["head"] |= {"scale_input_limit": None, "quat_eps": 1e-12}
-    model["centers"] = {
-        "type": "qgs/free",
-        "z_offset": 1.0,
-        "input_limit": None,
-        "output_limit": None,
-    }
+    unlimited = {"input_limit": None, "output_limit": None}
+    model["centers"] = {"type": "qgs/free", "z_offset": 1.0, **unlimited}
     model["supervision"] = {"type": "qgs/layers", "layers": [model["decoder"]["depth"]]}
     return {"recipe": 1, "model": model}
 
@@ -135,11 +131,11 @@ TOKENGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
     read=_read,
-    legible=LEGIBLE,
+    read_options=READ_OPTIONS,
     undecided=(
         "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
         "supervised layers: the last",
         "scale and frame of the world, losses, renderer, training: the framework's defaults",
     ),
 )
-"""The released TokenGS, with posed photos and without its dynamic or latent extensions."""
+"""The released TokenGS for posed photos, without its dynamic and latent extensions."""

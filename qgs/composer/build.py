@@ -15,7 +15,14 @@ from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.flow import fits
 from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
-from qgs.contracts import ModelComponent, ModelDims, Queries, Refinement, SceneSource
+from qgs.contracts import (
+    ModelComponent,
+    ModelDims,
+    Optimizer,
+    Queries,
+    Refinement,
+    SceneSource,
+)
 from qgs.contracts.component import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
 from qgs.types import QueryState
@@ -102,8 +109,9 @@ class _ShapesAlone(TorchFunctionMode):
 def build(chosen: Chosen, *arguments: Any) -> Any:
     """The component itself. arguments: what its constructor takes besides its Config.
 
-    What a plugin's constructor raises is reported with its distribution. Missing packages, and
-    data that cannot be opened, are for the user to put right, and raised as they are.
+    What a plugin's constructor raises is reported with its distribution. Missing packages,
+    data that cannot be opened and training too short for its optimiser are for the user to put
+    right, and raised as they are.
     """
     component: Any = chosen.component
     try:
@@ -112,7 +120,8 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         raise
     except Exception as error:
         ours = chosen.installed.plugin.name == BUILTIN.name
-        if ours or (issubclass(component, SceneSource) and isinstance(error, ValueError | OSError)):
+        for_users = issubclass(component, SceneSource | Optimizer)
+        if ours or (for_users and isinstance(error, ValueError | OSError)):
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         where = chosen.place.origin.file, chosen.place.origin.line

@@ -24,7 +24,9 @@ from qgs.contracts import (
     ComponentConfig,
     EvaluationConfig,
     Loss,
+    Metric,
     ModelDims,
+    Optimizer,
     Plugin,
     RecipeContext,
     SceneSource,
@@ -68,6 +70,14 @@ class Recipe:
         `losses: {}` gives none: fine for everything but training, which refuses it.
         """
         return self._build_named("losses")
+
+    def build_metrics(self) -> dict[str, Metric]:
+        """What evaluations measure, by the names that the recipe gives."""
+        return self._build_named("metrics")
+
+    def build_optimizer(self) -> Optimizer:
+        """The optimiser; raises ValueError where `training` is too short for it."""
+        return build(self.parts["optimizer",], self.training)
 
     def build_data(self) -> SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""

@@ -19,6 +19,7 @@ import qgs
 import qgs.components
 import qgs.data
 import qgs.losses
+import qgs.metrics
 import qgs.renderers
 from qgs.composer.slots import SLOTS
 from qgs.contracts import (
@@ -38,6 +39,7 @@ BUILTIN = Plugin(
         *qgs.components.COMPONENTS,
         *qgs.renderers.COMPONENTS,
         *qgs.losses.COMPONENTS,
+        *qgs.metrics.COMPONENTS,
         *qgs.data.COMPONENTS,
     ),
     layouts=(qgs.components.TOKENGS,),
@@ -50,7 +52,7 @@ BUILTIN = Plugin(
 )
 NAME = re.compile(r"[^\s/]+")
 """Of a component: `type: PLUGIN/NAME` must be read as it was written."""
-DEVICES = ("cpu", "cuda")
+DEVICES = ("cpu", "cuda", "mps")
 """Types of the devices that a renderer can render on."""
 
 

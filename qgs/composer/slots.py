@@ -37,6 +37,8 @@ SLOTS = {
         Slot(contracts.Supervision, "qgs/layers"),
         Slot(contracts.Renderer, "qgs/auto"),
         Slot(contracts.Loss, None),
+        Slot(contracts.Metric, None),
+        Slot(contracts.Optimizer, "qgs/adamw"),
         Slot(contracts.SceneSource, None),
     )
 }
@@ -61,9 +63,13 @@ class Section:
 
 
 DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
+DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
+
 SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
+    "metrics": Section(named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
+    "optimizer": Section(),
 }
 
 

@@ -24,6 +24,8 @@ from qgs.contracts.decoder import (
 from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
 from qgs.contracts.head import Centers, Head
 from qgs.contracts.loss import Loss, Supervision
+from qgs.contracts.metric import Column, Metric, MetricInput
+from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
 from qgs.contracts.plugin import (
     CONTRACT_VERSION,
     ENTRY_POINT_GROUP,
@@ -34,7 +36,7 @@ from qgs.contracts.plugin import (
 from qgs.contracts.queries import Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
-from qgs.contracts.weights import LayoutError, Rename, Unused, WeightLayout
+from qgs.contracts.weights import LayoutError, Rename, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -42,6 +44,7 @@ __all__ = [
     "MEMORY_FIELDS",
     "AttentionWeights",
     "Centers",
+    "Column",
     "Component",
     "ComponentConfig",
     "CrossAttention",
@@ -55,9 +58,14 @@ __all__ = [
     "Head",
     "LayoutError",
     "Loss",
+    "Metric",
+    "MetricInput",
     "ModelComponent",
     "ModelDims",
+    "Optimizer",
+    "OptimizerConfig",
     "OptionError",
+    "ParameterGroup",
     "Plugin",
     "Problem",
     "Queries",
@@ -73,7 +81,6 @@ __all__ = [
     "Split",
     "Supervision",
     "TrainingConfig",
-    "Unused",
     "ViewsConfig",
     "WeightLayout",
     "component_of",

@@ -1,4 +1,4 @@
-"""What every component shares: a name, a Config, and what it reads and writes."""
+"""What all components share: a name, a Config, the fields they read and write, problems."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class OptionError(ValueError):
-    """Raised by the validators of a Config: `reason` says what is wrong, `fix` what to write."""
+    """For validators of a Config: `reason` says what is wrong, `fix` what to write instead."""
 
     def __init__(self, reason: str, fix: str) -> None:
         super().__init__(f"{reason}; {fix}")
@@ -21,10 +21,13 @@ class OptionError(ValueError):
 
 
 class ComponentConfig(BaseModel):
-    """Options of a component: frozen, strict about types, unknown keys refused."""
+    """Options of a component: frozen, strict about types, without unknown keys.
+
+    Document every option with a docstring below it: meaning, unit, what null or 0 means.
+    """
 
     __component__: ClassVar[type[Component] | None] = None
-    """The class whose options these are; None for settings that belong to none."""
+    """The component that has these options; None for settings of a section of a recipe."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -37,14 +40,11 @@ class ComponentConfig(BaseModel):
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """A named tensor that one component leaves for later ones.
+    """A named tensor that one component writes and later ones read.
 
-    shape: trailing shape after the leading (batch, item) dimensions; a str is a symbolic size such
-        as "D".
-    dtype: what the tensor is stored in.
+    shape: after the leading (batch, item) axes; a str is a symbolic size such as "D".
     frame: the coordinate frame of its numbers.
-    encoding: how raw numbers are to be read where more than one way exists; writer and reader must
-        agree.
+    encoding: how to read raw numbers where there are several ways; writer and reader must agree.
     """
 
     shape: tuple[int | str, ...]
@@ -64,7 +64,7 @@ Fields: TypeAlias = Mapping[str, FieldSpec]
 
 @dataclass(frozen=True)
 class ModelDims:
-    """Sizes that all parts of one model share: width D, heads h, decoder depth L."""
+    """Sizes that all parts of a model share: width D, heads h, number of decoder layers."""
 
     width: int
     heads: int
@@ -73,9 +73,9 @@ class ModelDims:
 
 @dataclass(frozen=True)
 class RecipeContext:
-    """What a component may know of the rest of its recipe when its options are checked.
+    """The rest of a recipe, as far as `Component.problems` sees it.
 
-    image_size: (H, W) the data delivers; None when the recipe has no data.
+    image_size: (H, W) of the data's images; None for a recipe without data.
     """
 
     dims: ModelDims
@@ -84,7 +84,7 @@ class RecipeContext:
 
 @dataclass(frozen=True)
 class Problem:
-    """An option that does not fit the rest of the recipe.
+    """What is wrong with an option, and what to do about it.
 
     option: dotted path below the component, "" for the component itself.
     """
@@ -97,9 +97,9 @@ class Problem:
 def without_effect(
     config: ComponentConfig, options: Iterable[str], because: str
 ) -> Iterator[Problem]:
-    """A problem for each of `options` that is not at its default although nothing reads it.
+    """A problem for each of `options` that was changed although nothing reads it.
 
-    because: what else in `config` makes them idle. Defaults pass: resolved recipes spell them out.
+    because: what in `config` makes it idle. Defaults pass, since resolved recipes write them out.
     """
     for option in options:
         default = type(config).model_fields[option].get_default()
@@ -110,15 +110,14 @@ def without_effect(
 
 
 class Component(ABC):
-    """Base of everything that a recipe can name.
+    """Base of everything that a recipe selects with `type: PLUGIN/NAME`.
 
-    A slot's contract sets `slot`; a final class sets `name` and nests its `Config`. A recipe
-    selects it as `type: PLUGIN/NAME`. Classmethods are called with a decoded config before
-    anything is built.
+    A slot's contract sets `slot`; a component sets `name` and nests its `Config`. Classmethods are
+    called with a valid config before anything is built.
 
-    A forward pass treats scenes apart and changes neither its inputs nor what the component keeps,
-    in training neither; there, and there alone, it may draw from torch's global generator. What it
-    reads gets a gradient.
+    `forward`: the scenes of a batch are independent, neither inputs nor parameters and buffers are
+    changed, random numbers are drawn (from torch's global generator) in training only, and every
+    tensor that is read gets a gradient.
     """
 
     slot: ClassVar[str]
@@ -127,12 +126,16 @@ class Component(ABC):
     class Config(ComponentConfig):
         """No options."""
 
+    def __init__(self, config: ComponentConfig) -> None:
+        super().__init__()
+        self.config = config
+
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give every class a Config of its own, which knows the class (see `component_of`)."""
+        """Give every class a Config of its own, for `component_of`."""
         super().__init_subclass__(**options)
         inherited = cls.Config
         if not (isinstance(inherited, type) and issubclass(inherited, ComponentConfig)):
-            return  # no sound component: whoever loads it says so
+            return  # reported when the plugin is loaded
         if inherited.__qualname__ != f"{cls.__qualname__}.Config":
             own: dict[str, Any] = {"__qualname__": f"{cls.__qualname__}.Config"}
             own["__module__"] = cls.__module__
@@ -144,22 +147,22 @@ class Component(ABC):
 
     @classmethod
     def requires(cls, config: ComponentConfig) -> Fields:
-        """Fields that must exist before this component runs, as a function of its options."""
+        """Fields that must exist before this component runs with these options."""
         return {}
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
-        """Fields that exist once this component has run, as a function of its options."""
+        """Fields that exist after this component has run with these options."""
         return {}
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """What is wrong with `config` beside the rest of the recipe; empty when it fits."""
+        """Options that do not fit each other or the rest of the recipe."""
         return ()
 
 
 def component_of(config: ComponentConfig) -> type[Component]:
-    """The class whose options `config` holds; raises TypeError for options of no component."""
+    """The component that has the options `config`; raises TypeError where there is none."""
     component = type(config).__component__ if isinstance(config, ComponentConfig) else None
     if component is None:
         raise TypeError(
@@ -170,20 +173,19 @@ def component_of(config: ComponentConfig) -> type[Component]:
 
 
 class ModelComponent(Component, torch.nn.Module):
-    """A component with parameters, built with the sizes that the whole model shares."""
+    """A component with parameters, built with the sizes that all parts of the model share."""
 
     def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
+        super().__init__(config)
         self.dims = dims
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
         """Whether weight decay applies to `parameter`, called `name` inside this component.
 
-        By default to all but 1-d parameters (biases, norms, LayerScale), as in the LocusGS release.
+        By default, to all but 1-d parameters: biases, norms, LayerScale (LocusGS release).
         """
         return parameter.ndim != 1
 
 
 class MissingExtraError(RuntimeError):
-    """An optional package is needed; the message names it and the command that installs it."""
+    """An optional package is missing; the message names the command that installs it."""

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 from torch import Tensor
+from upath import UPath
 
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.types import Cameras
@@ -57,9 +58,9 @@ class Scene(ABC):
 
 
 class SceneSourceConfig(ComponentConfig):
-    """image_size: (H, W) of every delivered image, in pixels."""
+    """What all sources have in common. Where a source's data lies is its option `path`."""
 
-    undecisive: ClassVar[frozenset[str]] = frozenset({"path"})
+    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path"})
     """Options that change no scene, image or camera: where files lie, how they are kept in memory.
     Hashes of evaluation protocols leave them out."""
 
@@ -68,6 +69,7 @@ class SceneSourceConfig(ComponentConfig):
     an evaluation index names these, hashes of protocols leave them out too."""
 
     image_size: tuple[Side, Side] = (64, 64)
+    """(H, W) of every delivered image, in pixels."""
 
 
 class SceneSource(Component):
@@ -75,6 +77,9 @@ class SceneSource(Component):
 
     Opening a source reads what it needs to list its scenes and raises FileNotFoundError or
     ValueError with the path and the remedy; images are decoded by `Scene.images`.
+
+    A source of files says which paths it reads (`recognises`), so that `qgs reconstruct` and `qgs
+    data` open them without a recipe.
     """
 
     slot: ClassVar[str] = "data"
@@ -84,6 +89,36 @@ class SceneSource(Component):
 
     def __init__(self, config: SceneSourceConfig) -> None:
         self.config = config
+
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """Whether the folder or file `path`, which exists, looks like data of this source.
+
+        Told by names of files; nothing is decoded. By default no path is.
+        """
+        return False
+
+    @classmethod
+    def trains_on(cls, root: UPath, path: UPath) -> bool:
+        """Whether the training data of this source at `root` is `path`, or has it as one scene.
+
+        Both are absolute.
+        """
+        return path == root
+
+    @classmethod
+    def config_for(
+        cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
+    ) -> SceneSourceConfig:
+        """Options that open all frames of `path` for a model that was trained on other data.
+
+        trained: options of that data, of any source; what goes for `path` too is taken over.
+        """
+        options: dict[str, object] = {"path": path, "image_size": image_size}
+        background = getattr(trained, "background", None)
+        if background is not None and "background" in cls.Config.model_fields:
+            options["background"] = background
+        return cls.Config.model_validate(options)
 
     @abstractmethod
     def scenes(self, split: Split) -> Sequence[Scene]:

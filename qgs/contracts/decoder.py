@@ -1,4 +1,8 @@
-"""The slots of a decoder layer: cross-attention, self-attention, feed-forward, refinement."""
+"""Slots of a decoder layer: `cross_attention`, `self_attention`, `feed_forward`, `refinement`.
+
+An attention or feed-forward component holds its norms and its output projection; the decoder layer
+adds LayerScale and the residual sum.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,10 @@ from qgs.types import ImageMemory, QueryState
 
 @dataclass(frozen=True)
 class AttentionWeights:
-    """Attention of chosen queries, for looking inside.
+    """Attention of Q chosen queries to T tokens, for pictures.
 
-    content: (B, h, Q, T) logits of content alone. geometry: (B, 1, Q, T) what geometry adds to
-    them, None where nothing is added. weights: (B, h, Q, T) the softmax of their sum.
+    content: (B, h, Q, T) logits of content alone. geometry: (B, 1, Q, T) what is added to them,
+    None where nothing is. weights: (B, h, Q, T) softmax of the sum.
     """
 
     content: Tensor
@@ -28,13 +32,11 @@ class AttentionWeights:
 class CrossAttention(ModelComponent):
     """(QueryState, ImageMemory) -> update (B, N, D).
 
-    Pre-norm and output projection belong to the component; LayerScale and the residual sum belong
-    to the decoder layer. Neither argument is changed. Raises KeyError for a field the state lacks,
-    which the composer rules out through `requires`, and RuntimeError (torch's) for a memory of
-    another width or number of heads.
+    Raises KeyError for a field that the state lacks (the composer rules this out through
+    `requires`), and RuntimeError (torch's) for a memory of another width or number of heads.
 
-    ordered_views: whether the order of the views has a meaning. Without one, permuting the views of
-    the memory leaves the update as it is.
+    ordered_views: whether the order of the views matters. Otherwise, permuting the views of the
+    memory leaves the update as it is.
     """
 
     slot: ClassVar[str] = "cross_attention"
@@ -47,15 +49,12 @@ class CrossAttention(ModelComponent):
     def explain(
         self, state: QueryState, memory: ImageMemory, queries: Tensor
     ) -> AttentionWeights | None:
-        """Attention of the queries with indices `queries` (Q,); None if it cannot be told."""
+        """Attention of the queries with indices `queries` (Q,); None if it has none to show."""
         return None
 
 
 class SelfAttention(ModelComponent):
-    """QueryState -> update (B, N, D); norm and projection inside, LayerScale and residual outside.
-
-    Permuting the queries (with all their fields) permutes the update.
-    """
+    """QueryState -> update (B, N, D). Permuting queries and fields permutes the update alike."""
 
     slot: ClassVar[str] = "self_attention"
 
@@ -64,14 +63,14 @@ class SelfAttention(ModelComponent):
         """The update of the query features, before LayerScale."""
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights | None:
-        """Attention of the queries with indices `queries` (Q,); None if it cannot be told."""
+        """Attention of the queries with indices `queries` (Q,); None if it has none to show."""
         return None
 
 
 class FeedForward(ModelComponent):
-    """Features (B, N, D) -> update (B, N, D); norm inside, LayerScale and residual outside.
+    """Features (B, N, D) -> update (B, N, D), each query by itself.
 
-    Sees each query by itself. Raises RuntimeError (torch's) for features of another width.
+    Raises RuntimeError (torch's) for features of another width.
     """
 
     slot: ClassVar[str] = "feed_forward"
@@ -82,10 +81,9 @@ class FeedForward(ModelComponent):
 
 
 class Refinement(ModelComponent):
-    """QueryState -> QueryState with refined fields; features are passed on as they are.
+    """QueryState -> QueryState with refined fields and the same features, after each layer.
 
-    Runs at the end of each decoder layer. Layers with the same component and equal options share
-    one module, as the published heads do, unless the class sets `shared_by_layers` to False.
+    shared_by_layers: whether layers with equal options share one module (as in LocusGS).
     """
 
     slot: ClassVar[str] = "refinement"
@@ -93,4 +91,4 @@ class Refinement(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState) -> QueryState:
-        """A new state; the one given stays as it was."""
+        """The refined state."""

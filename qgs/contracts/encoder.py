@@ -19,11 +19,11 @@ MEMORY_FIELDS: Fields = {
 class Encoder(ModelComponent):
     """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
 
-    Runs once per forward pass. Raises ValueError for images it cannot divide into patches. A token
-    may see everything, and tells most of its own patch: that of its view, row and column.
+    Runs once per forward pass. A token may see all views; it depends most on its own patch, that of
+    its view, row and column. Raises ValueError for images that it cannot divide into patches.
 
-    ordered_views: whether the order of the views has a meaning. Without one, permuting the views
-    permutes the tokens.
+    ordered_views: whether the order of the views matters. Otherwise, permuting the views permutes
+    the tokens.
     """
 
     slot: ClassVar[str] = "encoder"

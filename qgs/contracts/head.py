@@ -13,10 +13,9 @@ from qgs.types import GaussianAttributes, QueryState
 
 
 class Head(ModelComponent):
-    """QueryState -> GaussianAttributes of K Gaussians per query (shapes there).
+    """QueryState -> GaussianAttributes of K Gaussians per query, in the ranges given there.
 
-    Scales are positive, quaternions unit (w x y z), opacities in (0, 1), colours in [0, 1];
-    `offsets` stay raw. With initial parameters too, for features other than zero.
+    They hold with initial parameters too, for features other than zero.
     """
 
     slot: ClassVar[str] = "head"
@@ -28,7 +27,7 @@ class Head(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """Decode the attributes of every Gaussian but its mean."""
+        """The attributes of all Gaussians, without their means."""
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
         """No weight decay on a head (TokenGS release)."""
@@ -38,9 +37,8 @@ class Head(ModelComponent):
 class Centers(ModelComponent):
     """(raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
 
-    The state is the one after the refinement of the decoded layer. Means are finite for finite
-    offsets. Raises KeyError for a field the state lacks, which the composer rules out through
-    `requires`.
+    The state is that after the refinement of the decoded layer. Means are finite for finite
+    offsets. Raises KeyError for a field that the state lacks (the composer rules this out).
     """
 
     slot: ClassVar[str] = "centers"

@@ -10,18 +10,17 @@ from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.weights import WeightLayout
 
 CONTRACT_VERSION = 1
-"""Raised when a contract changes so that components written for the old one no longer fit."""
+"""Goes up when components written for the old contracts no longer fit."""
 
 ENTRY_POINT_GROUP = "qgs.plugins"
-"""A distribution lists its `Plugin` object here, under the plugin's name."""
+"""Where a distribution lists its `Plugin` object, under the plugin's name."""
 
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """Why a check of `qgs.testing` of a component ends with an error, such as a missing kernel.
+    """A check of `qgs.testing` that is expected to raise, for example for want of a kernel.
 
-    error: the class of the error, or several; another error is a failure of the check.
-    reason: why that is right.
+    error: the class of the error, or several; the check fails on any other. reason: why.
     """
 
     error: type[Exception] | tuple[type[Exception], ...]
@@ -29,20 +28,20 @@ class ExpectedError:
 
 
 Expected: TypeAlias = str | ExpectedError
-"""A failure that is known: why a component breaks the contract, or an error with the reason."""
+"""Why a component is known to fail a check: a reason, or an error with its reason."""
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """Components under one name. Making or importing one has no side effect.
+    """Components under one name. Importing it has no side effect.
 
     name: the part of `type: NAME/component` before the slash.
     contract_version: the CONTRACT_VERSION that the components were written for.
-    components: final component classes; their `name` is unique within their slot.
-    layouts: published state dicts of models that these components make.
+    components: component classes; a `name` is unique within its slot.
+    layouts: weights that other codebases publish and these components can load.
     examples: options that `qgs check-plugin` tries besides the defaults of every component.
-    exemptions: checks of `qgs.testing` that a component is known to fail, each with the reason;
-        by class, or by options where the component passes with others.
+    exemptions: checks of `qgs.testing` that a component is known to fail, and why; by class, or by
+        options where it passes with others.
     """
 
     name: str

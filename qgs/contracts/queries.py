@@ -13,7 +13,7 @@ from qgs.contracts.component import ModelComponent
 from qgs.types import QueryState, SpatialSupport
 
 GROWTH_NOISE = 0.01
-"""Standard deviation by which a new query differs from the one it copies (LocusGS release)."""
+"""Standard deviation of the noise added to the copy of a query (LocusGS release)."""
 
 
 class Queries(ModelComponent):
@@ -37,13 +37,11 @@ class Queries(ModelComponent):
     def resized(
         self, learned: Mapping[str, Tensor], generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Parameters for these queries, made of those `learned` by another number of them.
+        """A state dict for these queries, made of one `learned` with another number of queries.
 
-        learned: named as in this component's state dict, on the CPU; sizes differ in the
-            leading dimension alone, where one item belongs to one query.
-        Fewer queries are the first. Of more, the first are the learned ones and query i copies
-        query i modulo their number, all its parameters plus noise of N(0, 0.01) (LocusGS release,
-        finetuning). Shapes that agree are kept as they are.
+        learned: on the CPU; shapes differ from ours in the first axis alone, the queries.
+        Shrinking keeps the first N. Growing keeps all; query i beyond them copies query i modulo
+        their number, plus noise of N(0, 0.01) on all parameters (LocusGS release, finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}
         return {
@@ -52,12 +50,12 @@ class Queries(ModelComponent):
         }
 
     def support(self, state: QueryState) -> SpatialSupport | None:
-        """Where each query of `state` looks; None for queries without a place in space."""
+        """Where each query of `state` looks; None for queries without a position."""
         return None
 
 
 def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """The first `count` items of `values`, or all of them and noisy copies, in turn."""
+    """The first `count` items of `values`, or all of them and then noisy copies in turn."""
     if count <= len(values):
         return values[:count]
     copied = values[torch.arange(len(values), count) % len(values)]

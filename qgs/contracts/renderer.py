@@ -48,14 +48,12 @@ class RendererConfig(ComponentConfig):
 class Renderer(Component, torch.nn.Module):
     """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
 
-    Differentiable in every Gaussian parameter and in the tensors of the cameras that
-    `camera_gradients` names. Zero Gaussians, and Gaussians behind the camera, off screen or huge,
-    give finite images and finite gradients.
+    Differentiable in all Gaussian parameters. Images and gradients are finite, also for no
+    Gaussians and for Gaussians behind the camera, off screen or huge.
 
-    devices: types of the devices that it renders on. camera_gradients: of "c2w" and "intrinsics",
-    those with a gradient on all of these devices; poses stay rigid, so that of c2w counts along
-    rotations and translations alone. Another one that requires a gradient is refused with a
-    ValueError where there is none, never left without it in silence.
+    devices: types of torch devices that it renders on, such as "cpu", "cuda", "mps".
+    camera_gradients: those of "c2w" and "intrinsics" that have a gradient on all these devices (of
+        c2w, along rotations and translations). A ValueError refuses others that require one.
     """
 
     slot: ClassVar[str] = "renderer"
@@ -65,9 +63,7 @@ class Renderer(Component, torch.nn.Module):
     class Config(RendererConfig):
         """The settings of every renderer; add your own below."""
 
-    def __init__(self, config: RendererConfig) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
+    config: RendererConfig
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
@@ -84,7 +80,7 @@ class Renderer(Component, torch.nn.Module):
     ) -> Rendering:
         """Render every scene from each of its cameras.
 
-        background: RGB (3,); None takes the configured one.
-        Raises ValueError when Gaussians and cameras disagree in batch size or device, and for
-        cameras that require a gradient which it does not have.
+        background: RGB (3,); None for the configured one.
+        Raises ValueError for Gaussians and cameras of different batch sizes or devices, and for
+        cameras that require a gradient which there is not.
         """

@@ -1,15 +1,12 @@
-"""The settings of a recipe that are no components: views, training, evaluation."""
+"""Sections of a recipe that are not components: views, training, evaluation."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal
 
 from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
-
-SsimCovariance: TypeAlias = Literal["population", "sample"]
-Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
 class ViewsConfig(ComponentConfig):
@@ -45,68 +42,60 @@ class ViewsConfig(ComponentConfig):
 
 
 class TrainingConfig(ComponentConfig):
-    """The optimisation (LocusGS release, base stage).
-
-    steps: optimiser steps. seconds: a time budget; when set, training ends at whichever of the two
-    comes first and the schedule follows the larger of the two fractions. batch_size: scenes per
-    step and process. accumulate: batches per optimiser step. learning_rate: peak of the one-cycle
-    cosine. warmup: optimiser steps up to the peak. initial_divisor: peak over first rate.
-    final_divisor: first rate over last rate (torch's OneCycleLR). betas, weight_decay: of AdamW.
-    clip: gradient norm. precision: autocast dtype. save_every: steps between checkpoints, 0 for
-    none but at the end and before evaluations. collapse_window: steps of background-only output
-    after which training stops. workers: processes that decode data, 0 for a thread of this one.
-    render_views: target views rendered at a time, 0 for all; bounds memory and changes no gradient.
-    ema: decay of an exponential moving average of the weights, saved and evaluated beside them.
-    on_nonfinite: after a NaN or infinite loss or gradient, whose batch and weights are saved,
-    training stops or skips the step. evaluate_every: steps between evaluations with pictures, 0 for
-    none. trackers: where metrics go besides the run's own history.
-    """
+    """How a model is trained, the optimiser aside (defaults: LocusGS release, base stage)."""
 
     steps: int = Field(default=150_000, ge=1)
+    """Optimiser steps."""
     seconds: float | None = Field(default=None, gt=0)
+    """Time budget; training ends when this or `steps` is used up. null: `steps` alone."""
     batch_size: int = Field(default=16, ge=1)
+    """Scenes per batch and process."""
     accumulate: int = Field(default=1, ge=1)
-    learning_rate: float = Field(default=4e-4, gt=0)
-    warmup: int = Field(default=2000, ge=0)
-    initial_divisor: float = Field(default=25.0, ge=1)
-    final_divisor: float = Field(default=1000.0, ge=1)
-    betas: tuple[Decay, Decay] = (0.9, 0.95)
-    weight_decay: float = Field(default=0.05, ge=0)
+    """Batches per optimiser step."""
     clip: float = Field(default=1.0, gt=0)
+    """Largest norm of the gradient; a larger one is scaled down to it."""
     precision: Literal["float32", "bf16"] = "bf16"
+    """What the model computes in; bf16 is torch's autocast, weights stay float32."""
     save_every: int = Field(default=1000, ge=0)
+    """Steps between checkpoints; 0 saves at the end and before evaluations only."""
     collapse_window: int = Field(default=50, ge=10, le=100)
+    """Steps in a row without signs of life (empty renderings, no gradient) that end training."""
     workers: int = Field(default=0, ge=0)
+    """Processes that decode data; 0 for a thread of the training process."""
     render_views: int = Field(default=0, ge=0)
+    """Target views rendered at a time, which bounds memory and changes no gradient; 0 for all."""
     ema: float | None = Field(default=None, gt=0, lt=1)
+    """Decay of a moving average of the weights, saved and evaluated beside them; null for none."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
+    """What a step with a NaN or infinite loss or gradient does; its batch and weights are saved."""
     evaluate_every: int = Field(default=0, ge=0)
+    """Steps between evaluations with pictures; 0 for none."""
     trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    """Where numbers and pictures go besides the folder of the run."""
 
 
 class EvaluationConfig(ComponentConfig):
-    """What `qgs eval` runs.
-
-    scenes: test scenes, at most. samples: view samples from each. seed: of their views. index: a
-    JSON file {scene: null | {"context": [frames], "target": [frames]}} that names scenes and frames
-    instead (pixelSplat's format); then scenes, samples and seed mean nothing. Frames are positions
-    in the scene's frames, the path is relative to the working directory. protocol: a name for these
-    settings in tables, by default the index's file name; what decides the numbers, the index's
-    content included, is hashed beside it. metrics: besides PSNR and SSIM. ssim_covariance:
-    population as in Wang et al. 2004, or sample, scikit-image's default, by which pixelSplat's
-    evaluation and those derived from it score. lpips_weights: file of VGG-16 weights (safetensors,
-    or torchvision's vgg16-397923af.pth), None for torch's cache. tuning_steps, tuning_rate: token
-    tuning on the input views before each scene is judged, with the recipe's photometric loss
-    (TokenGS: 50 steps of Adam at 1e-4); 0 for none.
-    """
+    """What `qgs eval` runs: which views are judged, after how much tuning; see also `metrics`."""
 
     scenes: int = Field(default=32, ge=1)
+    """Test scenes that are judged, at most; without effect beside `index`."""
+
     samples: int = Field(default=1, ge=1)
+    """View samples drawn from each scene; without effect beside `index`."""
+
     seed: int = Field(default=0, ge=0)
+    """Of the views that are drawn; without effect beside `index`."""
+
     index: str | None = None
+    """JSON file {scene: null | {"context": [frames], "target": [frames]}} of the views to judge
+    (pixelSplat's format), relative to the working directory; null draws them."""
+
     protocol: str | None = None
-    metrics: tuple[Literal["lpips"], ...] = ()
-    ssim_covariance: SsimCovariance = "population"
-    lpips_weights: str | None = None
+    """Name of these settings in tables; null takes the name of the index file."""
+
     tuning_steps: int = Field(default=0, ge=0)
+    """Steps of token tuning on the input views of each scene before it is judged, with the recipe's
+    photometric loss (TokenGS: 50); 0 for none."""
+
     tuning_rate: float = Field(default=1e-4, gt=0)
+    """Learning rate of token tuning, by Adam (TokenGS: 1e-4)."""

@@ -1,4 +1,4 @@
-"""Published weight layouts: how another codebase names what a model of ours has learned."""
+"""Weights that other codebases publish: their names for our parameters, and recipes that fit."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
 
 
 class LayoutError(ValueError):
-    """Published names and shapes that no recipe stands for; the message says why."""
+    """Published names and shapes that fit no recipe; the message says why."""
 
 
 @dataclass(frozen=True)
 class Rename:
-    """One module or parameter under both names; `{}` stands for a layer's number.
+    """Our and their name of a module or parameter; `{}` stands for the number of a layer.
 
-    Names that end with a dot are modules: what follows the dot is the same on both sides.
+    Names that end with a dot are modules; what follows is the same on both sides.
     """
 
     ours: str
     theirs: str
 
     def renamed(self, ours: str) -> str | None:
-        """The published name of `ours`; None for a name that this rename does not cover."""
+        """The published name of `ours`; None if this rename does not apply."""
         pattern = re.escape(self.ours).replace(r"\{\}", r"(\d+)")
         match = re.match(pattern if self.ours.endswith(".") else pattern + "$", ours)
         if match is None:
@@ -36,27 +36,18 @@ class Rename:
 
 
 @dataclass(frozen=True)
-class Unused:
-    """A published parameter that nothing reads, beside one that is read; both with `{}`."""
-
-    theirs: str
-    beside: str
-
-
-@dataclass(frozen=True)
 class WeightLayout:
-    """The state dict of one published codebase.
+    """Names and shapes in the state dicts of one published codebase.
 
     name: what the codebase calls its model. source: where it is published.
-    components: slot to the component types whose parameters it has names for; slots without
-        parameters may name the types that the codebase knows.
-    renames: the first that covers a name applies.
-    unused: what the codebase stores and never reads.
-    marks: published names that files of this layout have and files of others lack.
-    read: names and shapes of a whole state dict to the recipe that fits, a plain mapping with
-        `recipe: 1`; raises LayoutError. What shapes leave open is as in the published model.
-    legible: dotted paths of the options that `read` takes from names and shapes.
-    undecided: what shapes leave open, in words, with the choice that `read` makes.
+    components: slot to the component types that the codebase has; other slots may hold any.
+    renames: the first that applies to a name counts.
+    marks: published names that tell this layout from others.
+    unused: from a published name to that of a parameter stored beside it, which their code ignores.
+    read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
+        raises LayoutError.
+    read_options: dotted paths of the options that `read` takes from names and shapes.
+    undecided: what names and shapes leave open, in words, and what `read` chooses: the published.
     """
 
     name: str
@@ -65,8 +56,8 @@ class WeightLayout:
     renames: tuple[Rename, ...]
     marks: tuple[str, ...]
     read: Callable[[Shapes], dict[str, Any]]
-    legible: tuple[str, ...]
-    unused: tuple[Unused, ...] = ()
+    read_options: tuple[str, ...]
+    unused: tuple[Rename, ...] = ()
     undecided: tuple[str, ...] = ()
 
     def published_name(self, ours: str) -> str | None:
@@ -74,23 +65,23 @@ class WeightLayout:
         return next((name for r in self.renames if (name := r.renamed(ours)) is not None), None)
 
     def unused_names(self, theirs: Iterable[str]) -> list[str]:
-        """Published parameters that are stored beside `theirs` and never read."""
-        rules = [Rename(unused.beside, unused.theirs) for unused in self.unused]
-        return [name for key in theirs for rule in rules if (name := rule.renamed(key)) is not None]
+        """Published parameters that are stored beside `theirs` and never used."""
+        found = (rule.renamed(name) for name in theirs for rule in self.unused)
+        return [name for name in found if name is not None]
 
     def marks_all_in(self, names: Iterable[str]) -> bool:
-        """Whether a state dict with these published names is of this layout."""
+        """Whether a state dict with these published names has this layout."""
         return set(self.marks) <= set(names)
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:
-    """How many layers are stored as `prefix`N.: one more than the largest N, 0 for none."""
+    """Number of layers stored as `prefix`N.: the largest N plus one."""
     pattern = re.compile(re.escape(prefix) + r"(\d+)\.")
     return max((int(match[1]) + 1 for name in shapes if (match := pattern.match(name))), default=0)
 
 
 def size_at(shapes: Shapes, name: str, axis: int) -> int:
-    """One side of a published parameter; raises LayoutError when it is missing or flatter."""
+    """Size of an axis of a published parameter; raises LayoutError if there is none."""
     if name not in shapes:
         raise LayoutError(f"{name} is missing, from which a size would be read off")
     if not -len(shapes[name]) <= axis < len(shapes[name]):
@@ -99,14 +90,14 @@ def size_at(shapes: Shapes, name: str, axis: int) -> int:
 
 
 def whole_ratio(size: int, unit: int, what: str) -> int:
-    """size / unit; raises LayoutError, about `what`, where that is no whole number."""
+    """size / unit; raises LayoutError about `what` if that is no whole number."""
     if unit < 1 or size % unit or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     return size // unit
 
 
 def real_ratio(size: int, unit: int, what: str) -> float:
-    """The ratio of which int(ratio * unit) is `size`; raises LayoutError where there is none."""
+    """A ratio such that int(ratio * unit) is `size`; raises LayoutError if there is none."""
     if unit < 1 or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     ratio = size / unit

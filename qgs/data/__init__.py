@@ -6,5 +6,6 @@ from qgs.data.dl3dv import Dl3dvSource
 from qgs.data.photos.source import PhotosSource, read_photos
 
 COMPONENTS: tuple[type[Component], ...] = (ChunksSource, Dl3dvSource, PhotosSource)
+"""In the order in which they are asked whether they recognise a path."""
 
 __all__ = ["COMPONENTS", "ChunksSource", "Dl3dvSource", "PhotosSource", "read_photos"]

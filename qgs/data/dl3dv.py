@@ -3,63 +3,110 @@
 from __future__ import annotations
 
 import json
-import logging
+import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import ClassVar, TypeAlias, cast
 
 from pydantic import Field
-from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.lazy import LazyScenes
 from qgs.data.paths import ArchivePath, opened_path
-from qgs.data.photos.scene import Development, EncodedFrame, EncodedScene, PhotoScene, pixel_cache
-from qgs.data.photos.source import held_out_frames, present_frames
-from qgs.types import Cameras
-
-
-def read_scene_list(file: UPath) -> list[str]:
-    """Names of scenes in a file: the keys of a JSON mapping, such as an evaluation index, a JSON
-    list of names, or lines of text, where what follows # is a comment.
-
-    Raises FileNotFoundError, and ValueError for a file that names no scene.
-    """
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"the list of scenes {file} does not exist") from None
-    if file.suffix == ".json":
-        names = _from_json(file, text)
-    else:
-        lines = (line.partition("#")[0].strip() for line in text.splitlines())
-        names = [line for line in lines if line]
-    if not names:
-        raise ValueError(f"the list of scenes {file} names no scene: write one on each line")
-    return list(dict.fromkeys(names))
-
-
-def _from_json(file: UPath, text: str) -> list[str]:
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{file} is not valid JSON ({error})") from error
-    if not isinstance(data, dict | list) or not all(isinstance(name, str) for name in data):
-        raise ValueError(
-            f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
-        )
-    return list(data)
-
-
-_log = logging.getLogger(__name__)
+from qgs.data.photos import formats_of
+from qgs.data.photos.source import PhotoScene, PhotoScenes, PhotosConfig
+from qgs.data.scenes import warn_once
 
 LISTING = "transforms.json"
-_INSIDE = ("", "gaussian_splat", "nerfstudio")
+_INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
 _DEPTH = 2  # folders between the data set's and a scene
+_HASH = re.compile(r"[0-9a-f]{64}")
 
 Place: TypeAlias = UPath | ArchivePath
 """An archive's top or a folder: what a scene is published as."""
+
+
+class Dl3dvConfig(SceneSource.Config):
+    """Options of `qgs/dl3dv`."""
+
+    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
+
+    path: str
+    """Folder or fsspec URL of the data set, of a subset or of one scene, relative to the working
+    directory."""
+    images: str | None = None
+    """Folder of photos to read, such as images_4; null for the least reduced one of a scene."""
+    test_scenes: str | None = None
+    """File that names the test scenes, all others being for training: an evaluation index, a JSON
+    list or lines of text; null trains on all."""
+    holdout: int = Field(default=0, ge=0)
+    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 for none."""
+    max_scenes: int = Field(default=0, ge=0)
+    """Only the first scenes of each split by name; 0 for all."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
+
+
+class Dl3dvScenes(PhotoScenes):
+    """The scenes of a split, each read when it is asked for."""
+
+    def __init__(self, places: Mapping[str, Place], config: Dl3dvConfig) -> None:
+        wanted = dict(list(places.items())[: config.max_scenes or None])
+        same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
+        photos = PhotosConfig(format="nerfstudio", **same)
+        super().__init__(cast(Mapping[str, UPath], wanted), photos, cache_bytes=0)
+
+    def open(self, name: str, folder: UPath) -> PhotoScene:
+        """See `PhotoScenes`; raises as `scene_folder` too."""
+        return super().open(name, scene_folder(folder))
+
+
+class Dl3dvSource(SceneSource):
+    """Scenes of DL3DV, read in place: archives are not unpacked.
+
+    Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
+    `holdout` asks for any. Intrinsics are those of transforms.json, scaled to the photos' size.
+    Images that do not exist are left out, counted and named in a warning; so are scenes of
+    `test_scenes` that are not there.
+    """
+
+    name = "dl3dv"
+    Config = Dl3dvConfig
+
+    def __init__(self, config: Dl3dvConfig) -> None:
+        super().__init__(config)
+        places = find_scenes(opened_path(config.path))
+        train, test = places, places if config.holdout else {}
+        if config.test_scenes is not None:
+            listed = read_scene_list(opened_path(config.test_scenes))
+            absent = [name for name in listed if name not in places]
+            test = {name: places[name] for name in listed if name in places}
+            train = {name: place for name, place in places.items() if name not in test}
+            if absent:
+                names = ", ".join(absent)
+                warn_once(f"{len(absent)} of {len(listed)} test scenes are not there: {names}")
+        self._splits = {"train": Dl3dvScenes(train, config), "test": Dl3dvScenes(test, config)}
+
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """Archives, and folders named by a hash or laid out as DL3DV's benchmark, also in folders
+        such as 1K. A folder of photos that lists them itself is left to `qgs/photos`.
+        """
+        if path.is_file():
+            return path.suffix == ".zip"
+        return not formats_of(path) and any(
+            isinstance(place, ArchivePath) or _HASH.fullmatch(name) or not formats_of(place)
+            for name, place in _places(path, _DEPTH)
+        )
+
+    def scenes(self, split: Split) -> Sequence[Scene]:
+        """See `SceneSource`."""
+        return self._splits[split]
+
+    def names(self, split: Split) -> Sequence[str]:
+        """See `SceneSource`."""
+        return self._splits[split].names
 
 
 def find_scenes(path: UPath) -> dict[str, Place]:
@@ -75,10 +122,8 @@ def find_scenes(path: UPath) -> dict[str, Place]:
             "or {hash}/"
         )
     scenes: dict[str, Place] = {}
-    again: set[str] = set()
-    for name, place in sorted(_places(path, _DEPTH), key=lambda item: (item[0], str(item[1]))):
-        if name in scenes:
-            again.add(name)
+    found = sorted(_places(path, _DEPTH), key=lambda item: (item[0], str(item[1])))
+    for name, place in found:
         if name not in scenes or isinstance(scenes[name], ArchivePath):
             scenes[name] = place
     if not scenes:
@@ -87,11 +132,12 @@ def find_scenes(path: UPath) -> dict[str, Place]:
             f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING}, also "
             f"in folders such as 1K/, found {inside}"
         )
+    again = [name for name, times in Counter(name for name, _ in found).items() if times > 1]
     if again:
-        _log.warning(
-            "%d scenes of %s are there more than once, as folders or archives; one of each is "
-            "read: %s", len(again), path, ", ".join(f"{n} ({scenes[n]})" for n in sorted(again)),
-        )  # fmt: skip
+        warn_once(
+            f"{len(again)} scenes of {path} are there more than once, as folders or archives; one "
+            f"of each is read: {', '.join(f'{name} ({scenes[name]})' for name in again)}"
+        )
     return scenes
 
 
@@ -100,16 +146,12 @@ def _places(path: UPath, depth: int) -> Iterator[tuple[str, Place]]:
         yield path.stem, ArchivePath(path)
     elif not path.is_dir():
         return
-    elif _holds_listing(path):
+    elif any((path / inside / LISTING).is_file() for inside in _INSIDE):
         yield path.name, path
     elif depth:
         for item in path.iterdir():
             if not item.name.startswith("."):
                 yield from _places(item, depth - 1)
-
-
-def _holds_listing(folder: UPath) -> bool:
-    return any((folder / inside / LISTING).is_file() for inside in _INSIDE)
 
 
 def scene_folder(place: Place) -> UPath:
@@ -121,165 +163,46 @@ def scene_folder(place: Place) -> UPath:
     tops: list[Place] = [place]
     if isinstance(place, ArchivePath):
         tops += [item for item in place.iterdir() if item.is_dir() and item.name not in _INSIDE]
-    found = [top for top in tops if _within(top)]
+    found: dict[str, Place] = {}  # name of the top to its first folder with a listing
+    for top in tops:
+        for folder in (top / inside if inside else top for inside in _INSIDE):
+            if (folder / LISTING).is_file():
+                found.setdefault(top.name, folder)
     if not found:
         raise FileNotFoundError(
             f"{place} holds no {LISTING}, at its top or in gaussian_splat/ or nerfstudio/: "
             "download the scene again, or remove it"
         )
     if len(found) > 1:
+        first, second, *_ = found
         raise ValueError(
-            f"{place} holds {len(found)} scenes, {found[0].name} and {found[1].name} among them, "
+            f"{place} holds {len(found)} scenes, {first} and {second} among them, "
             "and one is expected in an archive: unpack it, and give the folder"
         )
-    return cast(UPath, _within(found[0])[0])
+    return cast(UPath, next(iter(found.values())))
 
 
-def _within(top: Place) -> list[Place]:
-    folders = [top / inside if inside else top for inside in _INSIDE]
-    return [folder for folder in folders if (folder / LISTING).is_file()]
+def read_scene_list(file: UPath) -> list[str]:
+    """Names of scenes in a file: the keys of a JSON mapping, such as an evaluation index, a JSON
+    list of names, or lines of text, where what follows # is a comment.
 
-
-class Dl3dvConfig(SceneSource.Config):
-    """Options of `qgs/dl3dv`.
-
-    path: folder or fsspec URL of the data set, of a subset or of one scene, relative to the working
-    directory. images: folder of photos to read, such as images_4; the least reduced one of a scene
-    by default. test_scenes: file that names the scenes of the test split, whose other scenes are
-    for training: an evaluation index, a JSON list or lines of text. holdout: every n-th frame of
-    each scene is kept for evaluation, from frame n // 2 on; 0 for none. max_scenes: only the first
-    scenes of each split by name, 0 for all. background: RGB behind transparent pixels.
+    Raises FileNotFoundError, and ValueError for a file that names no scene.
     """
-
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {
-        "test_scenes",
-        "max_scenes",
-    }
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
-
-    path: str
-    images: str | None = None
-    test_scenes: str | None = None
-    holdout: int = Field(default=0, ge=0)
-    max_scenes: int = Field(default=0, ge=0)
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-class Dl3dvScenes(LazyScenes):
-    """The scenes of a split, each read when it is asked for."""
-
-    def __init__(self, places: Mapping[str, Place], config: Dl3dvConfig) -> None:
-        self._places, self._config = list(places.items()), config
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def scene(self, place: int) -> Dl3dvScene:
-        """See `LazyScenes`."""
-        return Dl3dvScene(*self._places[place], self._config)
-
-
-class Dl3dvScene(EncodedScene):
-    """A scene that is opened when more than its name is asked for; see `open_scene`."""
-
-    def __init__(self, name: str, place: Place, config: Dl3dvConfig) -> None:
-        self.name = name
-        self._place, self._config = place, config
-
-    @cached_property
-    def _photos(self) -> PhotoScene:
-        return open_scene(self.name, self._place, self._config)
-
-    def __len__(self) -> int:
-        return len(self._photos)
-
-    @property
-    def held_out(self) -> Sequence[int]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """See `Scene`."""
-        return self._photos.held_out
-
-    @property
-    def missing(self) -> Sequence[str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """See `Scene`."""
-        return self._photos.missing
-
-    @property
-    def cameras(self) -> Cameras:
-        """See `Scene`; float64."""
-        return self._photos.cameras
-
-    def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`. Raises ValueError for a file that cannot be decoded."""
-        return self._photos.images(frames)
-
-    def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`."""
-        return self._photos.masks(frames)
-
-    def frame_name(self, frame: int) -> str:
-        """See `Scene`: the image file, relative to the folder of transforms.json."""
-        return self._photos.frame_name(frame)
-
-    def encoded(self, frame: int) -> EncodedFrame:
-        """See `EncodedScene`."""
-        return self._photos.encoded(frame)
-
-
-def open_scene(name: str, place: Place, config: Dl3dvConfig) -> PhotoScene:
-    """A scene of DL3DV; images that do not exist are left out, counted and named in a warning.
-
-    Intrinsics are those of transforms.json, for images of its `w` and `h`, scaled to the size that
-    the folder of photos has. Raises FileNotFoundError and ValueError, with what to do, for a scene
-    without photos or with poses or intrinsics that cannot be meant.
-    """
-    frames, missing = present_frames(scene_folder(place), "nerfstudio", config.images)
-    development = Development(config.image_size, config.background)
-    held_out = held_out_frames(frames, config.holdout)
-    scene = PhotoScene(name, frames, development, held_out, pixel_cache(0))
-    scene.missing = missing
-    return scene
-
-
-class Dl3dvSource(SceneSource):
-    """Scenes of DL3DV, read in place: archives are not unpacked.
-
-    Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
-    `holdout` asks for any.
-
-    absent: scenes that `test_scenes` names and that are not there, which are counted and named in a
-    warning.
-    """
-
-    name = "dl3dv"
-    Config = Dl3dvConfig
-
-    def __init__(self, config: Dl3dvConfig) -> None:
-        super().__init__(config)
-        places = find_scenes(opened_path(config.path))
-        self.absent: list[str] = []
-        if config.test_scenes is None:
-            train = _scenes(places, config)
-            test = train if config.holdout else _scenes({}, config)
-        else:
-            listed = read_scene_list(opened_path(config.test_scenes))
-            self.absent = [name for name in listed if name not in places]
-            self._tell_absent(len(listed))
-            chosen = {name: places[name] for name in listed if name in places}
-            train = _scenes({n: p for n, p in places.items() if n not in chosen}, config)
-            test = _scenes(chosen, config)
-        self._splits: dict[Split, Dl3dvScenes] = {"train": train, "test": test}
-
-    def _tell_absent(self, listed: int) -> None:
-        if self.absent:
-            _log.warning(
-                "%d of %d test scenes are not there: %s",
-                len(self.absent), listed, ", ".join(self.absent),
-            )  # fmt: skip
-
-    def scenes(self, split: Split) -> Sequence[Scene]:
-        """See `SceneSource`."""
-        return self._splits[split]
-
-
-def _scenes(places: Mapping[str, Place], config: Dl3dvConfig) -> Dl3dvScenes:
-    return Dl3dvScenes(dict(list(places.items())[: config.max_scenes or None]), config)
+    if not file.is_file():
+        raise FileNotFoundError(f"the list of scenes {file} does not exist")
+    text = file.read_text(encoding="utf-8-sig")
+    if file.suffix == ".json":
+        try:
+            names = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{file} is not valid JSON ({error})") from error
+        if not isinstance(names, dict | list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(
+                f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
+            )
+    else:
+        lines = (line.partition("#")[0].strip() for line in text.splitlines())
+        names = [line for line in lines if line]
+    if not names:
+        raise ValueError(f"the list of scenes {file} names no scene: write one on each line")
+    return list(dict.fromkeys(names))

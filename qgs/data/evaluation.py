@@ -9,25 +9,27 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
 from qgs.data.paths import opened_path
 from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, training_frames
+from qgs.geometry.poses import largest_distance
 
 FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
 
 
 class IndexEntry(BaseModel):
-    """Frames of one scene, as positions in its list of frames; what else a file says is ignored.
-
-    context: the input frames, the first of which sets the model's frame. target: those judged.
-    """
+    """Frames of one scene, as positions in its list of frames; what else a file says is ignored."""
 
     model_config = ConfigDict(frozen=True)
 
     context: FrameList
+    """The input frames, the first of which sets the model's frame."""
     target: FrameList
+    """The frames that are judged."""
 
     @property
     def both(self) -> tuple[int, ...]:
@@ -39,7 +41,7 @@ EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
 GIVEN = "frames as context and as target"
-"""What `given_targets` are, in words; no score tells anything about them."""
+"""What `given_targets` are, in words; a score on them means nothing."""
 
 
 def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
@@ -48,7 +50,6 @@ def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, .
 
 
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
-_ADAPTER = TypeAdapter(dict[str, IndexEntry | None])
 _SHOWN = 5
 
 
@@ -65,27 +66,24 @@ def read_index(path: str) -> EvaluationIndex:
             f"{_FORM}, relative to the working directory"
         )
     try:
-        index = _ADAPTER.validate_python(
-            json.loads(file.read_text(encoding="utf-8"), object_pairs_hook=_without_repeats)
-        )
-    except ValidationError as error:
-        raise ValueError(f"{path} is no evaluation index {_FORM}: {_told(error)}") from None
+        text = file.read_text(encoding="utf-8")
+        written = json.loads(text, object_pairs_hook=_without_repeats)
+        index = TypeAdapter(dict[str, IndexEntry | None]).validate_python(written)
     except ValueError as error:
-        raise ValueError(f"{path} is no evaluation index {_FORM}: {error}") from error
+        reason = _reasons(error) if isinstance(error, ValidationError) else error
+        raise ValueError(f"{path} is no evaluation index {_FORM}: {reason}") from error
     if not any(index.values()):
         raise ValueError(f"the evaluation index {path} names no scene to judge")
     return index
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    times = Counter(key for key, _ in pairs)
-    repeated = [key for key, count in times.items() if count > 1]
-    if repeated:
+    if repeated := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
         raise ValueError(f"written twice: {', '.join(repeated[:_SHOWN])}")
     return dict(pairs)
 
 
-def _told(error: ValidationError) -> str:
+def _reasons(error: ValidationError) -> str:
     found = [f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()]
     more = len(found) - _SHOWN
     return "; ".join(found[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
@@ -129,7 +127,7 @@ class EvaluationPlan:
         self._views, self._evaluation, self._index = views, evaluation, index
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
-        self._count = Counter(names)
+        self._times = Counter(names)
         self.wanted: tuple[str, ...] = tuple(dict.fromkeys(names[: evaluation.scenes]))
         self.null: tuple[str, ...] = ()
         self.unlisted: tuple[str, ...] = ()
@@ -142,26 +140,31 @@ class EvaluationPlan:
         """The samples, one decoded at a time; a scene that fails ends with its failure."""
         for name in self.wanted:
             try:
-                scene, place = self._open(name)
+                if name not in self._places:
+                    raise ValueError("not among the test scenes of the data")
+                if self._times[name] > 1:
+                    raise ValueError(f"{self._times[name]} test scenes of the data have this name")
+                place = self._places[name]
+                scene = self._scenes[place]
                 for frames in self._choices(scene, place):
                     yield make_sample(scene, *frames, self._views, mirror=False)
-            except Exception as error:  # whatever a reader raises is told, and never ends the rest
-                yield SceneFailure(name, told(error))
+            except Exception as error:  # whatever a reader raises; the other scenes go on
+                yield SceneFailure(name, one_line(error))
 
-    def _open(self, name: str) -> tuple[Scene, int]:
-        """The scene and its place in the split."""
-        if name not in self._places:
-            raise ValueError("not among the test scenes of the data")
-        if self._count[name] > 1:
-            raise ValueError(f"{self._count[name]} test scenes of the data have this name")
-        return self._scenes[self._places[name]], self._places[name]
-
-    def _choices(self, scene: Scene, place: int) -> Iterable[FrameChoice]:
+    def _choices(self, scene: Scene, place: int) -> Iterator[FrameChoice]:
+        limit = self._evaluation.scenes
         if self._index is not None:
-            return [_listed(scene, self._index)]
-        if scene.held_out:
-            return _thinned(held_out_windows(scene, self._views), self._evaluation.scenes)
-        return _drawn(scene, place, self._views, self._evaluation)
+            yield _named(scene, self._index)
+        elif scene.held_out:
+            windows = held_out_windows(scene, self._views)
+            kept = np.linspace(0, len(windows) - 1, min(limit, len(windows))).round().astype(int)
+            yield from (windows[i] for i in kept)
+        else:
+            for k in range(self._evaluation.samples):
+                rng = np.random.default_rng([self._evaluation.seed, place, k])
+                inputs, drawn = draw_frames(scene, self._views, rng)
+                between = tuple(f for f in range(inputs[0], inputs[-1] + 1) if f not in inputs)
+                yield inputs, between or tuple(sorted(set(drawn)))
 
 
 def evaluation_samples(
@@ -182,7 +185,18 @@ def evaluation_samples(
     return samples
 
 
-def told(error: Exception) -> str:
+def true_depth(source: SceneSource, sample: Sample) -> Tensor | None:
+    """Depth (T, 1, H, W) of the targets in the sample's units; None where the scene has none."""
+    scene = source.scenes("test")[list(source.names("test")).index(sample.scene)]
+    depth = scene.depths(sample.target_frames)
+    if depth is None:
+        return None
+    own = scene.cameras[[sample.input_frames[0], *sample.target_frames]].c2w
+    ours = torch.cat([sample.inputs.cameras.c2w[0, :1], sample.targets.cameras.c2w[0]])
+    return depth * float(largest_distance(ours) / largest_distance(own))
+
+
+def one_line(error: Exception) -> str:
     """An exception in one line; its kind is left out where the message is for users."""
     message = " ".join(str(error).split())
     if isinstance(error, ValueError | FileNotFoundError) and message:
@@ -218,7 +232,8 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
     return windows
 
 
-def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
+def _named(scene: Scene, index: EvaluationIndex) -> FrameChoice:
+    """The frames of `scene` that `index` names; raises ValueError where it lacks one."""
     entry = index[scene.name]
     assert entry is not None
     if scene.missing:
@@ -229,22 +244,6 @@ def _listed(scene: Scene, index: EvaluationIndex) -> FrameChoice:
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
         numbers = ", ".join(map(str, outside))
-        told = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
-        raise ValueError(f"{told} out of range, it has frames 0 to {len(scene) - 1}")
+        which = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
+        raise ValueError(f"{which} out of range, it has frames 0 to {len(scene) - 1}")
     return tuple(entry.context), tuple(entry.target)
-
-
-def _thinned(windows: list[FrameChoice], limit: int) -> list[FrameChoice]:
-    if len(windows) <= limit:
-        return windows
-    return [windows[i] for i in np.linspace(0, len(windows) - 1, limit).round().astype(int)]
-
-
-def _drawn(
-    scene: Scene, place: int, views: ViewsConfig, evaluation: EvaluationConfig
-) -> Iterator[FrameChoice]:
-    for k in range(evaluation.samples):
-        rng = np.random.default_rng([evaluation.seed, place, k])
-        inputs, drawn = draw_frames(scene, views, rng)
-        between = tuple(f for f in range(inputs[0], inputs[-1] + 1) if f not in inputs)
-        yield inputs, between or tuple(sorted(set(drawn)))

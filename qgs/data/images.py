@@ -1,7 +1,9 @@
-"""Image files to pixels of the wanted size, and the intrinsics that follow them."""
+"""Image, mask and depth files to pixels of the wanted size, and the intrinsics that follow them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -11,6 +13,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 from upath import UPath
+
+_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True)
@@ -33,22 +37,38 @@ class CropResize:
         """Left, top, right and bottom edge of the crop, in source pixels."""
         height, width = (extent / self.scale for extent in self.target)
         top, left = (self.source[0] - height) / 2, (self.source[1] - width) / 2
-        return max(left, 0.0), max(top, 0.0), left + width, top + height
+        right, bottom = min(left + width, self.source[1]), min(top + height, self.source[0])
+        return max(left, 0.0), max(top, 0.0), right, bottom
 
     def intrinsics(self, source: Tensor) -> Tensor:
         """fx, fy, cx, cy (..., 4) after the crop (shift), then the resize (scale)."""
         left, top, _, _ = self.box
         return (source - source.new_tensor([0.0, 0.0, left, top])) * self.scale
 
-    def image(self, image: Image.Image) -> np.ndarray:
-        """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel.
+    def image(
+        self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
+    ) -> np.ndarray:
+        """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel."""
+        return np.array(image.resize(self.target[::-1], kernel, box=self.box))
 
-        Lanczos filter over the area.
-        """
-        height, width = self.target
-        left, top, right, bottom = self.box
-        box = (left, top, min(right, self.source[1]), min(bottom, self.source[0]))
-        return np.array(image.resize((width, height), Image.Resampling.LANCZOS, box=box))
+
+@contextmanager
+def _readable(path: Path | UPath, kind: str) -> Iterator[None]:
+    try:
+        yield
+    except _UNREADABLE as error:
+        raise ValueError(
+            f"{path} cannot be read as {kind} ({error}): replace the file, or remove its frame"
+        ) from error
+
+
+def image_size(path: UPath) -> tuple[int, int]:
+    """(H, W) of an image file, of which only the header is read.
+
+    Raises ValueError for a file that is no image.
+    """
+    with _readable(path, "an image"), path.open("rb") as file, Image.open(file) as image:
+        return image.height, image.width
 
 
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
@@ -56,23 +76,56 @@ def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Imag
 
     Raises ValueError for a file that is no readable image.
     """
-    try:
-        with path.open("rb") as file:
-            return decode_rgb(file, background)
-    except OSError as error:
+    with _readable(path, "an image"), path.open("rb") as file:
+        return decode_rgb(file, background)
+
+
+def open_mask(path: UPath) -> np.ndarray:
+    """A mask file as (H, W) uint8, 255 where the photo shows what is to be modelled.
+
+    Files of zeros and ones are read as such. Raises ValueError for a file that is no image.
+    """
+    with _readable(path, "the mask of a photo"), path.open("rb") as file:
+        grey = np.array(decode_gray(file))
+    return grey * np.uint8(255) if grey.max() == 1 else grey
+
+
+def alpha_mask(path: UPath) -> np.ndarray:
+    """The alpha channel of a photo as (H, W) uint8; 255 for one without. Raises as `open_mask`."""
+    with _readable(path, "an image"), path.open("rb") as file:
+        image = _decoded(file)
+    if not image.has_transparency_data:
+        return np.full((image.height, image.width), 255, np.uint8)
+    return np.array(image.convert("RGBA").getchannel("A"))
+
+
+def open_depth(path: UPath, unit: float) -> np.ndarray:
+    """A depth map, an image of integers or a .npy file, as (H, W) float32 of world units.
+
+    unit: world units per number of the file. What is not finite becomes 0, for unknown.
+    Raises ValueError for another kind of file.
+    """
+    with _readable(path, "a depth map"), path.open("rb") as file:
+        if path.suffix.lower() == ".npy":
+            depth = np.asarray(np.load(file, allow_pickle=False)).squeeze()
+        else:
+            depth = np.array(_decoded(file))
+    if depth.ndim != 2 or depth.dtype.kind not in "fiu":
         raise ValueError(
-            f"{path} cannot be read as an image ({error}): replace the file, or remove its frame"
-        ) from error
+            f"{path} must hold one number for each pixel, got {depth.dtype} {depth.shape}: give "
+            "16-bit images or .npy files, or remove 'depth_file_path'"
+        )
+    metric = (depth * unit).astype(np.float32)
+    return np.where(np.isfinite(metric), metric, np.float32(0))
 
 
 def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image.Image:
     """As `open_rgb`, for an open file. Raises OSError for bytes that are no readable image."""
     image = _decoded(file)
     if image.has_transparency_data:
-        image = image.convert("RGBA")
         color = tuple(round(255 * channel) for channel in background)
         canvas = Image.new("RGBA", image.size, (*color, 255))
-        image = Image.alpha_composite(canvas, image)
+        image = Image.alpha_composite(canvas, image.convert("RGBA"))
     return image if image.mode == "RGB" else image.convert("RGB")
 
 

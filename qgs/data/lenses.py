@@ -1,14 +1,21 @@
-"""Lenses that bend rays: where a direction lands that a pinhole would have put elsewhere."""
+"""Lenses that bend rays, and photos without their distortion."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+
+from qgs.geometry.rays import pixel_directions
+
+Intrinsics: TypeAlias = tuple[float, float, float, float]
+Size: TypeAlias = tuple[int, int]
+Mode: TypeAlias = Literal["bilinear", "nearest"]
 
 
 @dataclass(frozen=True)
@@ -26,13 +33,9 @@ class RadialTangential:
         x, y = points.unbind(-1)
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        return torch.stack(
-            [
-                x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
-                y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
-            ],
-            -1,
-        )
+        u = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        return torch.stack([u, v], -1)
 
     def sees(self, points: Tensor) -> Tensor:
         """Whether points (..., 2) lie this side of where the radial polynomial turns back."""
@@ -73,11 +76,39 @@ def bending(lens: Lens) -> Lens | None:
 
 
 def _turn(*coefficients: float) -> float:
-    """The least t > 0 at which r (1 + k1 t + k2 t^2 + ...), t = r^2, stops to grow with r.
+    """The least t > 0 at which r (1 + k1 t + k2 t^2 + ...), t = r^2, stops growing with r, or inf.
 
-    Beyond it the polynomial would show the same photo again, mirrored; inf where it grows for ever.
+    Beyond it the polynomial would show the same photo again, mirrored.
     """
     slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
     roots = np.roots(slope[::-1])
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return float(real.min()) if len(real) else math.inf
+
+
+def undistorted(
+    pixels: np.ndarray,
+    intrinsics: Intrinsics,
+    lens: Lens | None,
+    mode: Mode = "bilinear",
+) -> np.ndarray:
+    """The photo as a pinhole camera with the same intrinsics would have taken it.
+
+    pixels: (H, W) or (H, W, C), returned in the same shape and dtype. intrinsics: in pixels of it.
+    What the lens did not see is 0. Without a lens, `pixels` themselves.
+    """
+    if lens is None:
+        return pixels
+    height, width = pixels.shape[:2]
+    camera = torch.tensor(intrinsics)
+    focal, centre = camera.split(2)
+    directions = pixel_directions(camera, (height, width))[..., :2]
+    source = focal * lens.distorted(directions) + centre
+    grid = source / torch.tensor([width, height]) * 2 - 1  # (H, W, 2), -1 to 1 across the photo
+    seen = lens.sees(directions) & (grid.abs() <= 1).all(-1)
+    planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
+    flat = F.grid_sample(
+        planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
+    )[0]
+    result = (flat * seen).permute(1, 2, 0).numpy().reshape(pixels.shape)
+    return (result.round() if pixels.dtype.kind in "iu" else result).astype(pixels.dtype)

@@ -5,32 +5,25 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from threading import Lock
 from typing import IO
 
 from upath import UPath
 
-_PACKAGES = {
-    "http": "requests aiohttp",
-    "https": "requests aiohttp",
-    "s3": "s3fs",
-    "s3a": "s3fs",
-    "gs": "gcsfs",
-    "gcs": "gcsfs",
-    "az": "adlfs",
-    "abfs": "adlfs",
-    "abfss": "adlfs",
-    "hf": "huggingface_hub",
-    "sftp": "paramiko",
-    "ssh": "paramiko",
-    "smb": "smbprotocol",
-    "webdav": "webdav4",
+_PROTOCOLS = {
+    "requests aiohttp": ("http", "https"),
+    "s3fs": ("s3", "s3a"),
+    "gcsfs": ("gs", "gcs"),
+    "adlfs": ("az", "abfs", "abfss"),
+    "huggingface_hub": ("hf",),
+    "paramiko": ("sftp", "ssh"),
+    "smbprotocol": ("smb",),
+    "webdav4": ("webdav",),
 }
-"""What file systems of fsspec need, by protocol."""
+"""The packages that file systems of fsspec need, with the protocols that they serve."""
 
 
 def opened_path(path: str | Path | UPath) -> UPath:
@@ -43,17 +36,15 @@ def opened_path(path: str | Path | UPath) -> UPath:
         url = UPath(path)
         url.fs  # noqa: B018  asks for the file system, whose package may be missing
     except ImportError as error:
-        raise ValueError(f"{path} cannot be opened: {error}{_remedy(str(path))}") from error
+        protocol = str(path).partition(":")[0]
+        packages = [needed for needed, served in _PROTOCOLS.items() if protocol in served]
+        remedy = f": pip install {packages[0]}" if packages else ""
+        raise ValueError(f"{path} cannot be opened: {error}{remedy}") from error
     except ValueError as error:
         raise ValueError(f"{path} cannot be opened as a path or URL: {error}") from error
     if url.protocol in {"file", "local"}:
         return UPath(url.path)
     return url.expanduser() if is_local(url) else url
-
-
-def _remedy(url: str) -> str:
-    packages = _PACKAGES.get(url.partition(":")[0])
-    return f": pip install {packages}" if packages else ""
 
 
 def is_local(path: Path | UPath) -> bool:
@@ -67,13 +58,11 @@ def stays_inside(name: str) -> bool:
     return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
 
 
-_OPEN = 8  # archives kept open by a process
-
-
 class Archive:
     """An open zip file. Raises ValueError for a file that is none, or that leads outside itself.
 
-    files: to each path, with slashes and without `./`, the name under which the archive has it.
+    files: path, with slashes and without `./`, to the name that the archive has for it.
+    folders: path to the names in it.
     """
 
     def __init__(self, path: UPath) -> None:
@@ -87,22 +76,17 @@ class Archive:
         self.folders: dict[str, set[str]] = {"": set()}
         for name in self._zip.namelist():
             parts = PurePosixPath(name.replace("\\", "/")).parts
-            if not parts:
-                continue
-            if not stays_inside(name):
+            if parts and not stays_inside(name):
                 raise ValueError(
                     f"{path} holds the name {name!r}, which leads outside the archive: it is not "
                     "read. Get the archive from its publisher again"
                 )
-            self._add(name, parts)
-
-    def _add(self, name: str, parts: tuple[str, ...]) -> None:
-        for depth, part in enumerate(parts):
-            self.folders.setdefault("/".join(parts[:depth]), set()).add(part)
-        if name.endswith(("/", "\\")):
-            self.folders.setdefault("/".join(parts), set())
-        else:
-            self.files["/".join(parts)] = name
+            for depth, part in enumerate(parts):
+                self.folders.setdefault("/".join(parts[:depth]), set()).add(part)
+            if name.endswith(("/", "\\")):
+                self.folders.setdefault("/".join(parts), set())
+            elif parts:
+                self.files["/".join(parts)] = name
 
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
@@ -114,26 +98,8 @@ class Archive:
             raise OSError(f"the archive is damaged there: {error}") from error
 
 
-class _Pool:
-    """The archives that this process read last; those that fall out close with their last use."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._open: OrderedDict[str, Archive] = OrderedDict()
-        self._lock = Lock()
-
-    def archive(self, path: UPath) -> Archive:
-        name = str(path)
-        with self._lock:
-            if name not in self._open:
-                while len(self._open) >= self._limit:
-                    self._open.popitem(last=False)
-                self._open[name] = Archive(path)
-            self._open.move_to_end(name)
-            return self._open[name]
-
-
-_pool = _Pool(_OPEN)
+open_archive = lru_cache(maxsize=8)(Archive)
+"""A process keeps the last archives open."""
 
 
 @dataclass(frozen=True)
@@ -169,28 +135,24 @@ class ArchivePath:
         folder = str(PurePosixPath(self.member).parent)
         return ArchivePath(self.archive, "" if folder == "." else folder)
 
-    @property
-    def _archive(self) -> Archive:
-        return _pool.archive(self.archive)
-
     def is_file(self) -> bool:
         """Whether it is a file of the archive."""
-        return self.member in self._archive.files
+        return self.member in open_archive(self.archive).files
 
     def is_dir(self) -> bool:
         """Whether it is a folder of the archive."""
-        return self.member in self._archive.folders
+        return self.member in open_archive(self.archive).folders
 
     def iterdir(self) -> Iterator[ArchivePath]:
         """What the folder holds, by name. Raises FileNotFoundError when it is no folder."""
-        names = self._archive.folders.get(self.member)
+        names = open_archive(self.archive).folders.get(self.member)
         if names is None:
             raise FileNotFoundError(f"{self} is no folder of the archive")
         return (self / name for name in sorted(names))
 
     def read_bytes(self) -> bytes:
         """The file's bytes. Raises OSError for one that is absent or damaged."""
-        return self._archive.read(self.member)
+        return open_archive(self.archive).read(self.member)
 
     def read_text(self, encoding: str = "utf-8") -> str:
         """The file's text."""

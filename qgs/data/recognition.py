@@ -1,50 +1,54 @@
-"""Which source reads a folder, told from what the folder holds."""
+"""Which source opens a path, and opening it for a trained model."""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Mapping
 
 from upath import UPath
 
-from qgs.data.chunks.files import INDEX, SUFFIX
-from qgs.data.photos.formats import formats_of
-
-_HASH = re.compile(r"[0-9a-f]{64}")
-_BENCHMARK = ("gaussian_splat", "nerfstudio")
+from qgs.contracts import Component, SceneSource, SceneSourceConfig, component_of
+from qgs.data.paths import opened_path
 
 
-def recognised(path: UPath) -> str:
-    """The name of the source that reads `path`: qgs/chunks, qgs/dl3dv or qgs/photos.
+def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
+    """The first of `sources` that recognises `path`, as PLUGIN/NAME.
 
-    Chunks are .torch files, also in train and test. DL3DV is archives, folders named by a hash or
-    laid out as its benchmark, also in folders such as 1K. The rest is photos, whose source says
-    what it misses. Raises FileNotFoundError when `path` does not exist.
+    sources: components of the slot data by PLUGIN/NAME, as `Registry.components` gives them: those
+    of qgs first. What none recognises is left to `qgs/photos`, whose error says what a folder of
+    photos needs. Raises FileNotFoundError when `path` does not exist.
     """
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist: give the folder of a data set")
-    if path.is_file():
-        return "qgs/dl3dv" if path.suffix == ".zip" else "qgs/photos"
-    if any(_holds_chunks(folder) for folder in (path, path / "train", path / "test")):
-        return "qgs/chunks"
-    if formats_of(path):
-        return "qgs/photos"
-    return "qgs/dl3dv" if _holds_dl3dv(path, depth=1) else "qgs/photos"
+        raise FileNotFoundError(
+            f"{path} (from {UPath.cwd()}) does not exist: give the folder of a data set"
+        )
+    found = (
+        kind
+        for kind, source in sources.items()
+        if issubclass(source, SceneSource) and source.recognises(path)
+    )
+    return next(found, "qgs/photos")
 
 
-def _holds_chunks(folder: UPath) -> bool:
-    if not folder.is_dir():
-        return False
-    names = [item.name for item in folder.iterdir()]
-    listed = folder.name in {"train", "test"} and INDEX in names
-    return listed or any(name.endswith(SUFFIX) for name in names)
+def open_for(
+    path: str,
+    image_size: tuple[int, int] | None,
+    trained: SceneSourceConfig | None,
+    sources: Mapping[str, type[Component]],
+) -> tuple[SceneSource, bool]:
+    """The data at `path`, and whether it is what a model with the data `trained` was trained on.
 
-
-def _holds_dl3dv(folder: UPath, depth: int) -> bool:
-    """Whether `folder`, or a folder in it, holds a scene as DL3DV publishes them."""
-    if any((folder / inside / "transforms.json").is_file() for inside in _BENCHMARK):
-        return True
-    items = [item for item in folder.iterdir() if not item.name.startswith(".")]
-    if any(item.suffix == ".zip" or _HASH.fullmatch(item.name) for item in items):
-        return True
-    inside = (item for item in items if item.is_dir())
-    return depth >= 0 and any(_holds_dl3dv(item, depth - 1) for item in inside)
+    If so it is opened with the same options, held-out frames included; else as `recognised`.
+    image_size: (H, W), by default that of `trained`. Raises as `recognised`, and as the source does
+    when it is opened.
+    """
+    size = image_size or (trained or SceneSourceConfig()).image_size
+    place = opened_path(path)
+    root = getattr(trained, "path", None)
+    if trained is not None and isinstance(root, str):
+        source = component_of(trained)
+        assert issubclass(source, SceneSource)
+        if source.trains_on(opened_path(root).resolve(), place.resolve()):
+            return source(trained.model_copy(update={"path": path, "image_size": size})), True
+    source = sources[recognised(place, sources)]
+    assert issubclass(source, SceneSource)
+    return source(source.config_for(path, size, trained)), False

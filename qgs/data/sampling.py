@@ -1,4 +1,4 @@
-"""From a scene to what a model sees: which frames, in which frame and scale, mirrored or not.
+"""From a scene to what a model sees: which views, in which coordinates, mirrored or not.
 
 Sources: TokenGS release (gap, targets from the span of the inputs, pose normalisation, mirroring).
 Everything here is a pure function of its arguments and of the random generator it is given.
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.lazy import warn_once
+from qgs.data.scenes import warn_once
 from qgs.geometry.poses import (
     first_camera,
     largest_distance,
@@ -25,14 +25,14 @@ from qgs.geometry.poses import (
     relative_to,
     scaled,
 )
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Views, map_tensors
 
 Frames: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Input and target views of one scene, both Views (1, V), in the frame of the inputs."""
+    """Input and target Views (1, V) of one scene, in the frame of the inputs."""
 
     scene: str
     inputs: Views
@@ -103,25 +103,16 @@ def draw_frames(
     gap = int(rng.integers(low, high + 1))
     first = int(rng.integers(0, len(usable) - gap))
     span = usable[first : first + gap + 1]
-    inputs = _inputs_of(span, views.inputs, rng)
-    return inputs, _targets_of(span, inputs, views.targets, rng)
-
-
-def _inputs_of(span: Sequence[int], count: int, rng: np.random.Generator) -> Frames:
-    """The two ends of `span` and `count - 2` frames between; one alone is drawn from the span."""
-    if count == 1:
-        return (int(rng.choice(span)),)
-    between = rng.choice(span[1:-1], count - 2, replace=False) if count > 2 else ()
-    return (span[0], *sorted(map(int, between)), span[-1])
-
-
-def _targets_of(
-    span: Sequence[int], inputs: Frames, count: int, rng: np.random.Generator
-) -> Frames:
+    if views.inputs == 1:
+        inputs = (int(rng.choice(span)),)
+    else:  # the two ends and frames between
+        more = views.inputs - 2
+        between = rng.choice(span[1:-1], more, replace=False) if more else ()
+        inputs = (span[0], *sorted(map(int, between)), span[-1])
     novel = rng.permutation([frame for frame in span if frame not in inputs]).astype(int)
-    chosen = [*novel, *rng.permutation(inputs)][:count]
-    chosen += list(rng.choice(span, count - len(chosen)))
-    return tuple(map(int, chosen))
+    targets = [*novel, *rng.permutation(inputs)][: views.targets]
+    targets += list(rng.choice(span, views.targets - len(targets)))
+    return inputs, tuple(map(int, targets))
 
 
 def make_sample(
@@ -137,23 +128,17 @@ def make_sample(
     order = [place[frame] for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
     cameras = scene.cameras[list(frames)]
-    c2w = normalised(cameras.c2w, len(input_frames), views, scene.name).float()
+    reference, scale = own_world(cameras.c2w[: len(input_frames)], views, scene.name)
+    c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
     both = Views(
         torch.from_numpy(images.numpy()[order])[None],
         Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
         None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
     )
-    if mirror:
-        both = mirrored_views(both)
+    both = mirrored_views(both) if mirror else both
     inputs = both.select(slice(0, len(input_frames)))
     targets = both.select(slice(len(input_frames), None))
     return Sample(scene.name, inputs, targets, input_frames, target_frames)
-
-
-def normalised(c2w: Tensor, inputs: int, views: ViewsConfig, scene: str = "") -> Tensor:
-    """Poses (V, 4, 4) in the frame and scale of the first `inputs` ones. Raises as `own_world`."""
-    reference, factor = own_world(c2w[:inputs], views, scene)
-    return scaled(relative_to(reference, c2w), factor)
 
 
 def own_world(c2w: Tensor, views: ViewsConfig, scene: str = "") -> tuple[Tensor, Tensor]:
@@ -181,8 +166,7 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    masks = None if views.masks is None else _flipped(views.masks)
-    return Views(_flipped(views.images), flipped, masks)
+    return Views(_flipped(views.images), flipped, map_tensors(_flipped, views.masks))
 
 
 def _flipped(images: Tensor) -> Tensor:
@@ -194,9 +178,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
     return Batch(
         stack_views([sample.inputs for sample in samples]),
         stack_views([sample.targets for sample in samples]),
-        tuple(sample.scene for sample in samples),
-        tuple(sample.input_frames for sample in samples),
-        tuple(sample.target_frames for sample in samples),
+        *zip(*((s.scene, s.input_frames, s.target_frames) for s in samples), strict=True),
     )
 
 
@@ -213,12 +195,6 @@ def stack_views(views: Sequence[Views]) -> Views:
     images = np.concatenate([v.images.numpy() for v in views])
     masks = None
     if any(v.masks is not None for v in views):
-        masks = torch.from_numpy(np.concatenate([_mask(v) for v in views]))
+        whole = [torch.ones_like(v.images[:, :, :1]) if v.masks is None else v.masks for v in views]
+        masks = torch.from_numpy(np.concatenate([mask.numpy() for mask in whole]))
     return Views(torch.from_numpy(images), cameras, masks)
-
-
-def _mask(views: Views) -> np.ndarray:
-    if views.masks is not None:
-        return views.masks.numpy()
-    batch, count, _, height, width = views.images.shape
-    return np.ones((batch, count, 1, height, width), np.float32)

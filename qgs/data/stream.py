@@ -1,4 +1,8 @@
-"""Endless training batches by number: order of scenes, samples, worker processes."""
+"""Endless training batches by number: order of scenes, samples, processes that decode.
+
+`training_batches` is the way in: it makes batch after batch of a `SampleStream`, in a thread or in
+worker processes.
+"""
 
 from __future__ import annotations
 
@@ -9,217 +13,19 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import islice
+from itertools import count, islice
+from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
-from qgs.contracts import Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.contracts import Scene, SceneSource, ViewsConfig
 from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
-
-
-class SceneOrder:
-    """The scenes of an endless sequence of samples: a function of (groups, seed) alone.
-
-    groups: scene indices by where they are stored, see `SceneSource.groups`. Each epoch visits
-    every scene once: the groups in a random order, the scenes of a group one after another in a
-    random order. Raises ValueError unless the groups hold each of `count` scenes once.
-    """
-
-    def __init__(self, groups: Sequence[Sequence[int]], count: int, seed: int) -> None:
-        self._groups = [np.asarray(group, np.int64) for group in groups if len(group)]
-        listed = np.concatenate([np.empty(0, np.int64), *self._groups])
-        if not np.array_equal(np.sort(listed), np.arange(count)):
-            raise ValueError(
-                f"the data source has {count} training scenes, but its groups list "
-                f"{len(listed)} indices, not each scene once; this is a mistake of the data source"
-            )
-        self._count = count
-        self._seed = seed
-        self._epoch = lru_cache(maxsize=2)(self._draw_epoch)
-
-    def scene(self, sample: int) -> int:
-        """The scene of a sample, counted from 0 over all epochs."""
-        epoch, position = divmod(sample, self._count)
-        return int(self._epoch(epoch)[position])
-
-    @property
-    def fingerprint(self) -> str:
-        """Equal for equal groups: sequences of equal fingerprint and seed visit alike."""
-        digest = hashlib.sha256()
-        for group in self._groups:
-            digest.update(len(group).to_bytes(8, "little") + group.astype("<i8").tobytes())
-        return digest.hexdigest()[:16]
-
-    def _draw_epoch(self, epoch: int) -> np.ndarray:
-        rng = np.random.default_rng([self._seed, 0, epoch])
-        shuffled = rng.permutation(len(self._groups))
-        return np.concatenate([rng.permutation(self._groups[index]) for index in shuffled])
-
-
-class SampleError(ValueError):
-    """A training sample that cannot be made; the message names the scene and the frame."""
-
-
-class SampleStream:
-    """Training samples of `source` by number; sample k depends on (seed, k) alone.
-
-    Raises ValueError when the source has no training scenes.
-    """
-
-    def __init__(self, source: SceneSource, views: ViewsConfig, seed: int) -> None:
-        self._scenes = source.scenes("train")
-        if not len(self._scenes):
-            raise ValueError(f"the data source {type(source).name!r} has no training scenes")
-        self.order = SceneOrder(source.groups("train"), len(self._scenes), seed)
-        self._views, self._seed = views, seed
-
-    def batch(self, numbers: Sequence[int]) -> Batch:
-        """The samples of these numbers, counted from 0 over all epochs.
-
-        Raises ValueError for a scene with too few frames, SampleError for frames that cannot be
-        decoded or normalised.
-        """
-        return collate([self._sample(number) for number in numbers])
-
-    def _sample(self, number: int) -> Sample:
-        rng = np.random.default_rng([self._seed, 1, number])
-        scene = self._scenes[self.order.scene(number)]
-        mirror = bool(rng.random() < self._views.mirror)
-        inputs, targets = draw_frames(scene, self._views, rng)
-        try:
-            return make_sample(scene, inputs, targets, self._views, mirror)
-        except Exception as error:
-            raise SampleError(_told(scene, (*inputs, *targets), error)) from error
-
-
-def _told(scene: Scene, frames: Frames, error: Exception) -> str:
-    """What went wrong with which frames of `scene`: the first that fails alone, else all."""
-    for frame in frames:
-        try:
-            scene.images([frame])
-            scene.masks([frame])
-        except Exception as own:
-            return f"scene {scene.name!r}, frame {frame} ({scene.frame_name(frame)}): {own}"
-    return f"scene {scene.name!r}, frames {sorted(set(frames))}: {error}"
-
-
-class WorkerError(ChildProcessError):
-    """A process that decodes data was killed."""
-
-
-@dataclass(frozen=True)
-class _Failure:
-    """An error of a worker, as text: exceptions need not survive the way between processes."""
-
-    message: str
-    trace: str
-
-    def error(self) -> SampleError:
-        error = SampleError(self.message)
-        error.add_note(f"In a process that decodes data:\n{self.trace}")
-        return error
-
-
-class _Batches(Dataset[Batch | _Failure]):
-    """Batches by number. A worker opens the data itself, so that nothing decoded ever travels."""
-
-    def __init__(self, opener: Callable[[], Callable[[int], Batch]]) -> None:
-        self._opener = opener
-        self._make: Callable[[int], Batch] | None = None
-
-    def __getitem__(self, number: int) -> Batch | _Failure:
-        try:
-            self._make = self._make or self._opener()
-            return self._make(number)
-        except Exception as error:
-            return _Failure(str(error), traceback.format_exc())
-
-
-class _From(Sampler[int]):
-    """start, start + 1, ..."""
-
-    def __init__(self, start: int) -> None:
-        self._start = start
-
-    def __iter__(self) -> Iterator[int]:
-        number = self._start
-        while True:
-            yield number
-            number += 1
-
-
-def decoded_by_workers(
-    opener: Callable[[], Callable[[int], Batch]], start: int, workers: int
-) -> Generator[Batch, None, None]:
-    """Batches start, start + 1, ..., made by `workers` processes; closing ends them.
-
-    opener: opens the data and returns what makes the batch of a number; it runs in the workers and
-        so must be picklable. They are spawned: threads of numba and torch do not survive a fork.
-    Raises SampleError with what a worker raised, WorkerError when one was killed.
-    """
-    loader = DataLoader(
-        _Batches(opener),
-        batch_size=None,
-        sampler=_From(start),
-        num_workers=workers,
-        multiprocessing_context="spawn",
-        worker_init_fn=_prepare_worker,
-        generator=torch.Generator(),  # so that no random number of the training is used up
-    )
-    with _signals_of_children_left_alone():
-        batches = iter(loader)
-    try:
-        while True:
-            batch = _next(batches)
-            if isinstance(batch, _Failure):
-                raise batch.error()
-            yield batch
-    finally:
-        del batches
-
-
-@contextmanager
-def _signals_of_children_left_alone() -> Iterator[None]:
-    """Keep torch from raising where the training happens to be when a worker dies.
-
-    Asking for a batch raises too, within seconds, between two steps.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.getsignal(signal.SIGCHLD)
-    yield
-    signal.signal(signal.SIGCHLD, before)
-
-
-def _next(batches: Iterator[Batch | _Failure]) -> Batch | _Failure:
-    try:
-        return next(batches)
-    # What torch tells of a worker's sudden end, and what a connection to it says when it breaks.
-    except (RuntimeError, OSError, EOFError) as error:
-        raise WorkerError(
-            f"a process that decodes data ended suddenly ({error}): often the system was out of "
-            "memory; lower training.workers, or views and image sizes"
-        ) from error
-
-
-def _prepare_worker(number: int) -> None:
-    """Leave stopping to the training process, which closes its workers in an orderly way.
-
-    Terminals and schedulers send their signals to all processes of a job.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    logging.getLogger("qgs").setLevel(logging.ERROR)  # opening the data has been reported before
-    # Python's own end aborts where the thread that sends batches is inside torch at that moment.
-    atexit.register(os._exit, 0)
 
 
 @dataclass(frozen=True)
@@ -228,6 +34,14 @@ class Share:
 
     rank: int = 0
     processes: int = 1
+
+
+class SampleError(ValueError):
+    """A training sample that cannot be made; the message names the scene and the frame."""
+
+
+class WorkerError(ChildProcessError):
+    """A process that decodes data was killed."""
 
 
 def training_batches(
@@ -250,15 +64,11 @@ def training_batches(
 
     workers: processes that decode; with 0 the next batch is made in a thread while the caller uses
     this one. Closing the generator ends them.
-    Raises ValueError when the source has no training scenes or a scene has too few frames, and
-    SampleError, which is one too, for a sample that cannot be made.
+    Raises ValueError when the source has no training scenes or a scene has too few frames,
+    SampleError, which is one too, for a sample that cannot be made, and WorkerError.
     """
-    stream = SampleStream(source, views, seed)
-    part = _Part(batch_size, share)
-    if not workers:
-        return _prefetched(lambda number: stream.batch(part.samples(number)), start)
-    opener = _Opener(type(source), source.config, views, seed, part)
-    return decoded_by_workers(opener, start, workers)
+    batches = _Batches(source, views, seed, batch_size, share)
+    return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
@@ -266,41 +76,187 @@ def scenes_fingerprint(source: SceneSource) -> str:
     return SceneOrder(source.groups("train"), len(source.scenes("train")), seed=0).fingerprint
 
 
+class SceneOrder:
+    """The scenes of an endless sequence of samples: a function of (groups, seed) alone.
+
+    groups: scene indices by where they are stored, see `SceneSource.groups`. Each epoch visits
+    every scene once: the groups in a random order, the scenes of a group one after another in a
+    random order. Raises ValueError unless the groups hold each of `count` scenes once.
+    """
+
+    def __init__(self, groups: Sequence[Sequence[int]], count: int, seed: int) -> None:
+        self._groups = [np.asarray(group, np.int64) for group in groups if len(group)]
+        listed = np.concatenate([np.empty(0, np.int64), *self._groups])
+        if not np.array_equal(np.sort(listed), np.arange(count)):
+            raise ValueError(
+                f"the data source has {count} training scenes, but its groups list "
+                f"{len(listed)} indices, not each scene once; this is a mistake of the data source"
+            )
+        self._count, self._seed = count, seed
+        self._epoch = lru_cache(maxsize=2)(self._draw_epoch)
+
+    def scene(self, sample: int) -> int:
+        """The scene of a sample, counted from 0 over all epochs."""
+        epoch, position = divmod(sample, self._count)
+        return int(self._epoch(epoch)[position])
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for equal groups: sequences of equal fingerprint and seed visit alike."""
+        digest = hashlib.sha256()
+        for group in self._groups:
+            digest.update(len(group).to_bytes(8, "little") + group.astype("<i8").tobytes())
+        return digest.hexdigest()[:16]
+
+    def _draw_epoch(self, epoch: int) -> np.ndarray:
+        rng = np.random.default_rng([self._seed, 0, epoch])
+        shuffled = rng.permutation(len(self._groups))
+        return np.concatenate([rng.permutation(self._groups[index]) for index in shuffled])
+
+
+class SampleStream:
+    """Training samples of `source` by number; sample k depends on (seed, k) alone.
+
+    Raises ValueError when the source has no training scenes.
+    """
+
+    def __init__(self, source: SceneSource, views: ViewsConfig, seed: int) -> None:
+        self._views, self._seed = views, seed
+        self._scenes = source.scenes("train")
+        if not len(self._scenes):
+            raise ValueError(f"the data source {type(source).name!r} has no training scenes")
+        self.order = SceneOrder(source.groups("train"), len(self._scenes), seed)
+
+    def batch(self, numbers: Sequence[int]) -> Batch:
+        """The samples of these numbers, counted from 0 over all epochs.
+
+        Raises ValueError for a scene with too few frames, SampleError for frames that cannot be
+        decoded or normalised.
+        """
+        return collate([self._sample(number) for number in numbers])
+
+    def _sample(self, number: int) -> Sample:
+        rng = np.random.default_rng([self._seed, 1, number])
+        scene = self._scenes[self.order.scene(number)]
+        mirror = bool(rng.random() < self._views.mirror)
+        inputs, targets = draw_frames(scene, self._views, rng)
+        try:
+            return make_sample(scene, inputs, targets, self._views, mirror)
+        except Exception as error:
+            raise SampleError(_what_failed(scene, (*inputs, *targets), error)) from error
+
+
+def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
+    """The first of `frames` that fails by itself, and why; else all of them."""
+    for frame in frames:
+        try:
+            scene.images([frame])
+            scene.masks([frame])
+        except Exception as own:
+            return f"scene {scene.name!r}, frame {frame} ({scene.frame_name(frame)}): {own}"
+    return f"scene {scene.name!r}, frames {sorted(set(frames))}: {error}"
+
+
 @dataclass(frozen=True)
-class _Part:
-    batch_size: int
-    share: Share
+class _Failure:
+    """An error of a worker, as text: exceptions need not survive the way between processes."""
 
-    def samples(self, number: int) -> range:
-        """The samples of this process's slice of global batch `number`."""
-        first = (number * self.share.processes + self.share.rank) * self.batch_size
-        return range(first, first + self.batch_size)
+    message: str
+    trace: str
 
 
-@dataclass(frozen=True)
-class _Opener:
-    """Opens a source of the class and options that the training process has opened."""
+class _Batches(Dataset[Batch | _Failure]):
+    """The batches of one process by number.
 
-    kind: type[SceneSource]
-    config: SceneSourceConfig
-    views: ViewsConfig
-    seed: int
-    part: _Part
+    A copy in a worker opens the data itself when it is first used: no scene travels, and what fails
+    then is told as any failure.
+    """
 
-    def __call__(self) -> Callable[[int], Batch]:
-        stream = SampleStream(self.kind(self.config), self.views, self.seed)
-        return lambda number: stream.batch(self.part.samples(number))
+    def __init__(
+        self, source: SceneSource, views: ViewsConfig, seed: int, batch_size: int, share: Share
+    ) -> None:
+        self._stream: SampleStream | None = SampleStream(source, views, seed)
+        self._source, self._settings = (type(source), source.config), (views, seed)
+        self._size, self._share = batch_size, share
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_stream": None}
+
+    def batch(self, number: int) -> Batch:
+        """This process's slice of global batch `number`."""
+        if self._stream is None:
+            kind, config = self._source
+            self._stream = SampleStream(kind(config), *self._settings)
+        first = (number * self._share.processes + self._share.rank) * self._size
+        return self._stream.batch(range(first, first + self._size))
+
+    def __getitem__(self, number: int) -> Batch | _Failure:
+        """As `batch`, for a worker, whose failures are returned."""
+        try:
+            return self.batch(number)
+        except Exception as error:
+            return _Failure(str(error), traceback.format_exc())
 
 
-def _prefetched(batch: Callable[[int], Batch], start: int) -> Generator[Batch, None, None]:
-    """Yield batch(start), batch(start + 1), ..., each made while the one before is in use."""
+def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
+    """Batches start, start + 1, ..., each made while the one before is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
-        number, pending = start, pool.submit(batch, start)
-        while True:
+        pending = pool.submit(batches.batch, start)
+        for number in count(start + 1):
             ready = pending.result()
-            number += 1
-            pending = pool.submit(batch, number)
+            pending = pool.submit(batches.batch, number)
             yield ready
+
+
+def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batch, None, None]:
+    """Batches start, start + 1, ..., made by `workers` processes; closing ends them.
+
+    They are spawned: threads of numba and torch do not survive a fork.
+    """
+    loader = DataLoader(
+        batches,
+        batch_size=None,
+        sampler=count(start),
+        num_workers=workers,
+        multiprocessing_context="spawn",
+        worker_init_fn=_prepare_worker,
+        generator=torch.Generator(),  # so that no random number of the training is used up
+    )
+    handler = signal.getsignal(signal.SIGCHLD)
+    made = iter(loader)
+    if threading.current_thread() is threading.main_thread():
+        # torch's handler raises wherever training is when a worker dies. Asking for a batch raises
+        # too, within seconds, between two steps.
+        signal.signal(signal.SIGCHLD, handler)
+    try:
+        while True:
+            try:
+                batch = next(made)
+            # What torch raises for a worker's sudden end, and a connection to it when it breaks.
+            except (RuntimeError, OSError, EOFError) as error:
+                raise WorkerError(
+                    f"a process that decodes data ended suddenly ({error}): often the system was "
+                    "out of memory; lower training.workers, or views and image sizes"
+                ) from error
+            if isinstance(batch, _Failure):
+                error = SampleError(batch.message)
+                error.add_note(f"In a process that decodes data:\n{batch.trace}")
+                raise error
+            yield batch
+    finally:
+        del made
+
+
+def _prepare_worker(number: int) -> None:
+    """Leave stopping to the training process, which closes its workers in an orderly way.
+
+    Terminals and schedulers send their signals to all processes of a job.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    logging.getLogger("qgs").setLevel(logging.ERROR)  # opening the data has been reported before
+    # Python's own end aborts where the thread that sends batches is inside torch at that moment.
+    atexit.register(os._exit, 0)
 
 
 class Feed:

@@ -6,9 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps, rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from PIL import Image
 
 from qgs.drawing.images import DEPTH_MAP, NOTHING, Picture
 
@@ -27,7 +32,7 @@ CATEGORICAL: tuple[Color, ...] = (
 INK: Color = (32, 36, 42)
 MUTED: Color = (122, 128, 136)
 PAPER: Color = (255, 255, 255)
-ATTENTION_MAP = "magma"
+COLUMN_INCHES = 1.9
 
 
 def hex_color(color: Color) -> str:
@@ -43,8 +48,6 @@ def categorical(index: int) -> Color:
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Matplotlib settings of every figure, for the `with` block only."""
-    from matplotlib import rc_context
-
     ink = hex_color(INK)
     style: dict[Any, Any] = {
         "font.family": "sans-serif",
@@ -73,12 +76,6 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-COLUMN_INCHES = 1.9
-
-
 @dataclass(frozen=True)
 class Curves:
     """What training reported: seconds since its start, loss, and PSNR of the supervised views."""
@@ -90,8 +87,6 @@ class Curves:
 
 def figure_picture(figure: Figure, dpi: int = 120) -> Picture:
     """The figure as a picture."""
-    from PIL import Image
-
     buffer = BytesIO()
     with figure_style():
         figure.savefig(buffer, format="png", dpi=dpi)
@@ -104,8 +99,6 @@ def grid_figure(
     depth_row: tuple[str, float, float] | None = None,
 ) -> Figure:
     """Rows of pictures under column titles; `depth_row` (row, near, far) gets a colour scale."""
-    from matplotlib.figure import Figure
-
     aspect = np.divide(*next(iter(rows.values()))[0].shape[:2])
     size = (COLUMN_INCHES * len(columns) + 0.9, COLUMN_INCHES * aspect * len(rows) + 0.6)
     with figure_style():
@@ -119,27 +112,17 @@ def grid_figure(
                 axis.spines[:].set_visible(False)
             line[0].set_ylabel(label)
             if depth_row and label == depth_row[0]:
-                _depth_scale(figure, line, *depth_row[1:])
+                scale = ScalarMappable(Normalize(*depth_row[1:]), colormaps[DEPTH_MAP])
+                bar = figure.colorbar(scale, ax=list(line), fraction=0.03, pad=0.01)
+                bar.set_label("depth, world units")
+                bar.outline.set_visible(False)  # type: ignore[operator]
         for axis, title in zip(axes[0], columns, strict=True):
             axis.set_title(title)
     return figure
 
 
-def _depth_scale(figure: Figure, line: np.ndarray, near: float, far: float) -> None:
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    scale = ScalarMappable(Normalize(near, far), colormaps[DEPTH_MAP])
-    bar = figure.colorbar(scale, ax=list(line), fraction=0.03, pad=0.01)
-    bar.set_label("depth, world units")
-    bar.outline.set_visible(False)  # type: ignore[operator]
-
-
 def curves_figure(curves: Mapping[str, Curves]) -> Figure:
     """Loss and PSNR against seconds of training: the raw values pale, their running mean strong."""
-    from matplotlib.figure import Figure
-
     with figure_style():
         figure = Figure(figsize=(8.4, 2.9), layout="constrained")
         loss_axis, psnr_axis = figure.subplots(1, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -57,21 +58,21 @@ def side_by_side(pictures: list[Picture], gap: int = 4) -> Picture:
     return np.concatenate(parts[:-1], 1)
 
 
-def png_bytes(picture: np.ndarray) -> bytes:
+def png_bytes(picture: Picture) -> bytes:
     """A uint8 (H, W, 3) picture as the bytes of a PNG file."""
     buffer = BytesIO()
     _checked(picture).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 
-def write_png(picture: np.ndarray, path: str | Path) -> None:
+def write_png(picture: Picture, path: str | Path) -> None:
     """Write a uint8 (H, W, 3) picture."""
     data = png_bytes(picture)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
-def write_gif(frames: Sequence[np.ndarray], path: str | Path, frames_per_second: float) -> None:
+def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
     """Write uint8 (H, W, 3) frames of one size as a GIF that loops for ever.
 
     All frames share one palette, so that flat areas do not flicker. Raises ValueError for no
@@ -80,22 +81,29 @@ def write_gif(frames: Sequence[np.ndarray], path: str | Path, frames_per_second:
     sizes = {frame.shape for frame in frames}
     if len(sizes) != 1:
         raise ValueError(f"a GIF needs frames of one size, got {sorted(sizes) or 'none'}")
-    images = [_checked(frame) for frame in frames]
-    sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
+    sample = _checked(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
-    paletted = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    images = [_checked(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    options = {"duration": round(1000 / frames_per_second), "loop": 0}
     with replacing(path) as temporary:
-        paletted[0].save(
-            temporary,
-            format="GIF",
-            save_all=True,
-            append_images=paletted[1:],
-            duration=round(1000 / frames_per_second),
-            loop=0,
-        )
+        images[0].save(temporary, "GIF", save_all=True, append_images=images[1:], **options)
 
 
-def _checked(picture: np.ndarray) -> Image.Image:
+def png_uri(picture: Picture) -> str:
+    """A picture as a data URI."""
+    return "data:image/png;base64," + base64.b64encode(png_bytes(picture)).decode()
+
+
+def webp_uri(frames: Sequence[Picture], milliseconds: int = 90) -> str:
+    """Frames as the data URI of an endless WebP animation."""
+    buffer = BytesIO()
+    first, *rest = map(_checked, frames)
+    options = {"duration": milliseconds, "loop": 0, "quality": 80, "method": 2}
+    first.save(buffer, format="WEBP", save_all=True, append_images=rest, **options)
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _checked(picture: Picture) -> Image.Image:
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise ValueError(
             f"a picture must be uint8 (H, W, 3), got {picture.dtype} {tuple(picture.shape)}"

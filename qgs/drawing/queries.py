@@ -8,15 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from einops import rearrange
+from matplotlib import colormaps
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from qgs.drawing.figures import ATTENTION_MAP, INK, Color, categorical
+from qgs.drawing.figures import INK, Color, categorical
 from qgs.drawing.images import Picture, rgb_picture, washed
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, SpatialSupport
+
+ATTENTION_MAP = "magma"
+OVERSAMPLING = 3
+OUTLINE_POINTS = 96
 
 
 @dataclass(frozen=True)
@@ -35,38 +40,42 @@ class Ellipses:
     whole: Tensor
 
 
+@full_precision
 def project_support(support: SpatialSupport, cameras: Cameras) -> Ellipses:
     """Exact perspective outlines of the first scene's ellipsoids in one camera, cameras (1, 1).
 
     An ellipsoid with centre c and axes A (camera frame) has the dual quadric A A^T - c c^T, whose
     image under K is the dual conic of the outline (Hartley and Zisserman, section 8.3).
     """
-    rotation = cameras.w2c[0, 0, :3, :3]
-    centers = to_camera(support.centers[:1], cameras)[0, 0]
-    return _outlines(centers, rotation @ support.axes[0], cameras.intrinsics[0, 0])
-
-
-@full_precision
-def _outlines(centers_N3: Tensor, axes_N33: Tensor, intrinsics: Tensor) -> Ellipses:
-    fx, fy, cx, cy = intrinsics.unbind()
+    centers_N3 = to_camera(support.centers[:1], cameras)[0, 0]
+    axes_N33 = cameras.w2c[0, 0, :3, :3] @ support.axes[0]
+    fx, fy, cx, cy = cameras.intrinsics[0, 0]
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     calibration = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
     quadric = axes_N33 @ axes_N33.mT - centers_N3[:, :, None] * centers_N3[:, None, :]
     conic = calibration @ quadric @ calibration.T
-    scale = -conic[:, 2, 2]
-    whole = (scale > 1e-9) & (centers_N3[:, 2] > 0)
+    depths, scale = centers_N3[:, 2], -conic[:, 2, 2]
+    whole = (scale > 1e-9) & (depths > 0)
     conic = conic / torch.where(whole, scale, 1)[:, None, None]
     centers = -conic[:, :2, 2]
     shape = conic[:, :2, :2] + centers[:, :, None] * centers[:, None, :]
     lengths, directions = torch.linalg.eigh(torch.where(whole[:, None, None], shape, 0))
     axes = directions * lengths.clamp_min(0).sqrt()[:, None, :]
-    depths = centers_N3[:, 2]
     in_front = torch.where(depths[:, None] > 0, centers_N3, centers_N3.new_tensor([0, 0, 1]))
-    return Ellipses(centers, axes, to_pixels(in_front, intrinsics), depths, whole)
+    points = to_pixels(in_front, cameras.intrinsics[0, 0])
+    return Ellipses(centers, axes, points, depths, whole)
 
 
-OVERSAMPLING = 3
-OUTLINE_POINTS = 96
+def _oversampled(picture: Picture) -> Image.Image:
+    """An image OVERSAMPLING times as large, to draw smooth lines on; `_reduced` takes it back."""
+    height, width = picture.shape[:2]
+    size = (width * OVERSAMPLING, height * OVERSAMPLING)
+    return Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
+
+
+def _reduced(image: Image.Image) -> Picture:
+    size = (image.width // OVERSAMPLING, image.height // OVERSAMPLING)
+    return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
 
 
 def support_picture(
@@ -78,47 +87,24 @@ def support_picture(
     camera is not drawn; its centre is, if it lies in front.
     """
     ellipses = project_support(support, cameras)
-    height, width = photo.shape[:2]
-    scale = OVERSAMPLING * width / cameras.size[1]
-    canvas = Image.fromarray(washed(photo, 0.45)).resize(
-        (width * OVERSAMPLING, height * OVERSAMPLING), Image.Resampling.BICUBIC
-    )
-    draw = ImageDraw.Draw(canvas, "RGBA")
-    for index in torch.argsort(ellipses.depths, descending=True).tolist():
-        if index not in colors:
-            _draw_center(draw, ellipses, index, scale, INK, 1.5)
-    for index, color in colors.items():
-        _draw_outline(draw, ellipses, index, scale, color)
-        _draw_center(draw, ellipses, index, scale, color, 3.0)
-    return np.asarray(canvas.resize((width, height), Image.Resampling.LANCZOS))
-
-
-def _draw_center(
-    draw: ImageDraw.ImageDraw,
-    ellipses: Ellipses,
-    index: int,
-    scale: float,
-    color: Color,
-    radius: float,
-) -> None:
-    if ellipses.depths[index] <= 0:
-        return
-    x, y = (ellipses.points[index] * scale).clamp(-1e5, 1e5).tolist()
-    r = radius * OVERSAMPLING
-    draw.ellipse((x - r, y - r, x + r, y + r), fill=(*color, 190))
-
-
-def _draw_outline(
-    draw: ImageDraw.ImageDraw, ellipses: Ellipses, index: int, scale: float, color: Color
-) -> None:
-    if not ellipses.whole[index]:
-        return
+    scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
     angle = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS)
     circle = torch.stack([angle.cos(), angle.sin()])
-    outline = (ellipses.centers[index][:, None] + ellipses.axes[index] @ circle) * scale
-    points = [tuple(point) for point in outline.T.clamp(-1e5, 1e5).tolist()]
-    draw.polygon(points, fill=(*color, 22))
-    draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
+    farthest_first = torch.argsort(ellipses.depths, descending=True).tolist()
+    image = _oversampled(washed(photo, 0.45))
+    draw = ImageDraw.Draw(image, "RGBA")
+    for index in [i for i in farthest_first if i not in colors] + list(colors):
+        color = colors.get(index)
+        if color and ellipses.whole[index]:
+            outline = (ellipses.centers[index][:, None] + ellipses.axes[index] @ circle) * scale
+            points = [tuple(point) for point in outline.T.clamp(-1e5, 1e5).tolist()]
+            draw.polygon(points, fill=(*color, 22))
+            draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
+        if ellipses.depths[index] > 0:
+            center = (ellipses.points[index] * scale).clamp(-1e5, 1e5).tolist()
+            radius = (3.0 if color else 1.5) * OVERSAMPLING
+            draw.circle(center, radius, fill=(*(color or INK), 190))
+    return _reduced(image)
 
 
 def patch_maps(row_M: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
@@ -128,8 +114,6 @@ def patch_maps(row_M: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
     """Each photo in pale grey with its map on top; the views share one colour scale."""
-    from matplotlib import colormaps
-
     low, high = float(maps.min()), float(maps.max())
     shades = (maps - low) / max(high - low, 1e-12)
     pictures = []
@@ -178,24 +162,22 @@ def notable_tokens(
     pixel of its weighted centroid in the first camera.
     """
     queries = model.queries.count
-    weights_NK = rearrange(
-        rendered_weights(model, gaussians, cameras)[0], "(n k) -> n k", n=queries
-    )
+    weights_G = rendered_weights(model, gaussians, cameras)[0]
+    weights_NK = rearrange(weights_G, "(n k) -> n k", n=queries)
     means_NK3 = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries)
     weights = weights_NK.sum(1)
     candidates = weights.topk(min(max(queries // 8, 2 * count), queries)).indices
     share_CK = weights_NK[candidates] / weights[candidates, None].clamp_min(1e-12)
-    centres = (means_NK3[candidates] * share_CK[..., None]).sum(1)
-    chosen = _spread_out(_pixels(centres, cameras[:, :1]), count)
-    return [
-        Token(
-            query=int(candidates[index]),
-            color=categorical(rank),
-            weight=float(weights[candidates[index]]),
-            spread=float(_spread(means_NK3[candidates[index]])),
-        )
-        for rank, index in enumerate(chosen)
-    ]
+    centres = _pixels((means_NK3[candidates] * share_CK[..., None]).sum(1), cameras[:, :1])
+    chosen, distance = [0], (centres - centres[0]).norm(dim=-1)
+    while len(chosen) < min(count, len(centres)):
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (centres - centres[chosen[-1]]).norm(dim=-1))
+    tokens = []
+    for rank, query in enumerate(candidates[chosen].tolist()):
+        spread = (means_NK3[query] - means_NK3[query].mean(0)).norm(dim=-1).mean()
+        tokens.append(Token(query, categorical(rank), float(weights[query]), float(spread)))
+    return tokens
 
 
 def token_picture(
@@ -205,55 +187,31 @@ def token_picture(
 
     cameras (1, 1). Lines join each Gaussian in front of the camera to its token's centroid.
     """
-    scene = rgb_picture(model.render(gaussians, cameras).rgb[0, 0])
-    painted = model.render(
-        _painted(gaussians, tokens, model.queries.count), cameras, torch.zeros(3)
-    )
+    scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
+    per_query = gaussians.count // model.queries.count
+    members = [range(t.query * per_query, (t.query + 1) * per_query) for t in tokens]
+    index = [i for member in members for i in member]
+    shown = gaussians[:, torch.tensor(index, dtype=torch.long, device=gaussians.means.device)]
+    paint = torch.tensor([t.color for t in tokens]).view(-1, 3).to(shown.colors) / 255
+    colors = paint.repeat_interleave(per_query, 0)[None]
+    visible = replace(shown, colors=colors, opacities=shown.opacities.clamp_min(0.5))
+    painted = model.render(visible, cameras, torch.zeros(3))
     alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
     color = painted.rgb[0, 0].permute(1, 2, 0).cpu().numpy() * 255
-    picture = washed(scene) * (1 - alpha) + color
-    picture = picture.clip(0, 255).round().astype(np.uint8)
-    return _with_stars(
-        picture, _token_means(gaussians, tokens, model.queries.count), tokens, cameras
-    )
-
-
-def _token_means(gaussians: Gaussians, tokens: Sequence[Token], queries: int) -> Tensor:
-    means = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries)
-    return means[torch.tensor([token.query for token in tokens], dtype=torch.long)]
-
-
-def _painted(gaussians: Gaussians, tokens: Sequence[Token], queries: int) -> Gaussians:
-    """Only the Gaussians of `tokens`, in their colours, opaque enough to be seen."""
-    per_query = gaussians.count // queries
-    starts = torch.tensor([token.query * per_query for token in tokens], dtype=torch.long)
-    index = (starts[:, None] + torch.arange(per_query)).flatten().to(gaussians.means.device)
-    shown = gaussians[:, index]
-    paint = torch.tensor([token.color for token in tokens]).view(-1, 3).to(shown.colors) / 255
-    colors = paint.repeat_interleave(per_query, 0)[None]
-    return replace(shown, colors=colors, opacities=shown.opacities.clamp_min(0.5))
-
-
-def _with_stars(
-    picture: Picture, means_TK3: Tensor, tokens: Sequence[Token], cameras: Cameras
-) -> Picture:
-    scale = OVERSAMPLING
-    large = Image.fromarray(picture).resize(
-        (picture.shape[1] * scale, picture.shape[0] * scale), Image.Resampling.BICUBIC
-    )
-    draw = ImageDraw.Draw(large, "RGBA")
-    for means, token in zip(means_TK3, tokens, strict=True):
+    picture = (scene * (1 - alpha) + color).clip(0, 255).round().astype(np.uint8)
+    image = _oversampled(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    for member, token in zip(members, tokens, strict=True):
+        means = gaussians.means[0, list(member)]
         front = to_camera(means[None], cameras)[0, 0, :, 2] > 1e-3
-        centre = means.mean(0, keepdim=True)
-        points = _pixels(torch.cat([centre, means[front]]), cameras).clamp(-1e4, 1e4) * scale
-        hub, *rays = [tuple(point) for point in points.tolist()]
+        points = torch.cat([means.mean(0, keepdim=True), means[front]])
+        pixels = _pixels(points, cameras).clamp(-1e4, 1e4) * OVERSAMPLING
+        hub, *rays = [tuple(point) for point in pixels.tolist()]
         for end in rays:
-            draw.line([hub, end], fill=(*token.color, 200), width=scale)
-        for x, y in rays:
-            radius = 1.6 * scale
-            box = (x - radius, y - radius, x + radius, y + radius)
-            draw.ellipse(box, fill=(*token.color, 255), outline=(*INK, 160))
-    return np.asarray(large.resize(picture.shape[1::-1], Image.Resampling.LANCZOS))
+            draw.line([hub, end], fill=(*token.color, 200), width=OVERSAMPLING)
+        for end in rays:
+            draw.circle(end, 1.6 * OVERSAMPLING, fill=(*token.color, 255), outline=(*INK, 160))
+    return _reduced(image)
 
 
 def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
@@ -261,17 +219,3 @@ def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
     in_camera = to_camera(points[None], cameras)[0, 0]
     in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
     return to_pixels(in_camera, cameras.intrinsics[0, 0]).cpu()
-
-
-def _spread(means_K3: Tensor) -> Tensor:
-    return (means_K3 - means_K3.mean(0)).norm(dim=-1).mean()
-
-
-def _spread_out(points: Tensor, count: int) -> list[int]:
-    """Indices of `count` points, starting with the first, each farthest from those before."""
-    chosen = [0]
-    distance = (points - points[0]).norm(dim=-1)
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(distance.argmax()))
-        distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=-1))
-    return chosen

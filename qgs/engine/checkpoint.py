@@ -1,11 +1,11 @@
-"""What continues a run: its state on disk, resuming it, starting from another one's weights."""
+"""What a run saves and continues from; starting from the weights of another one."""
 
 from __future__ import annotations
 
 import json
 import os
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -19,13 +19,15 @@ from torch import Tensor, nn
 
 import qgs
 from qgs.composer import Recipe, resolve
-from qgs.engine.distributed import placed_like, whole
+from qgs.composer.recipe import flat
+from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.io.checkpoint import (
     CheckpointError,
     load_recipe,
     load_weights,
     opened_tensors,
+    save,
     unique_tensors,
     write_tensors,
 )
@@ -50,7 +52,7 @@ class Stateful(Protocol):
         ...
 
     def load_state(self, state: State) -> None:
-        """Become what `state` was taken from."""
+        """Restore from `state`."""
         ...
 
 
@@ -109,6 +111,81 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
     return SavedState(resolve(json.loads(metadata[_RECIPE])), parts)
 
 
+class Saver:
+    """Writes the checkpoint and the state of a run; of several processes, the main one writes.
+
+    parts: everything that continues the run, by name; "weights", and "ema" if there is one, are
+        also what checkpoints are written from.
+    Each file appears whole or not at all, and the state is complete by itself. It comes last: what
+    is in it has reached the other files. All processes must call each method together.
+    """
+
+    def __init__(
+        self, accelerator: Accelerator, folder: RunFolder, model: QueryGaussianModel
+    ) -> None:
+        self.folder = folder
+        self.model = model
+        self.parts: dict[str, Stateful] = {"weights": Weights(model)}
+        self._accelerator = accelerator
+
+    def save(self, step: int) -> None:
+        """Save the run after `step` optimiser steps."""
+        parts = self._states()
+        if self._accelerator.is_main_process:
+            if not self.folder.state.exists():
+                self._write_state(parts)  # a checkpoint alone is a run that cannot be continued
+            extra = {"step": str(step)}
+            save(self.model, self.folder.checkpoint, extra=extra, weights=parts["weights"])
+            if "ema" in parts:
+                save(self.model, self.folder.checkpoint_ema, extra=extra, weights=parts["ema"])
+            self._write_state(parts)
+        self._accelerator.wait_for_everyone()
+
+    def save_state(self) -> None:
+        """Save what continues the run, and leave the checkpoint."""
+        parts = self._states()
+        if self._accelerator.is_main_process:
+            self._write_state(parts)
+        self._accelerator.wait_for_everyone()
+
+    def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
+        """Save a checkpoint of other weights than the present ones."""
+        if self._accelerator.is_main_process:
+            save(self.model, self.folder.checkpoint, extra={"step": str(step)}, weights=weights)
+        self._accelerator.wait_for_everyone()
+
+    def whole_model(self) -> QueryGaussianModel:
+        """The model, as a copy of its own where its weights lie in shards."""
+        if not sharded(self.model):
+            return self.model
+        assert self.model.recipe is not None
+        copy = resolve(self.model.recipe).build_model()
+        load_weights(copy, self.parts["weights"].state(), "the model in shards")
+        return copy.to(self._accelerator.device)
+
+    def restore(self, saved: SavedState) -> None:
+        """Bring every part back to where `saved` was taken.
+
+        Raises CheckpointError, and what parts raise.
+        """
+        missing = [name for name in self.parts if name not in saved.parts]
+        if missing:
+            raise CheckpointError(
+                f"{self.folder.state} lacks {', '.join(missing)}: another version of qgs wrote "
+                "it; continue the run with that version"
+            )
+        for name, part in self.parts.items():
+            part.load_state(saved.parts[name])
+
+    def _states(self) -> dict[str, State]:
+        return {name: part.state() for name, part in self.parts.items()}
+
+    def _write_state(self, parts: Mapping[str, State]) -> None:
+        self.folder.flush(to_disk=True)
+        assert self.model.recipe is not None
+        write_state(self.folder.state, self.model.recipe, parts)
+
+
 class Weights:
     """Parameters and persistent buffers of a module, by name."""
 
@@ -126,17 +203,17 @@ class Weights:
             tensor.copy_(placed_like(state[name], tensor))
 
 
-class Moments:
-    """What an optimiser remembers of the parameters of `module`, by name."""
+class OptimizerState:
+    """What torch's optimiser remembers of the parameters of `module`, by name."""
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         self._parameters = dict(module.named_parameters())
         self._optimizer = optimizer
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Any]:
         """See `Stateful`."""
         return {
-            f"{name}/{key}": whole(value)
+            f"{name}/{key}": whole(value) if isinstance(value, Tensor) else value
             for name, parameter in self._parameters.items()
             for key, value in self._optimizer.state.get(parameter, {}).items()
         }
@@ -147,7 +224,9 @@ class Moments:
         for path, value in state.items():
             name, key = path.rsplit("/", 1)
             parameter = self._parameters[name]
-            self._optimizer.state[parameter][key] = placed_like(value, parameter)
+            if isinstance(value, Tensor):
+                value = placed_like(value, parameter)
+            self._optimizer.state[parameter][key] = value
 
 
 def set_seed(seed: int) -> None:
@@ -164,43 +243,36 @@ class RandomStates:
         self._accelerator = accelerator
 
     def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        own = [_generators(self._accelerator.device)]
-        ranks = gather_object(own) if self._accelerator.num_processes > 1 else own
+        """See `Stateful`."""
+        version, words, gauss = random.getstate()
+        own = {
+            "python": [version, list(words), gauss],
+            "numpy": _with_key(np.random.get_state(legacy=False), np.ndarray.tolist),
+            "torch": torch.get_rng_state(),
+        }
+        device = self._accelerator.device
+        if device.type == "cuda":
+            own["cuda"] = torch.cuda.get_rng_state(device)
+        ranks = gather_object([own]) if self._accelerator.num_processes > 1 else [own]
         return {f"{rank}/{key}": v for rank, state in enumerate(ranks) for key, v in state.items()}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`; a rank that `state` does not know keeps its own."""
-        prefix = f"{self._accelerator.process_index}/"
+    def load_state(self, state: State) -> None:
+        """See `Stateful`; a rank that `state` does not know keeps its own."""
+        prefix, device = f"{self._accelerator.process_index}/", self._accelerator.device
         own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
-        if own:
-            _restore_generators(own, self._accelerator.device)
+        if not own:
+            return
+        version, words, gauss = own["python"]
+        random.setstate((version, tuple(words), gauss))
+        np.random.set_state(_with_key(own["numpy"], lambda key: np.array(key, np.uint32)))
+        torch.set_rng_state(own["torch"])
+        if device.type == "cuda" and "cuda" in own:
+            torch.cuda.set_rng_state(own["cuda"], device)
 
 
-def _generators(device: torch.device) -> dict[str, Any]:
-    version, words, gauss = random.getstate()
-    numpy_state = np.random.get_state(legacy=False)
-    assert isinstance(numpy_state, dict)
-    twister = numpy_state["state"]
-    state: dict[str, Any] = {
-        "python": [version, list(words), gauss],
-        "numpy": {**numpy_state, "state": {**twister, "key": twister["key"].tolist()}},
-        "torch": torch.get_rng_state(),
-    }
-    if device.type == "cuda":
-        state["cuda"] = torch.cuda.get_rng_state(device)
-    return state
-
-
-def _restore_generators(state: Mapping[str, Any], device: torch.device) -> None:
-    version, words, gauss = state["python"]
-    random.setstate((version, tuple(words), gauss))
-    twister = {**state["numpy"]["state"]}
-    twister["key"] = np.array(twister["key"], np.uint32)
-    np.random.set_state({**state["numpy"], "state": twister})
-    torch.set_rng_state(state["torch"])
-    if device.type == "cuda" and "cuda" in state:
-        torch.cuda.set_rng_state(state["cuda"], device)
+def _with_key(state: Any, function: Callable[[Any], Any]) -> dict[str, Any]:
+    """A state of numpy's generator with `function` of the words of its Mersenne Twister."""
+    return {**state, "state": {**state["state"], "key": function(state["state"]["key"])}}
 
 
 FREE = (
@@ -214,6 +286,7 @@ FREE = (
     "training.evaluate_every",
     "training.trackers",
     "evaluation",
+    "metrics",
     "data.path",
 )
 """Parts of a recipe that may change when a run is continued.
@@ -233,26 +306,18 @@ class OtherRunError(ValueError):
 def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
     """The state from which the run in `folder` continues with `recipe`; None to start it.
 
-    A run that was killed before it first saved starts again.
-    Raises FileExistsError when the folder holds something else, OtherRunError when the run has
-    another recipe, CheckpointError when the state cannot be read.
+    A run that was killed before it first saved starts again. Raises OtherRunError unless `recipe`
+    equals the run's outside of FREE, CheckpointError when the state cannot be read.
     """
-    folder.refuse_foreign()
     if folder.is_new:
         return None
     saved = read_state(folder.state) if folder.state.is_file() else None
-    refuse_another(recipe, saved.recipe if saved else resolve(folder.recipe), folder)
-    return saved
-
-
-def refuse_another(recipe: Recipe, trained: Recipe, folder: RunFolder) -> None:
-    """Raise OtherRunError unless `recipe` learns what `trained`, the run's recipe, does."""
-    ours, theirs = dict(_leaves(recipe.tree)), dict(_leaves(trained.tree))
-    keys = [*ours, *(key for key in theirs if key not in ours)]
+    ours, theirs = flat(recipe.tree), flat((saved.recipe if saved else resolve(folder.recipe)).tree)
+    may_change = tuple(f"{key}." for key in (*FREE, *_COUNTED))
     differing = [
         f"{key}: {ours.get(key, 'absent')} here, {theirs.get(key, 'absent')} in the run"
-        for key in keys
-        if ours.get(key) != theirs.get(key) and not _free(key)
+        for key in dict.fromkeys([*ours, *theirs])
+        if ours.get(key) != theirs.get(key) and not f"{key}.".startswith(may_change)
     ]
     if differing:
         raise OtherRunError(
@@ -261,15 +326,14 @@ def refuse_another(recipe: Recipe, trained: Recipe, folder: RunFolder) -> None:
             + f"\nContinue it with its own recipe, {folder.recipe}, or choose another folder. "
             f"Only these may change: {', '.join(FREE)}."
         )
+    return saved
 
 
-def refuse_other_conditions(
-    saved: Mapping[str, Any], now: Mapping[str, Any], folder: RunFolder
-) -> None:
+def refuse_other_data(saved: State, now: State, folder: RunFolder) -> None:
     """Raise OtherRunError unless steps see the same data in number and order as before.
 
-    saved, now: "step_size", samples of an optimiser step over all processes, and "scenes", the
-    fingerprint of `qgs.data.stream.SceneOrder`.
+    saved, now: "step_size", samples of an optimiser step over all processes, and "scenes", see
+    `qgs.data.stream.scenes_fingerprint`.
     """
     if saved["step_size"] != now["step_size"]:
         raise OtherRunError(
@@ -284,20 +348,7 @@ def refuse_other_conditions(
         )
 
 
-def _free(key: str) -> bool:
-    return key in _COUNTED or any(key == free or key.startswith(f"{free}.") for free in FREE)
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted path and value of everything in `tree` that is no mapping with entries."""
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-QUERIES = "queries."
+_QUERIES = "queries."
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
@@ -317,28 +368,29 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     learned_by = load_recipe(path)
     with safe_open(path, "pt") as file:
         learned = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    options = _differing_options(learned_by, recipe)
+    options = [
+        f"{option}: {theirs} (here {ours})"
+        for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()
+        if option != "model.queries.count"
+    ]
     found = _differences(learned, model, learned_by.build_model("meta").queries.count)
     if found:
-        raise CheckpointError(_refusal(path, found, options))
-    generator = torch.Generator().manual_seed(recipe.seed)
-    queries = {k.removeprefix(QUERIES): v for k, v in learned.items() if k.startswith(QUERIES)}
-    resized = model.queries.resized(queries, generator)
-    weights = learned | {QUERIES + name: values for name, values in resized.items()}
+        first = (
+            f"init_from: {path} does not fit this recipe; only the number of queries may differ:"
+        )
+        trained = "options of the model that the checkpoint was trained with:"
+        raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
+    queries = {k.removeprefix(_QUERIES): v for k, v in learned.items() if k.startswith(_QUERIES)}
+    resized = model.queries.resized(queries, torch.Generator().manual_seed(recipe.seed))
+    weights = learned | {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, str(path))
-    resizings = [
-        _told(name, len(learned[name]), len(values))
-        for name, values in weights.items()
-        if values.shape != learned[name].shape
-    ]
-    others = [f"learned with {option}" for option in options]
-    return [f"weights start from {path}", *resizings, *others]
-
-
-def _told(name: str, old: int, new: int) -> str:
-    if new < old:
-        return f"{name}: {old} -> {new}, the first are kept"
-    return f"{name}: {old} -> {new}, {old} kept, {new - old} noisy copies of them"
+    done = [f"weights start from {path}"]
+    for name, values in weights.items():
+        if values.shape != learned[name].shape:
+            old, new = len(learned[name]), len(values)
+            kept = f"{old} kept, {new - old} noisy copies of them"
+            done.append(f"{name}: {old} -> {new}, {'the first are kept' if new < old else kept}")
+    return done + [f"learned with {option}" for option in options]
 
 
 def _differences(learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int) -> list[str]:
@@ -347,47 +399,6 @@ def _differences(learned: Mapping[str, Tensor], model: QueryGaussianModel, count
     for name in own.keys() & theirs.keys():
         ours, shape = own[name], theirs[name]
         per_query = ours[:1] == (model.queries.count,) and shape[:1] == (count,)
-        if name.startswith(QUERIES) and per_query and ours[1:] == shape[1:]:
+        if name.startswith(_QUERIES) and per_query and ours[1:] == shape[1:]:
             del own[name], theirs[name]
     return differing_tensors(theirs, own)
-
-
-def _refusal(path: Path, found: Iterable[str], options: Iterable[str]) -> str:
-    return "\n  ".join(
-        [f"init_from: {path} does not fit this recipe; only the number of queries may differ:"]
-        + [*found, "options of the model that the checkpoint was trained with:"]
-        + [f"  {option}" for option in options]
-    )
-
-
-def _differing_options(learned_by: Recipe, recipe: Recipe) -> list[str]:
-    """Options of the model, the number of queries aside, in which two recipes differ."""
-    apart = options_beside_weights(learned_by.tree, recipe.tree)
-    return [
-        f"{path}: {theirs} (here {ours})"
-        for path, (theirs, ours) in apart.items()
-        if path != "model.queries.count"
-    ]
-
-
-class Counters:
-    """Optimiser steps, and samples drawn over all processes.
-
-    conditions: what must be as it was for these numbers to mean the same when the run in `folder`
-    is continued, see `qgs.engine.checkpoint.refuse_other_conditions`.
-    """
-
-    def __init__(self, conditions: Mapping[str, Any], folder: RunFolder) -> None:
-        self.step = 0
-        self.samples = 0
-        self._conditions = conditions
-        self._folder = folder
-
-    def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        return {"step": self.step, "samples": self.samples, **self._conditions}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`. Raises OtherRunError."""
-        refuse_other_conditions(state, self._conditions, self._folder)
-        self.step, self.samples = state["step"], state["samples"]

@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any
 
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from qgs.engine.results import StoredResults, listed, markdown_table
+from qgs.contracts import Column
+from qgs.engine.results import (
+    StoredResults,
+    as_json,
+    listed,
+    markdown_table,
+    null_entries,
+    print_lines,
+    print_table,
+    value_name,
+)
 from qgs.io.files import write_text
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
 _SEED = 0
 _AT_A_TIME = 1_000_000
-
-COLUMNS = {
-    "model_psnr": ("PSNR ↑", 1, 3),
-    "model_ssim": ("SSIM ↑", 1, 4),
-    "model_lpips": ("LPIPS ↓", -1, 4),
-    "dispersion_mean": ("dispersion mean ↓", -1, 4),
-    "dispersion_median": ("dispersion med. ↓", -1, 4),
-}
-"""Compared values of a scene: header, sign of better, digits."""
+"""Numbers that the bootstrap draws at a time, which bounds its memory."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,7 @@ class Difference:
     """
 
     metric: str
+    column: Column
     scenes: int
     first: float
     second: float
@@ -50,28 +50,104 @@ class Difference:
     wins: int
     losses: int
 
+    def cells(self) -> list[str]:
+        """A row of the table, one digit finer than an evaluation's."""
+        digits, interval = self.column.digits + 1, "–"
+        if self.low is not None and self.high is not None:
+            interval = f"[{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
+        first, second = f"{self.first:.{digits}f}", f"{self.second:.{digits}f}"
+        apart, score = f"{self.difference:+.{digits}f}", f"{self.wins} : {self.losses}"
+        return [self.column.title, first, second, apart, interval, score]
+
 
 @dataclass(frozen=True)
 class Comparison:
-    """The first results against others. wanted: how many scenes their protocols name.
+    """The first results against others. shared: the scenes that both judged."""
 
-    missing_first, missing_second: scenes without a score. null: scenes that an index lists without
-    frames. only_first, only_second: scenes that one alone judged. empty: metrics that one of them
-    lacks. other_frames: shared scenes judged on different frames.
-    """
-
-    first: str
-    second: str
-    same_protocol: bool
-    other_frames: Sequence[str]
+    first: StoredResults
+    second: StoredResults
+    shared: Sequence[str]
     differences: Sequence[Difference]
-    wanted: int
-    missing_first: Sequence[str]
-    missing_second: Sequence[str]
-    null: Sequence[str]
-    only_first: Sequence[str]
-    only_second: Sequence[str]
-    empty: Sequence[str]
+
+    @property
+    def same_protocol(self) -> bool:
+        """Whether both were judged alike."""
+        return self.first.sha256 == self.second.sha256
+
+    @property
+    def other_frames(self) -> list[str]:
+        """Shared scenes that were judged on different frames."""
+        return [name for name in self.shared if self.first.frames[name] != self.second.frames[name]]
+
+    def record(self) -> dict[str, Any]:
+        """Plain values for JSON.
+
+        wanted: how many scenes the protocols name. null: scenes that an index lists without frames.
+        only: scenes that one alone judged. empty: headings of metrics that have no scene in both.
+        """
+        first, second = self.first, self.second
+        compared = {difference.metric for difference in self.differences}
+        columns = {**first.columns, **second.columns}
+        return {
+            "first": first.name,
+            "second": second.name,
+            "same_protocol": self.same_protocol,
+            "other_frames": self.other_frames,
+            "differences": [asdict(difference) for difference in self.differences],
+            "wanted": max(first.wanted, second.wanted),
+            "missing_first": list(first.missing),
+            "missing_second": list(second.missing),
+            "null": list(dict.fromkeys([*first.null, *second.null])),
+            "only_first": [name for name in first.scenes if name not in self.shared],
+            "only_second": [name for name in second.scenes if name not in self.shared],
+            "empty": [column.heading for name, column in columns.items() if name not in compared],
+        }
+
+    @property
+    def title(self) -> str:
+        """Who is compared, over how many scenes."""
+        count, wanted = len(self.shared), max(self.first.wanted, self.second.wanted)
+        scenes = f"{count} scene{'s' if count > 1 else ''}"
+        if count < wanted:
+            missing = list(dict.fromkeys([*self.first.missing, *self.second.missing]))
+            names = f" (missing: {listed(missing)})" if missing else ""
+            scenes = f"{count} of {wanted} scenes{names}"
+        return f"{self.first.name} against {self.second.name}, {scenes}"
+
+    def rows(self) -> list[list[str]]:
+        """The table, headers first."""
+        percent = f"{100 * CONFIDENCE:.0f} % interval"
+        header = ["metric", "first", "second", "difference", percent, "won : lost"]
+        return [header, *(difference.cells() for difference in self.differences)]
+
+    def notes(self) -> Iterator[str]:
+        """What is to be known beside the table, one line each."""
+        first, second, facts = self.first, self.second, self.record()
+        yield (
+            f"difference: {first.name} minus {second.name}, mean over scenes; interval: percentile "
+            f"bootstrap over scenes, {RESAMPLES:,} resamples"
+        )
+        if len(self.shared) == 1:
+            yield "one scene is too few for an interval"
+        for result in (first, second):
+            if result.missing:
+                yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
+        if facts["null"]:
+            yield null_entries(facts["null"])
+        for result, only in ((first, facts["only_first"]), (second, facts["only_second"])):
+            if only:
+                yield f"{len(only)} scenes only in {result.name}, left out: {listed(only)}"
+        for d in self.differences:
+            if d.scenes < len(self.shared):
+                yield f"{d.column.heading}: over the {d.scenes} scenes that have it in both"
+            if d.column.heading != (other := second.columns[d.metric].heading):
+                yield f"{d.column.heading} in {first.name} is {other} in {second.name}"
+        if facts["empty"]:
+            yield f"not in both, left out: {', '.join(facts['empty'])}"
+        if not self.same_protocol:
+            yield "the protocols differ: the scores do not measure the same"
+        if moved := self.other_frames:
+            yield f"{len(moved)} scenes judged on different frames: {listed(moved)}"
 
 
 @dataclass(frozen=True)
@@ -81,67 +157,30 @@ class Comparisons:
     protocols: Mapping[str, str]
     pairs: Sequence[Comparison]
 
-    @classmethod
-    def of(cls, results: Sequence[StoredResults], across_protocols: bool = False) -> Self:
-        """Compare the first of `results` with each of the others.
-
-        Raises ValueError for fewer than two, for one folder twice, for results without a scene in
-        common, and unless `across_protocols` for results of different protocols and for scenes that
-        were judged on different frames.
-        """
-        names = [result.name for result in results]
-        if len(names) < 2 or len(set(names)) < len(names):
-            raise ValueError(f"a comparison takes two or more different results, got {names}")
-        first, *others = results
-        for other in others:
-            if other.sha256 != first.sha256 and not across_protocols:
-                raise ValueError(_different_protocols(first, other))
-            moved = _judged_on_other_frames(first, other)
-            if moved and not across_protocols:
-                raise ValueError(_different_frames(first, other, moved))
-        protocols = {result.name: _protocol(result) for result in results}
-        return cls(protocols, [_compared(first, other) for other in others])
-
     def show(self, console: Console) -> None:
         """Print a table for each pair."""
+        compact = {"box": box.SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
         for pair in self.pairs:
-            table = Table(
-                title=escape(_title(pair)),
-                title_justify="left",
-                box=box.SIMPLE_HEAD,
-                collapse_padding=True,
-                pad_edge=False,
-            )
-            header, *rows = _rows(pair)
-            for name in header:
-                table.add_column(
-                    name, no_wrap=True, justify="left" if name == header[0] else "right"
-                )
-            for row in rows:
-                table.add_row(*row)
-            console.print(table)
-            for line in _notes(pair):
-                console.print(escape(line), highlight=False, soft_wrap=True)
-        for line in self._protocol_lines():
-            console.print(escape(line), highlight=False, soft_wrap=True)
+            print_table(console, pair.title, pair.rows(), **compact)
+            print_lines(console, pair.notes())
+        print_lines(console, self._protocol_lines())
 
     def write(self, folder: Path) -> None:
         """Write comparison.json and comparison.md into `folder`."""
         record = {
             "protocols": dict(self.protocols),
             "bootstrap": {"resamples": RESAMPLES, "confidence": CONFIDENCE, "seed": _SEED},
-            "pairs": [asdict(pair) for pair in self.pairs],
+            "pairs": [pair.record() for pair in self.pairs],
         }
-        text = json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False)
-        write_text(folder / "comparison.json", text + "\n")
+        write_text(folder / "comparison.json", as_json(record))
         write_text(folder / "comparison.md", self.markdown())
 
     def markdown(self) -> str:
         """The tables and what is to be known beside them."""
         parts = []
         for pair in self.pairs:
-            notes = "\n".join(f"- {line}" for line in _notes(pair))
-            parts += [f"**{_title(pair)}**", markdown_table(_rows(pair)), notes]
+            notes = "\n".join(f"- {line}" for line in pair.notes())
+            parts += [f"**{pair.title}**", markdown_table(pair.rows()), notes]
         parts.append("\n".join(f"- {line}" for line in self._protocol_lines()))
         return "\n\n".join(parts) + "\n"
 
@@ -149,6 +188,46 @@ class Comparisons:
         if len(set(self.protocols.values())) == 1:
             return [f"protocol {next(iter(self.protocols.values()))}"]
         return [f"protocol of {name}: {protocol}" for name, protocol in self.protocols.items()]
+
+
+def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Comparisons:
+    """Compare the first of `results` with each of the others.
+
+    Raises ValueError for fewer than two, for one folder twice, for results without a scene in
+    common, and unless `across_protocols` for results of different protocols and for scenes that
+    were judged on different frames.
+    """
+    names = [result.name for result in results]
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise ValueError(f"a comparison takes two or more different results, got {names}")
+    first, *others = results
+    pairs = []
+    for other in others:
+        if other.sha256 != first.sha256 and not across_protocols:
+            keys = sorted({*first.protocol, *other.protocol})
+            unequal = [key for key in keys if first.protocol.get(key) != other.protocol.get(key)]
+            raise ValueError(
+                f"{first.name} was judged by {first.protocol_name} ({first.sha256[:12]}), "
+                f"{other.name} by {other.protocol_name} ({other.sha256[:12]}), which differ in "
+                f"{', '.join(unequal)}: evaluate both alike, or add --across-protocols to compare "
+                "them all the same"
+            )
+        shared = [name for name in first.scenes if name in other.scenes]
+        if not shared:
+            raise ValueError(f"{first.name} and {other.name} have no scene in common")
+        metrics = [name for name in first.columns if name in other.columns]
+        found = (_difference(metric, first, other, shared) for metric in metrics)
+        pair = Comparison(first, other, shared, [d for d in found if d])
+        if pair.other_frames and not across_protocols:
+            raise ValueError(
+                f"{first.name} and {other.name} judged {len(pair.other_frames)} scenes on "
+                f"different frames, although their protocols agree: {listed(pair.other_frames)}. "
+                "The data, or how views are drawn, changed between them: evaluate both again, or "
+                "add --across-protocols"
+            )
+        pairs.append(pair)
+    protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
+    return Comparisons(protocols, pairs)
 
 
 def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
@@ -172,129 +251,27 @@ def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def _compared(first: StoredResults, second: StoredResults) -> Comparison:
-    shared = [name for name in first.scenes if name in second.scenes]
-    if not shared:
-        raise ValueError(f"{first.name} and {second.name} have no scene in common")
-    ours, theirs = first.scenes[shared[0]], second.scenes[shared[0]]
-    return Comparison(
-        first=first.name,
-        second=second.name,
-        same_protocol=first.sha256 == second.sha256,
-        other_frames=_judged_on_other_frames(first, second),
-        differences=[
-            _difference(
-                metric,
-                np.array([first.scenes[name][metric] for name in shared]),
-                np.array([second.scenes[name][metric] for name in shared]),
-            )
-            for metric in COLUMNS
-            if metric in ours and metric in theirs
-        ],
-        wanted=max(first.wanted, second.wanted),
-        missing_first=first.missing,
-        missing_second=second.missing,
-        null=list(dict.fromkeys([*first.null, *second.null])),
-        only_first=[name for name in first.scenes if name not in second.scenes],
-        only_second=[name for name in second.scenes if name not in first.scenes],
-        empty=[m for m in COLUMNS if m not in ours or m not in theirs],
-    )
-
-
-def _judged_on_other_frames(first: StoredResults, second: StoredResults) -> list[str]:
-    shared = [name for name in first.frames if name in second.frames]
-    return [name for name in shared if first.frames[name] != second.frames[name]]
-
-
-def _difference(metric: str, first: np.ndarray, second: np.ndarray) -> Difference:
-    apart = first - second
-    better = apart * COLUMNS[metric][1]
+def _difference(
+    metric: str, first: StoredResults, second: StoredResults, shared: Sequence[str]
+) -> Difference | None:
+    """None where no scene has the metric in both."""
+    column, value = first.columns[metric], value_name("model", metric)
+    both = [s for s in shared if value in first.scenes[s] and value in second.scenes[s]]
+    if not both:
+        return None
+    ours, theirs = (np.array([r.scenes[name][value] for name in both]) for r in (first, second))
+    apart = ours - theirs
+    better = apart if column.better == "higher" else -apart
     low, high = paired_interval(apart) or (None, None)
     return Difference(
         metric=metric,
-        scenes=len(apart),
-        first=float(first.mean()),
-        second=float(second.mean()),
+        column=column,
+        scenes=len(both),
+        first=float(ours.mean()),
+        second=float(theirs.mean()),
         difference=float(apart.mean()),
         low=low,
         high=high,
         wins=int((better > 0).sum()),
         losses=int((better < 0).sum()),
-    )
-
-
-def _title(pair: Comparison) -> str:
-    count = pair.differences[0].scenes
-    scenes = f"{count} scene{'s' if count > 1 else ''}"
-    if count < pair.wanted:
-        missing = list(dict.fromkeys([*pair.missing_first, *pair.missing_second]))
-        names = f" (missing: {listed(missing)})" if missing else ""
-        scenes = f"{count} of {pair.wanted} scenes{names}"
-    return f"{pair.first} against {pair.second}, {scenes}"
-
-
-def _rows(pair: Comparison) -> list[list[str]]:
-    percent = f"{100 * CONFIDENCE:.0f} % interval"
-    rows = [["metric", "first", "second", "difference", percent, "won : lost"]]
-    for d in pair.differences:
-        header, _, digits = COLUMNS[d.metric]
-        interval = "–"
-        if d.low is not None and d.high is not None:
-            interval = f"[{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
-        numbers = f"{d.first:.{digits}f}", f"{d.second:.{digits}f}", f"{d.difference:+.{digits}f}"
-        rows.append([header, *numbers, interval, f"{d.wins} : {d.losses}"])
-    return rows
-
-
-def _notes(pair: Comparison) -> list[str]:
-    lines = [
-        f"difference: {pair.first} minus {pair.second}, mean over scenes; interval: percentile "
-        f"bootstrap over scenes, {RESAMPLES:,} resamples"
-    ]
-    if pair.differences[0].low is None:
-        lines.append("one scene is too few for an interval")
-    for name, scenes in ((pair.first, pair.missing_first), (pair.second, pair.missing_second)):
-        if scenes:
-            lines.append(f"{name} is incomplete: no score of {listed(scenes)}")
-    if pair.null:
-        lines.append(
-            f"null entries of the index, not judged ({len(pair.null)}): {listed(pair.null)}"
-        )
-    for name, scenes in ((pair.first, pair.only_first), (pair.second, pair.only_second)):
-        if scenes:
-            lines.append(f"{len(scenes)} scenes only in {name}, left out: {listed(scenes)}")
-    if pair.empty:
-        empty = ", ".join(COLUMNS[metric][0].split(" ↓")[0].split(" ↑")[0] for metric in pair.empty)
-        lines.append(f"not in both, left out: {empty}")
-    if not pair.same_protocol:
-        lines.append("the protocols differ: the scores do not measure the same")
-    if pair.other_frames:
-        lines.append(
-            f"{len(pair.other_frames)} scenes judged on different frames: "
-            f"{listed(pair.other_frames)}"
-        )
-    return lines
-
-
-def _protocol(result: StoredResults) -> str:
-    text = f"{result.protocol_name}, sha256 {result.sha256}"
-    covariance = result.protocol.get("ssim_covariance", "population")
-    return text if covariance == "population" else f"{text}, SSIM with {covariance} covariance"
-
-
-def _different_protocols(first: StoredResults, other: StoredResults) -> str:
-    keys = sorted({*first.protocol, *other.protocol})
-    unequal = [key for key in keys if first.protocol.get(key) != other.protocol.get(key)]
-    return (
-        f"{first.name} was judged by {first.protocol_name} ({first.sha256[:12]}), {other.name} by "
-        f"{other.protocol_name} ({other.sha256[:12]}), which differ in {', '.join(unequal)}: "
-        "evaluate both alike, or add --across-protocols to compare them all the same"
-    )
-
-
-def _different_frames(first: StoredResults, other: StoredResults, moved: Sequence[str]) -> str:
-    return (
-        f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, although "
-        f"their protocols agree: {listed(moved)}. The data, or how views are drawn, changed "
-        "between them: evaluate both again, or add --across-protocols"
     )

@@ -22,12 +22,9 @@ from torch.distributed.tensor import DTensor, distribute_tensor
 
 from qgs.model import QueryGaussianModel
 
-PATIENCE = timedelta(hours=24)
-"""How long processes wait for each other: while one evaluates or saves, the others do.
-
-torch's own 10 minutes with NCCL would end such runs. A process that died is none of this: the
-launcher notices it and ends the others.
-"""
+TIMEOUT = timedelta(hours=24)
+"""How long processes wait for each other while one evaluates or saves; torch's own 10 minutes with
+NCCL would end such runs. A process that died is noticed by the launcher, which ends the others."""
 
 
 def make_accelerator(device: str) -> Accelerator:
@@ -35,8 +32,8 @@ def make_accelerator(device: str) -> Accelerator:
 
     device: "cpu" or "cuda". Autocast is the trainer's own, so no mixed precision is asked for.
     """
-    patience = InitProcessGroupKwargs(timeout=PATIENCE)
-    return Accelerator(cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[patience])
+    group = InitProcessGroupKwargs(timeout=TIMEOUT)
+    return Accelerator(cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[group])
 
 
 def wants_shards(accelerator: Accelerator) -> bool:
@@ -104,10 +101,9 @@ def whole(tensor: Tensor) -> Tensor:
 def placed_like(tensor: Tensor, other: Tensor) -> Tensor:
     """The whole `tensor` on the device of `other`, as shards where `other` lies in shards."""
     tensor = tensor.to(other.device)
-    if isinstance(other, DTensor) and tensor.shape == other.shape:
-        mesh, placements = other.device_mesh, other.placements
-        return distribute_tensor(tensor, mesh, placements, src_data_rank=None)
-    return tensor
+    if not isinstance(other, DTensor) or tensor.shape != other.shape:
+        return tensor
+    return distribute_tensor(tensor, other.device_mesh, other.placements, src_data_rank=None)
 
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -166,20 +162,21 @@ def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    patience_ends = float("inf")
+    gives_up_at = float("inf")
 
     def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal patience_ends
+        nonlocal gives_up_at
         if number == signal.SIGINT:
-            if time.monotonic() >= patience_ends:
+            if time.monotonic() >= gives_up_at:
                 raise KeyboardInterrupt
-            patience_ends = min(patience_ends, time.monotonic() + PAUSE)
-        if request:
-            return
-        request.signal = signal.Signals(number)
-        if not quiet:  # not by print, which must not be entered twice
-            told = f"\n{request.signal.name}: finishing the step, saving; Ctrl-C again to give up\n"
-            os.write(2, told.encode())
+            gives_up_at = min(gives_up_at, time.monotonic() + PAUSE)
+        if not request:
+            request.signal = signal.Signals(number)
+            message = (
+                f"\n{request.signal.name}: finishing the step, saving; Ctrl-C again to give up\n"
+            )
+            if not quiet:  # not by print, which must not be entered twice
+                os.write(2, message.encode())
 
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -4,34 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.contracts import SceneSource
-from qgs.data.evaluation import EvaluationPlan, SceneFailure, told
-from qgs.data.sampling import Frames, Sample, stack_views
+from qgs.contracts import Column, Metric, MetricInput, SceneSource
+from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
+from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
-from qgs.engine.results import TUNING, Evaluation, SceneScore, column
-from qgs.engine.tuning import Tuning, tune, tuning_loss
-from qgs.metrics import gaussians_used, mean_colour, nearest_input, psnr, ssim, token_dispersion
-from qgs.metrics.dispersion import median
-from qgs.metrics.lpips import LpipsUnavailableError, load_lpips
+from qgs.engine.results import TUNING, Evaluation, SceneScore, value_name
+from qgs.engine.tuning import tune, tuning_loss
+from qgs.metrics import gaussians_used, mean_colour, nearest_input
 from qgs.model import QueryGaussianModel
-from qgs.types import Gaussians
+from qgs.types import Gaussians, Views
 
-SECTIONS = ("data", "views", "evaluation")
-"""What of a recipe decides which views are judged."""
+SECTIONS = ("data", "views", "evaluation", "metrics")
+"""What of a recipe decides which views are judged, and how."""
 
-_NOT_ASKED = "not asked for; set evaluation.metrics=[lpips]"
-
-Metric = Callable[[Tensor, Tensor], Tensor]
 Observer = Callable[[int, int], None]
-"""Told how many scenes are done, and how many there are."""
+"""Called with how many scenes are done, and how many there are."""
 
 
 def evaluate(
@@ -41,29 +34,28 @@ def evaluate(
     batch: int = 1,
     observe: Observer | None = None,
 ) -> Evaluation:
-    """Evaluate `model` on the test views of `recipe`, on the device where the model is.
+    """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
-    A scene that fails is told in the result and does not end the evaluation. Samples are decoded
-    one at a time. Leaves the model in the mode it was in.
+    A scene that fails is named in the result with the reason, and the others go on. Samples are
+    decoded one at a time. Leaves the model in the mode it was in.
 
     step: optimiser steps behind the weights. batch: scenes that pass through the model together;
-    tuned tokens pass alone. observe: see `Observer`.
+    with tuned tokens each passes alone. observe: see `Observer`.
     Raises what opening the data source or the index raises, and ValueError when no scene at all
-    could be judged or `batch` is less than 1.
+    could be judged, `batch` is less than 1, or two values of metrics have one name.
     """
     if batch < 1:
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
     source, index = recipe.build_data(), index_of(recipe)
     plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index)
+    judge = _Judge(model, recipe, source)
     training = model.training
     model.eval()
     try:
-        judge = _Judge.of(model, recipe)
-        outcomes = _observed(judge.judged(plan.samples(), batch), plan.wanted, observe)
-        scores, missing = _by_scene(plan.wanted, outcomes)
-        missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
+        scores, missing = _by_scene(plan.wanted, judge.judged(plan.samples(), batch), observe)
     finally:
         model.train(training)
+    missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
     if not scores:
         first = missing[0]
         raise ValueError(
@@ -72,65 +64,58 @@ def evaluate(
         )
     return Evaluation(
         protocol=protocol_of(recipe, index, plan.wanted),
+        columns=judge.columns,
         scores=scores,
         wanted=plan.wanted,
         gaussians=model.queries.count * model.head.gaussians_per_query,
         missing=missing,
         null=plan.null,
         unlisted=plan.unlisted,
-        empty=judge.empty,
+        incomplete=judge.incomplete(scores),
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
 
 
-@dataclass(frozen=True)
-class _SampleScore:
-    scene: str
-    views: tuple[Frames, Frames]
-    values: Mapping[str, float]
-
-
-_Outcome = _SampleScore | SceneFailure
-
-
-@dataclass(frozen=True)
 class _Judge:
-    """Scores samples. tuner: tunes one sample's tokens; None for none. empty: see `Evaluation`."""
+    """Scores samples. columns: name of every value to how it is shown."""
 
-    model: QueryGaussianModel
-    metrics: Mapping[str, Metric]
-    tuner: Callable[..., Tuning] | None
-    empty: Mapping[str, str]
+    def __init__(self, model: QueryGaussianModel, recipe: Recipe, source: SceneSource) -> None:
+        self._model = model
+        self._source = source
+        self._device = next(model.parameters()).device
+        self._metrics = {n: m.to(self._device).eval() for n, m in recipe.build_metrics().items()}
+        self._tune = None
+        if steps := recipe.evaluation.tuning_steps:
+            rate, loss = recipe.evaluation.tuning_rate, tuning_loss(recipe)
+            self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate)
+        self._needed = {need for metric in self._metrics.values() for need in metric.needs}
+        self._owners: dict[str, Metric] = {}
+        self.columns: dict[str, Column] = {}
+        for metric_name, metric in self._metrics.items():
+            for key, column in metric.columns().items():
+                name = _name(metric_name, key)
+                if name in self.columns:
+                    raise ValueError(f"two values of the metrics are called {name}; rename one")
+                self.columns[name], self._owners[name] = column, metric
 
-    @classmethod
-    def of(cls, model: QueryGaussianModel, recipe: Recipe) -> _Judge:
-        evaluation = recipe.evaluation
-        metrics: dict[str, Metric] = {
-            "psnr": psnr,
-            "ssim": partial(ssim, covariance=evaluation.ssim_covariance),
-        }
-        empty: dict[str, str] = {}
-        if "lpips" not in evaluation.metrics:
-            empty["lpips"] = _NOT_ASKED
-        else:
-            try:
-                metrics["lpips"] = load_lpips(evaluation.lpips_weights).to(_device(model))
-            except LpipsUnavailableError as error:
-                empty["lpips"] = str(error)
-        tuner = None
-        if evaluation.tuning_steps:
-            tuner = partial(
-                tune,
-                model,
-                loss=tuning_loss(recipe),
-                steps=evaluation.tuning_steps,
-                rate=evaluation.tuning_rate,
-            )
-        return cls(model, metrics, tuner, empty)
+    def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
+        """Values that some scenes or all lack, and why."""
+        found: dict[str, str] = {}
+        for name, metric in self._owners.items():
+            if metric.unavailable:
+                found[name] = metric.unavailable
+                continue
+            lacking = sum(value_name("model", name) not in score.values for score in scores)
+            if lacking:
+                needs = " and ".join(metric.needs).replace("_", " ")
+                found[name] = f"it needs {needs}, not known for {lacking} of {len(scores)} scenes"
+        return found
 
-    def judged(self, samples: Iterable[Sample | SceneFailure], batch: int) -> Iterator[_Outcome]:
-        """An outcome of every sample, up to `batch` with inputs of one shape at a time."""
+    def judged(
+        self, samples: Iterable[Sample | SceneFailure], batch: int
+    ) -> Iterator[SceneScore | SceneFailure]:
+        """The score of every sample, up to `batch` with inputs of one shape at a time."""
         waiting: list[Sample] = []
         for sample in samples:
             if isinstance(sample, SceneFailure):
@@ -145,121 +130,121 @@ class _Judge:
         yield from self._together(waiting)
 
     @torch.no_grad()
-    def _together(self, samples: Sequence[Sample]) -> list[_Outcome]:
-        if len(samples) < 2 or self.tuner:
-            return [self._alone(sample) for sample in samples]
-        try:
-            inputs = stack_views([sample.inputs for sample in samples]).to(_device(self.model))
-            gaussians = self.model(inputs).gaussians
-        except Exception:  # one of them is to blame: each again by itself, which tells whose
-            return [self._alone(sample) for sample in samples]
-        return [
-            self._safely(sample, gaussians[place : place + 1])
-            for place, sample in enumerate(samples)
-        ]
+    def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
+        if len(samples) > 1 and not self._tune:
+            try:
+                inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
+                gaussians = self._model(inputs).gaussians
+            except Exception:  # run each by itself, to see which one fails
+                pass
+            else:
+                return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
+        return [self._score(sample) for sample in samples]
 
-    def _alone(self, sample: Sample) -> _Outcome:
+    def _score(
+        self, sample: Sample, gaussians: Gaussians | None = None
+    ) -> SceneScore | SceneFailure:
+        """The score of `sample`. gaussians: (1, G), None to predict them here."""
+        values: dict[str, float] = {}
         try:
-            inputs = sample.inputs.to(_device(self.model))
-            if self.tuner is None:
-                return self._safely(sample, self.model(inputs).gaussians)
-            tuning = self.tuner(inputs)
-        except Exception as error:  # told, and never ends the other scenes
-            return SceneFailure(sample.scene, told(error))
-        before, after = TUNING
-        ends = {before: tuning.losses[0], after: tuning.losses[-1]}
-        return self._safely(sample, tuning.prediction.gaussians, ends)
-
-    def _safely(
-        self, sample: Sample, gaussians: Gaussians, more: Mapping[str, float] | None = None
-    ) -> _Outcome:
-        try:
-            values = {**self._values(sample, gaussians), **(more or {})}
-        except Exception as error:  # told, and never ends the other scenes
-            return SceneFailure(sample.scene, told(error))
+            if gaussians is None:
+                gaussians, values = self._predicted(sample.inputs.to(self._device))
+            values = {**self._values(sample, gaussians), **values}
+        except Exception as error:  # reported in the result; the other scenes go on
+            return SceneFailure(sample.scene, one_line(error))
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         if broken:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
-        return _SampleScore(sample.scene, (sample.input_frames, sample.target_frames), values)
+        return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
+
+    def _predicted(self, inputs: Views) -> tuple[Gaussians, dict[str, float]]:
+        """Gaussians (1, G), and TUNING where tokens are tuned before."""
+        if self._tune is None:
+            return self._model(inputs).gaussians, {}
+        tuning = self._tune(inputs)
+        ends = tuning.losses[0], tuning.losses[-1]
+        return tuning.prediction.gaussians, dict(zip(TUNING, ends, strict=True))
 
     def _values(self, sample: Sample, gaussians: Gaussians) -> dict[str, float]:
         """Everything measured on the Gaussians (1, G) of `sample`."""
-        device = _device(self.model)
-        inputs, targets = sample.inputs.to(device), sample.targets.to(device)
-        images = {
-            "model": self.model.render(gaussians, targets.cameras).rgb,
-            "nearest_input": nearest_input(inputs, targets.cameras),
-            "mean_colour": mean_colour(inputs, targets.cameras),
+        inputs, targets = sample.inputs.to(self._device), sample.targets.to(self._device)
+        rendering = self._model.render(gaussians, targets.cameras)
+        depth = true_depth(self._source, sample) if "true_depth" in self._needed else None
+        if depth is not None:
+            depth = depth[None].to(self._device)
+        count = self._model.head.gaussians_per_query
+        given = {
+            "model": MetricInput(
+                rendering.rgb, targets, gaussians, count, rendering.depth, true_depth=depth
+            ),
+            "nearest_input": MetricInput(nearest_input(inputs, targets.cameras), targets),
+            "mean_colour": MetricInput(mean_colour(inputs, targets.cameras), targets),
         }
-        distances = token_dispersion(gaussians.means, self.model.head.gaussians_per_query)
-        return {
-            **{
-                column(method, metric): float(score(rgb, targets.images).double().mean())
-                for method, rgb in images.items()
-                for metric, score in self.metrics.items()
-            },
-            "dispersion_mean": float(distances.double().mean()),
-            "dispersion_median": float(median(distances)),
-            "gaussians_used": float(gaussians_used(gaussians.opacities)),
+        values = {
+            value_name(method, name): value
+            for method, shown in given.items()
+            for name, value in self._measured(shown)
         }
+        return {**values, "gaussians_used": float(gaussians_used(gaussians.opacities))}
+
+    def _measured(self, given: MetricInput) -> Iterator[tuple[str, float]]:
+        for name, metric in self._metrics.items():
+            if metric.unavailable or any(getattr(given, need) is None for need in metric.needs):
+                continue
+            found = metric(given)
+            found = found if isinstance(found, Mapping) else {"": found}
+            for key in metric.columns():
+                yield _name(name, key), float(found[key].double().mean())
+
+
+def _name(metric: str, key: str) -> str:
+    return f"{metric}_{key}" if key else metric
 
 
 def _by_scene(
-    wanted: Sequence[str], outcomes: Iterable[_Outcome]
+    wanted: Sequence[str],
+    results: Iterable[SceneScore | SceneFailure],
+    observe: Observer | None,
 ) -> tuple[list[SceneScore], list[SceneFailure]]:
     """Scores and failures in the order of `wanted`; one failed sample fails its scene."""
-    samples: dict[str, list[_SampleScore]] = {}
+    samples: dict[str, list[SceneScore]] = {}
     failures: dict[str, SceneFailure] = {}
-    for outcome in outcomes:
-        if isinstance(outcome, SceneFailure):
-            failures.setdefault(outcome.scene, outcome)
+    for result in results:
+        if isinstance(result, SceneFailure):
+            failures.setdefault(result.scene, result)
         else:
-            samples.setdefault(outcome.scene, []).append(outcome)
+            samples.setdefault(result.scene, []).append(result)
+        if observe:
+            observe(len(samples.keys() | failures.keys()), len(wanted))
     scores = [_merged(samples[name]) for name in wanted if name in samples and name not in failures]
     return scores, [failures[name] for name in wanted if name in failures]
 
 
-def _merged(samples: Sequence[_SampleScore]) -> SceneScore:
+def _merged(samples: Sequence[SceneScore]) -> SceneScore:
+    """One scene's samples as one: means of the values that all of them have."""
     values = {
         name: sum(sample.values[name] for sample in samples) / len(samples)
         for name in samples[0].values
+        if all(name in sample.values for sample in samples)
     }
-    return SceneScore(samples[0].scene, [sample.views for sample in samples], values)
-
-
-def _observed(
-    outcomes: Iterable[_Outcome], wanted: Sequence[str], observe: Observer | None
-) -> Iterator[_Outcome]:
-    seen: set[str] = set()
-    for outcome in outcomes:
-        yield outcome
-        seen.add(outcome.scene)
-        if observe:
-            observe(len(seen), len(wanted))
+    views = [frames for sample in samples for frames in sample.views]
+    return SceneScore(samples[0].scene, views, values)
 
 
 def _held_out(source: SceneSource, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
     """Held-out frames that were targets, and all of them, over the scenes that were judged."""
-    judged = {
-        score.scene: {frame for _, targets in score.views for frame in targets} for score in scores
-    }
-    scenes, count, total = source.scenes("test"), 0, 0
-    for place, name in enumerate(source.names("test")):
-        if name in judged:
-            held_out = set(scenes[place].held_out)
-            count += len(judged[name] & held_out)
-            total += len(held_out)
+    judged = {score.scene: {f for _, targets in score.views for f in targets} for score in scores}
+    scenes, names = source.scenes("test"), enumerate(source.names("test"))
+    held_out = {name: set(scenes[place].held_out) for place, name in names if name in judged}
+    count = sum(len(judged[name] & frames) for name, frames in held_out.items())
+    total = sum(map(len, held_out.values()))
     return (count, total) if total else None
 
 
 def _without_folder(reason: str, recipe: Recipe) -> str:
-    """`reason` with files told below the data's folder, so that results do not depend on it."""
+    """`reason` with paths relative to the data's folder, so that results do not depend on it."""
     path = recipe.tree["data"].get("path")
     folders = [path, str(Path(path).expanduser().resolve())] if isinstance(path, str) else []
     for folder in folders:
         reason = reason.replace(folder.rstrip("/") + "/", "")
     return reason
-
-
-def _device(model: QueryGaussianModel) -> torch.device:
-    return next(model.parameters()).device

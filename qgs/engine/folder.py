@@ -15,30 +15,43 @@ from qgs.io.files import is_leftover, read_records, write_text
 
 
 class RunFolder:
-    """RUN: recipe.yaml, history.jsonl, checkpoint.safetensors, state.safetensors, evaluation/.
+    """The files of a run, whether they exist yet or not.
 
-    checkpoint.safetensors is the model, for users; state.safetensors alone continues the run.
+    recipe: resolved, as YAML. checkpoint: the latest good weights, for users. checkpoint_ema: their
+    moving average, where a recipe asks for it. state: everything that continues the run.
+    evaluation: the folder where `qgs eval` writes.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self.recipe = self.path / "recipe.yaml"
+        self.checkpoint = self.path / "checkpoint.safetensors"
+        self.checkpoint_ema = self.path / "checkpoint_ema.safetensors"
+        self.state = self.path / "state.safetensors"
+        self.evaluation = self.path / "evaluation"
+        self._history_file = self.path / "history.jsonl"
         self._history: TextIO | None = None
         self._lock: int | None = None
 
-    def refuse_used(self) -> None:
-        """Raise FileExistsError when the path is a file or a folder that holds anything."""
-        self._refuse_file()
-        if not self.is_new:
+    @property
+    def is_new(self) -> bool:
+        """Whether the folder does not exist or holds nothing but what killed processes left."""
+        return not self.path.is_dir() or all(map(is_leftover, self.path.iterdir()))
+
+    def refuse_other(self, resume: bool) -> None:
+        """Raise FileExistsError unless the path is new or, with `resume`, holds a run of its own.
+
+        A run whose state was not saved yet is one to be started again.
+        """
+        if self.path.is_file():
+            raise FileExistsError(f"{self.path} is a file; choose another folder for this run")
+        if self.is_new or (resume and self.state.is_file()):
+            return
+        if not resume:
             raise FileExistsError(
                 f"{self.path} is not empty and a run never overwrites another; choose another "
                 "folder, delete it yourself, or continue its run with --resume"
             )
-
-    def refuse_foreign(self) -> None:
-        """Raise FileExistsError when the path holds something, but no run to be continued."""
-        self._refuse_file()
-        if self.is_new or self.state.is_file():
-            return
         if self.checkpoint.exists():
             raise FileExistsError(
                 f"{self.path} holds a checkpoint but no {self.state.name}, so its run cannot be "
@@ -48,40 +61,6 @@ class RunFolder:
             raise FileExistsError(
                 f"{self.path} is not empty and holds no run of `qgs train`; choose another folder"
             )
-
-    def _refuse_file(self) -> None:
-        if self.path.is_file():
-            raise FileExistsError(f"{self.path} is a file; choose another folder for this run")
-
-    @property
-    def is_new(self) -> bool:
-        """Whether the folder does not exist or holds nothing but what killed processes left."""
-        return not self.path.is_dir() or all(map(is_leftover, self.path.iterdir()))
-
-    @property
-    def recipe(self) -> Path:
-        """The resolved recipe."""
-        return self.path / "recipe.yaml"
-
-    @property
-    def checkpoint(self) -> Path:
-        """The latest good weights."""
-        return self.path / "checkpoint.safetensors"
-
-    @property
-    def checkpoint_ema(self) -> Path:
-        """The moving average of the weights, where a recipe asks for it."""
-        return self.path / "checkpoint_ema.safetensors"
-
-    @property
-    def state(self) -> Path:
-        """Everything that continues the run."""
-        return self.path / "state.safetensors"
-
-    @property
-    def evaluation(self) -> Path:
-        """Where `qgs eval` writes."""
-        return self.path / "evaluation"
 
     def take(self) -> None:
         """Make the folder this process's own until `close`; remove what killed ones left half done.
@@ -104,16 +83,12 @@ class RunFolder:
             self._history = self._history_file.open("a", encoding="utf-8")
         self._history.write(json.dumps(record) + "\n")
 
-    def flush(self) -> None:
-        """Let others read the history so far."""
+    def flush(self, to_disk: bool = False) -> None:
+        """Let others read the history so far; to_disk: also see that it outlives the system."""
         if self._history is not None:
             self._history.flush()
-
-    def synchronise(self) -> None:
-        """Bring the history to the disk."""
-        if self._history is not None:
-            self._history.flush()
-            os.fsync(self._history.fileno())
+            if to_disk:
+                os.fsync(self._history.fileno())
 
     def history(self) -> list[dict[str, float]]:
         """All records so far, one per optimiser step.
@@ -125,23 +100,17 @@ class RunFolder:
 
     def cut_history(self, step: int) -> None:
         """Drop the records of later steps than `step`, and lines that are damaged."""
-        if not self._history_file.exists():
-            return
-        kept = (record for record in read_records(self._history_file) if record["step"] <= step)
-        write_text(self._history_file, "".join(json.dumps(record) + "\n" for record in kept))
+        if self._history_file.exists():
+            kept = [record for record in self.history() if record["step"] <= step]
+            write_text(self._history_file, "".join(json.dumps(record) + "\n" for record in kept))
 
     def close(self) -> None:
         """Close the history and leave the folder to others."""
         if self._history is not None:
             self._history.close()
-            self._history = None
         if self._lock is not None:
             os.close(self._lock)
-            self._lock = None
-
-    @property
-    def _history_file(self) -> Path:
-        return self.path / "history.jsonl"
+        self._history = self._lock = None
 
 
 def checkpoint_of(path: str | Path) -> Path:
@@ -165,12 +134,12 @@ def _locked(folder: Path) -> int | None:
     number = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError as error:
         os.close(number)
-        raise FileExistsError(
-            f"another process is training in {folder}; wait for its end, or choose another folder"
-        ) from None
-    except OSError:
-        os.close(number)
+        if isinstance(error, BlockingIOError):
+            raise FileExistsError(
+                f"another process is training in {folder}; wait for its end, or choose another "
+                "folder"
+            ) from None
         return None
     return number

@@ -1,17 +1,32 @@
-"""Noticing a run that died or met numbers that are not finite, and what is saved then."""
+"""What ends a run by itself: a model that died, and steps that are not finite."""
 
 from __future__ import annotations
 
+import json
+import logging
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
 
 import torch
+from accelerate import Accelerator
+from accelerate.utils import gather_object
 from torch import Tensor, nn
 
+from qgs.contracts import TrainingConfig
+from qgs.data.sampling import Batch
+from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
-from qgs.io.checkpoint import unique_tensors
+from qgs.engine.objective import Objective
+from qgs.io.checkpoint import save, unique_tensors, write_tensors
+from qgs.io.files import replacing_entries
+from qgs.types import named_tensors
+
+_log = logging.getLogger(__name__)
 
 EMPTY_ALPHA = 2e-3
 """Mean alpha below which a rendering shows the background alone."""
@@ -22,18 +37,23 @@ FLAT = 1 / 255
 NO_GRADIENT = 1e-8
 """Gradient norm of a model that learns nothing any more."""
 
-COLLAPSE_REMEDIES = (
-    "a learning rate too high for this model (lower training.learning_rate, lengthen "
-    "training.warmup)",
+MAX_SKIPPED = 10
+"""Steps in a row that may be skipped; after them training stops."""
+
+MAX_SAVED = 20
+"""Incidents of a run that are saved; later ones are told and counted."""
+
+COLLAPSE_CAUSES = (
+    "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
+    "optimizer.warmup)",
     "a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
     "behind_camera: invisible)",
     "an initialisation that hides every Gaussian (raise model.head.opacity_bias, check "
     "views.scale_factor against the anchors' and the scenes' depth)",
 )
 
-BROKEN_REMEDIES = (
-    "a learning rate too high for this model (lower training.learning_rate, lengthen "
-    "training.warmup)",
+NONFINITE_CAUSES = (
+    COLLAPSE_CAUSES[0],
     "a range that bfloat16 does not hold (training.precision: float32)",
     "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; with "
     "views.scale distance, at input cameras that almost stand on one point)",
@@ -52,22 +72,175 @@ class NonFiniteError(TrainingError):
     """A step gave NaN or infinity; the run is saved as it was before that step."""
 
 
-@dataclass(frozen=True)
-class Vitals:
-    """Signs of life of one step: numbers, so that reading them synchronises once."""
+class Guard:
+    """Stops a run that is dead or not finite, and sees that good weights are kept.
 
-    alpha: float
-    deviation: float
-    gradient: float
+    All processes must call each of its methods together; `step` counts finished optimiser steps.
+    A step that is not finite leaves RUN/incidents/step-N with batch.safetensors (of another process
+    than the main one batch-RANK.safetensors, where it found something), weights.safetensors, which
+    `qgs.load` reads, and report.json.
 
-
-def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean alpha, and the largest of the views' mean |rgb - background|; both 0-d.
-
-    rgb: (B, V, 3, H, W). Means over a view's pixels, so that a stray splat is no sign of life.
+    incidents: steps that were not finite. skipped: how many of them came last, without a good one.
     """
-    deviation = (rgb - background[:, None, None]).abs().mean((-3, -2, -1))
-    return alpha.mean(), deviation.amax()
+
+    def __init__(
+        self,
+        accelerator: Accelerator,
+        objective: Objective,
+        saver: Saver,
+        config: TrainingConfig,
+        repeat: Callable[[Sequence[Batch]], Any],
+    ) -> None:
+        """objective: as it was before `Accelerator.prepare` wrapped it.
+
+        repeat: computes the gradients of batches again.
+        """
+        self.detector = CollapseDetector(config.collapse_window)
+        self.good = GoodWeights(objective.model, keep=accelerator.is_main_process)
+        self.incidents = self.skipped = 0
+        self._accelerator, self._objective, self._repeat = accelerator, objective, repeat
+        self._saver, self._skips = saver, config.on_nonfinite == "skip"
+        saver.parts |= {"guard": self, "good": self.good}
+
+    def state(self) -> dict[str, Any]:
+        """See `qgs.engine.checkpoint.Stateful`."""
+        counted = {"incidents": self.incidents, "skipped": self.skipped}
+        return {"detector": self.detector.state(), **counted}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """See `qgs.engine.checkpoint.Stateful`."""
+        self.detector.load_state(state["detector"])
+        self.incidents, self.skipped = state["incidents"], state["skipped"]
+
+    def passed(self, numbers: Mapping[str, float]) -> None:
+        """Take note of a finite step."""
+        self.skipped = 0
+        self.detector.observe(numbers)
+
+    def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
+        """Look into the step after `step`, which is not finite; return to go on without it.
+
+        Raises NonFiniteError, the run then being saved as it was before that step, and
+        CollapseError when the model is already lost.
+        """
+        found, in_data = self.look_into(step + 1, batches, symptom)
+        if self._skips and self.skipped <= MAX_SKIPPED:
+            _log.warning("step %d is skipped: %s", step + 1, found)
+            return
+        if self.detector.dead_steps or broken_tensors(self._saver.model):
+            self._collapse(step + 1, found, NONFINITE_CAUSES)
+        self._saver.save(step)
+        first = (
+            f", after {MAX_SKIPPED} steps in a row were skipped. The run is saved as it was before "
+            "this step; continue it with --resume when the cause is gone"
+            if self.skipped > MAX_SKIPPED
+            else ". To go on without it, repeat the command with `--resume --set "
+            "training.on_nonfinite=skip`; the run is saved as it was before this step"
+        )
+        second = (
+            f"The data is to blame, see `qgs data check`: {found}"
+            if in_data
+            else f"{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES)}"
+        )
+        raise NonFiniteError(f"step {step + 1} is not finite{first}.\n{second}")
+
+    def look_into(self, step: int, batches: Sequence[Batch], symptom: str) -> tuple[str, bool]:
+        """Find the first bad tensor of a step and save what it takes to see it again.
+
+        symptom: what the step showed. Gradients are those of the repeated step afterwards.
+        Returns what was found, in words, and whether it came with the images and cameras of a
+        batch, and so from nothing that the model did.
+        """
+        self.incidents += 1
+        self.skipped += 1
+        watch = Watch()
+        with watch.on(self._objective):
+            self._repeat(batches)
+        first = watch.first._asdict() if watch.first else None
+        shown = [{name: getattr(batch, name) for name in _SHOWN} for batch in batches]
+        own = {"process": self._accelerator.process_index, "first": first, "batches": shown}
+        reports = gather_object([own]) if self._accelerator.num_processes > 1 else [own]
+        found = [report for report in reports if report["first"]]
+        in_data = [r["first"]["tensor"].startswith(("inputs.", "targets.")) for r in found]
+        words = f"{symptom}; {_in_words(found)}; "
+        if self.incidents > MAX_SAVED:
+            words += f"not saved, as {MAX_SAVED} incidents of this run are"
+        else:
+            report = {"step": step, "symptom": symptom, "found": reports}
+            words += f"batch and weights are in {self._save_incident(step, batches, report, own)}"
+        return words, bool(found) and all(in_data)
+
+    def refuse_collapse(self, step: int) -> None:
+        """Raise CollapseError when the last steps, a whole window of them, were dead."""
+        if self.detector.collapsed:
+            symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
+            self._collapse(step, symptom, COLLAPSE_CAUSES)
+
+    def keep_good(self, step: int) -> None:
+        """Take the weights for good ones. Raises CollapseError for weights that are not finite."""
+        self._refuse_broken_weights(step)
+        self.good.refresh(step)
+
+    def save(self, step: int) -> None:
+        """Save the run. Raises CollapseError for weights that are not finite."""
+        self._refuse_broken_weights(step)
+        self._saver.save(step)
+
+    def save_to_go_on(self, step: int) -> None:
+        """Save the run as one that may go on; a dead model's checkpoint is the last good one."""
+        if self.detector.dead_after(step):
+            self._save_good()
+            self._saver.save_state()
+        else:
+            self.save(step)
+
+    def finish(self, step: int, stopped: bool) -> None:
+        """Save a run whose budget is used or that was stopped. Raises CollapseError."""
+        symptom = f"for the last {self.detector.dead_steps} steps {self.detector.symptom}"
+        if self.detector.dead_after(step):
+            if not stopped:
+                self._collapse(step, symptom, COLLAPSE_CAUSES)
+        elif self.detector.dead_steps:
+            _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
+        self.save_to_go_on(step)
+
+    def _refuse_broken_weights(self, step: int) -> None:
+        problem = broken_tensors(self._saver.model)
+        if problem:
+            self._collapse(step, problem, NONFINITE_CAUSES)
+
+    def _save_good(self) -> None:
+        self._saver.save_checkpoint(self.good.step, self.good.tensors)
+
+    def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
+        self._save_good()
+        raise CollapseError(
+            f"training collapsed at step {step}: {problem}. The weights of step {self.good.step} "
+            f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
+        )
+
+    def _save_incident(
+        self, step: int, batches: Sequence[Batch], report: Mapping[str, Any], own: Mapping[str, Any]
+    ) -> Path:
+        name, model = f"step-{step}", self._saver.model
+        place = self._saver.folder.path / "incidents" / name
+        weights = Weights(model).state()
+        if self._accelerator.is_main_process:
+            with replacing_entries(place.parent) as fresh:
+                _write_batches(fresh / name / "batch.safetensors", batches)
+                path = fresh / name / "weights.safetensors"
+                save(model, path, extra={"step": str(step - 1)}, weights=weights)
+                text = json.dumps(report, indent=2) + "\n"
+                (fresh / name / "report.json").write_text(text, encoding="utf-8")
+        self._accelerator.wait_for_everyone()
+        if own["first"] and not self._accelerator.is_main_process:
+            _write_batches(place / f"batch-{own['process']}.safetensors", batches)
+        self._accelerator.wait_for_everyone()
+        return place
+
+
+def _as_list(causes: Sequence[str]) -> str:
+    return "".join(f"\n  - {cause}" for cause in causes)
 
 
 class CollapseDetector:
@@ -84,11 +257,11 @@ class CollapseDetector:
         self.symptom = ""
         self._has_drawn = False
 
-    def observe(self, vitals: Vitals) -> None:
-        """Take note of one step."""
-        self.symptom = self._symptom_of(vitals)
+    def observe(self, numbers: Mapping[str, float]) -> None:
+        """Take note of a step: "alpha" and "deviation" of its renderings, "gradient" (norm)."""
+        self.symptom = self._symptom_of(numbers["alpha"], numbers["deviation"], numbers["gradient"])
         self.dead_steps = self.dead_steps + 1 if self.symptom else 0
-        self._has_drawn |= vitals.deviation > 8 * FLAT
+        self._has_drawn |= numbers["deviation"] > 8 * FLAT
 
     @property
     def collapsed(self) -> bool:
@@ -96,7 +269,7 @@ class CollapseDetector:
         return self.dead_steps >= self.window
 
     def dead_after(self, steps: int) -> bool:
-        """Whether a run that ends after `steps` never lived, or filled the window with death."""
+        """Whether all of a run's `steps` so far, or the whole window, were dead."""
         return self.dead_steps >= min(self.window, steps)
 
     def state(self) -> dict[str, Any]:
@@ -108,33 +281,36 @@ class CollapseDetector:
         self.dead_steps, self.symptom = state["dead"], state["symptom"]
         self._has_drawn = state["has_drawn"]
 
-    def _symptom_of(self, vitals: Vitals) -> str:
-        if vitals.alpha < EMPTY_ALPHA:
-            return f"the renderings are empty (mean alpha {vitals.alpha:.1e})"
-        if vitals.gradient < NO_GRADIENT:
-            return f"the gradient has vanished (norm {vitals.gradient:.1e})"
-        if self._has_drawn and vitals.deviation < FLAT:
+    def _symptom_of(self, alpha: float, deviation: float, gradient: float) -> str:
+        if alpha < EMPTY_ALPHA:
+            return f"the renderings are empty (mean alpha {alpha:.1e})"
+        if gradient < NO_GRADIENT:
+            return f"the gradient has vanished (norm {gradient:.1e})"
+        if self._has_drawn and deviation < FLAT:
             return "the renderings equal the background"
         return ""
 
 
 class GoodWeights:
-    """Host copies of the weights from healthy times, the older of the last two.
+    """Copies in host memory of the weights at the last two times that the model was healthy.
 
-    A collapse is noticed late, and the newest healthy copy may already be on its way down; the
-    older one is at least a window away.
+    A collapse is noticed late, and the newer copy may already be on its way down; the older one,
+    `step` and `tensors`, is at least a window away.
 
     keep: whether this process holds the copies; one of several suffices.
     """
 
     def __init__(self, model: nn.Module, keep: bool = True) -> None:
-        self._model = model
+        self._weights = Weights(model)
         self._keep = keep
-        self._copies = [(0, self._copy())]
+        self._copies: list[tuple[int, dict[str, Tensor]]] = []
+        self.refresh(0)
 
     def refresh(self, step: int) -> None:
         """Copy the present weights, which `step` optimiser steps made. All processes must call."""
-        self._copies = [*self._copies, (step, self._copy())][-2:]
+        present = self._weights.state()
+        copy = {n: t.to("cpu", copy=True) for n, t in present.items()} if self._keep else {}
+        self._copies = [*self._copies, (step, copy)][-2:]
 
     @property
     def step(self) -> int:
@@ -149,10 +325,8 @@ class GoodWeights:
     def state(self) -> dict[str, Any]:
         """See `qgs.engine.checkpoint.Stateful`."""
         copies = enumerate(tensors for _, tensors in self._copies)
-        return {
-            "steps": [step for step, _ in self._copies],
-            **{f"{i}/{name}": t for i, tensors in copies for name, t in tensors.items()},
-        }
+        tensors = {f"{i}/{name}": t for i, copy in copies for name, t in copy.items()}
+        return {"steps": [step for step, _ in self._copies], **tensors}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """See `qgs.engine.checkpoint.Stateful`."""
@@ -161,37 +335,138 @@ class GoodWeights:
             for i, step in enumerate(state["steps"])
         ]
 
-    def _copy(self) -> dict[str, Tensor]:
-        copies: dict[str, Tensor] = {}
-        for name, tensor in unique_tensors(self._model).items():
-            gathered = whole(tensor)
-            if self._keep:
-                copies[name] = gathered.to("cpu", copy=True)
-        return copies
-
 
 def broken_tensors(model: nn.Module) -> str:
     """Which tensors of `model` hold NaN or infinity; "" if none does."""
     names = [n for n, t in unique_tensors(model).items() if not whole(torch.isfinite(t).all())]
-    return f"weights are not finite: {_listed(names)}" if names else ""
+    return f"weights are not finite: {_first_names(names)}" if names else ""
 
 
-def not_finite(terms: Mapping[str, float], module: nn.Module, gradient: float) -> str:
-    """What is NaN or infinite: loss terms, else tensors with such gradients; "" if nothing is."""
-    bad = [
-        f"loss term {name} is {value}" for name, value in terms.items() if not math.isfinite(value)
-    ]
-    if bad:
+def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
+    """What is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is.
+
+    numbers: of the step; "gradient" is the norm of the gradients that parameters of `module` have.
+    """
+    terms = {name: n for name, n in numbers.items() if name not in ("gradient", "psnr")}
+    bad = [f"loss term {name} is {n}" for name, n in terms.items() if not math.isfinite(n)]
+    if bad or math.isfinite(numbers["gradient"]):
         return ", ".join(bad)
-    if math.isfinite(gradient):
-        return ""
     names = [
         name
         for name, parameter in module.named_parameters()
         if parameter.grad is not None and not torch.isfinite(parameter.grad).all()
     ]
-    return f"the gradient norm is {gradient}" + (f", from {_listed(names)}" if names else "")
+    origin = f", from {_first_names(names)}" if names else ""
+    return f"the gradient norm is {numbers['gradient']}{origin}"
 
 
-def _listed(names: list[str]) -> str:
+def _first_names(names: list[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _in_words(found: Sequence[Mapping[str, Any]]) -> str:
+    """The first bad tensors of processes, each with the batch that it came up in."""
+    if not found:
+        return "repeating the step gave finite numbers everywhere"
+    sentences = []
+    for report in found:
+        finding = Finding(**report["first"])
+        batch = report["batches"][finding.batch]
+        samples = [
+            f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
+            for scene, inputs, targets in zip(*(batch[name] for name in _SHOWN), strict=True)
+        ]
+        sentences.append(f"the first bad tensor is {finding}, with {', '.join(samples)}")
+    return "; ".join(sentences)
+
+
+class Finding(NamedTuple):
+    """A tensor with NaN or infinity. batch: which of the step's batches it came up in, from 0."""
+
+    tensor: str
+    values: str
+    batch: int
+
+    def __str__(self) -> str:
+        return f"{self.tensor} ({self.values})"
+
+
+class Watch:
+    """Notes the first tensor that is not finite, in the order in which a step computes.
+
+    That is: weights, images and cameras, outputs of the model's modules, and then, layer by layer,
+    what is predicted, the renderings, the loss terms and the gradients of the Gaussians; last the
+    gradients of the modules' outputs and of the parameters, backwards.
+    """
+
+    def __init__(self) -> None:
+        self.first: Finding | None = None
+        self._batch = -1
+        self._calls: Counter[str] = Counter()
+
+    def see(self, name: str, value: Any) -> None:
+        """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
+        for path, tensor in named_tensors(value, name):
+            if self.first:
+                return
+            bad = nonfinite_values(tensor)
+            if bad:
+                self.first = Finding(path, bad, max(self._batch, 0))
+
+    @contextmanager
+    def on(self, objective: Objective) -> Iterator[None]:
+        """Watch the steps that `objective` makes inside the `with` block."""
+        for name, tensor in unique_tensors(objective).items():
+            self.see(f"weight {name}", whole(tensor))
+        handles = [objective.register_forward_pre_hook(self._see_batch)]
+        for name, module in objective.named_modules():
+            if name.startswith("model.") and module is not objective.model.renderer:
+                handles.append(module.register_forward_hook(partial(self._see_output, name)))
+        for name, parameter in objective.named_parameters():
+            if parameter.requires_grad:
+                handles.append(parameter.register_hook(partial(self.see, f"gradient of {name}")))
+        before, objective.hook = objective.hook, self.see
+        try:
+            yield
+        finally:
+            objective.hook = before
+            for handle in handles:
+                handle.remove()
+
+    def _see_batch(self, module: nn.Module, arguments: tuple[Any, ...]) -> None:
+        self._batch += 1
+        self._calls.clear()
+        for name, views in zip(("inputs", "targets"), arguments, strict=True):
+            self.see(name, views)
+
+    def _see_output(self, name: str, module: nn.Module, arguments: Any, output: Any) -> None:
+        self._calls[name] += 1
+        call = f" (call {self._calls[name]})" if self._calls[name] > 1 else ""
+        what = f"output{call} of {name}"
+        self.see(what, output)
+        for path, tensor in named_tensors(output, f"gradient of the {what}"):
+            if tensor.requires_grad:
+                tensor.register_hook(partial(self.see, path))
+
+
+def nonfinite_values(tensor: Tensor) -> str:
+    """How many values of `tensor` are NaN and infinite; "" if none is."""
+    tensor = tensor.detach()
+    if not tensor.is_floating_point() or bool(torch.isfinite(tensor).all()):
+        return ""
+    nan, infinite = int(torch.isnan(tensor).sum()), int(torch.isinf(tensor).sum())
+    counts = [f"{n} {word}" for n, word in ((nan, "NaN"), (infinite, "infinite")) if n]
+    return f"{' and '.join(counts)} of {tensor.numel()} values"
+
+
+_SHOWN = ("scenes", "input_frames", "target_frames")
+
+
+def _write_batches(path: Path, batches: Sequence[Batch]) -> None:
+    """Write batches of one shape, one after the other, as a safetensors file."""
+    parts: dict[str, list[Tensor]] = {}
+    for batch in batches:
+        for name, tensor in named_tensors({"inputs": batch.inputs, "targets": batch.targets}):
+            parts.setdefault(name, []).append(tensor)
+    shown = {name: json.dumps([i for b in batches for i in getattr(b, name)]) for name in _SHOWN}
+    write_tensors(path, {name: torch.cat(tensors) for name, tensors in parts.items()}, shown)

@@ -1,125 +1,89 @@
-"""AdamW, the one-cycle learning rate, and the moving average of the weights."""
+"""What the optimiser moves and how fast, part by part; and the moving average of the weights."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
-from torch.optim import AdamW
 
-from qgs.contracts import ModelComponent, TrainingConfig
+from qgs.composer.errors import nearest
+from qgs.contracts import ModelComponent, Optimizer, OptimizerConfig, ParameterGroup
 from qgs.engine.distributed import placed_like, whole
 from qgs.io.checkpoint import unique_tensors
 
-WARMUP_TIME = 0.1
-"""Largest part of a time budget that warm-up may take."""
 
+def make_optimizer(module: nn.Module, optimizer: Optimizer) -> torch.optim.Optimizer:
+    """Torch's optimiser of `module`, a model or an objective; what its `parts` freeze is frozen.
 
-class OneCycle:
-    """Cosine from peak / initial_divisor to the peak, then down by final_divisor from the start.
-
-    Warm-up ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that comes
-    first. The descent follows the fraction of the budget that is used, the larger of steps and
-    seconds; with steps alone this is torch's `OneCycleLR` with pct_start = warmup / steps.
-    Raises ValueError when the warm-up fills all steps and no time budget shortens it.
+    Raises ValueError for patterns of `parts` that match nothing, or freeze everything.
     """
+    config = optimizer.config
+    factors = rate_factors(module, config.parts if isinstance(config, OptimizerConfig) else {})
+    for name, parameter in module.named_parameters():
+        if factors[name] == 0:
+            parameter.requires_grad_(False)
+    groups = parameter_groups(module, factors)
+    if not groups:
+        raise ValueError("optimizer.parts freezes every parameter, so there is nothing to train")
+    return optimizer.build(groups)
 
-    def __init__(self, config: TrainingConfig) -> None:
-        self.config = config
-        self.peak = config.learning_rate
-        self.first = config.learning_rate / config.initial_divisor
-        self.last = self.first / config.final_divisor
-        self._descent_starts: float | None = None
-        if config.seconds is None and config.warmup >= config.steps:
+
+def rate_factors(module: nn.Module, parts: Mapping[str, float]) -> dict[str, float]:
+    """Factor of the learning rate for every parameter of `module`, by name; 1 where none is given.
+
+    parts: see `OptimizerConfig`; parameters go by their names in the model (`encoder.norm.weight`),
+    those of losses start with `losses.`, a shared one goes by its first name. Raises ValueError.
+    """
+    factors = {name: 1.0 for name, _ in module.named_parameters()}
+    for pattern, factor in parts.items():
+        wanted = pattern.removeprefix("model.").split(".")
+        matched = False
+        for name in factors:
+            steps = name.removeprefix("model.").split(".")
+            if len(wanted) <= len(steps) and all(map(fnmatchcase, steps, wanted)):
+                factors[name], matched = factor, True
+        if not matched:
             raise ValueError(
-                f"training.warmup is {config.warmup}, but training.steps is {config.steps}: the "
-                "learning rate would never come down; lower warmup or train for longer"
+                f"optimizer.parts: the pattern `{pattern}` matches no parameter of the model; "
+                + _existing_parts(wanted, factors)
             )
-
-    def rate(self, step: int, seconds: float) -> float:
-        """Learning rate of the `step`-th optimiser step (0 is the first), `seconds` into training.
-
-        To be called with ascending steps.
-        """
-        used = self._used(step, seconds)
-        if self._descent_starts is None:
-            warmed = self._warmed(step, seconds)
-            if warmed < 1:
-                return _cosine(self.first, self.peak, warmed)
-            self._descent_starts = used
-        left = 1 - self._descent_starts
-        part = (used - self._descent_starts) / left if left > 0 else 1.0
-        return _cosine(self.peak, self.last, min(part, 1.0))
-
-    def state(self) -> dict[str, float | None]:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        return {"descent_starts": self._descent_starts}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        self._descent_starts = state["descent_starts"]
-
-    def _warmed(self, step: int, seconds: float) -> float:
-        """Fraction of the warm-up that is over; may exceed 1."""
-        top = self.config.warmup - 1
-        of_steps = step / top if top > 0 else 1.0
-        of_seconds = seconds / (WARMUP_TIME * self.config.seconds) if self.config.seconds else 0.0
-        return max(of_steps, of_seconds)
-
-    def _used(self, step: int, seconds: float) -> float:
-        of_steps = step / max(self.config.steps - 1, 1)
-        of_seconds = seconds / self.config.seconds if self.config.seconds else 0.0
-        return min(max(of_steps, of_seconds), 1.0)
+    return factors
 
 
-def _cosine(start: float, end: float, part: float) -> float:
-    return end + (start - end) / 2 * (1 + math.cos(math.pi * part))
+def _existing_parts(wanted: list[str], names: Iterable[str]) -> str:
+    """The part that a pattern, in segments, was probably meant to name; else the outermost ones."""
+    parts = [name.removeprefix("model.").split(".") for name in names]
+    starred = [["*" if step.isdigit() else step for step in part] for part in parts]
+    near = nearest(".".join(wanted), {".".join(part[: len(wanted)]) for part in parts + starred})
+    return (
+        f"did you mean `{near}`?" if near else f"its parts: {', '.join({p[0]: 0 for p in parts})}"
+    )
 
 
-def make_optimizer(module: nn.Module, config: TrainingConfig) -> AdamW:
-    """AdamW over all parameters of `module` that train, in decayed and undecayed groups.
+def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[ParameterGroup]:
+    """The parameters of `module` that train, together with others that are treated alike.
 
-    Parameters that lie in shards and whole ones are in groups of their own, where both exist.
+    The innermost component around a parameter decides whether it decays (`ModelComponent.decays`);
+    outside of components all but 1-d parameters do. A shared parameter goes by its first name.
+    Parameters in shards and whole ones are kept apart: no kernel updates both at once.
     """
-    decayed, undecayed = parameter_groups(module)
-    groups = [
-        {"params": parameters, "weight_decay": decay}
-        for group, decay in ((decayed, config.weight_decay), (undecayed, 0.0))
-        for parameters in _by_kind(group)
-    ]
-    return AdamW(groups, lr=config.learning_rate, betas=config.betas, fused=True)
-
-
-def _by_kind(parameters: list[nn.Parameter]) -> list[list[nn.Parameter]]:
-    """Parameters in shards and whole ones apart: no kernel updates both at once."""
-    kinds: dict[bool, list[nn.Parameter]] = {}
-    for parameter in parameters:
-        kinds.setdefault(isinstance(parameter, DTensor), []).append(parameter)
-    return list(kinds.values())
-
-
-def parameter_groups(module: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    """Parameters with and without weight decay.
-
-    The innermost component around a parameter decides (`ModelComponent.decays`); outside of
-    components all but 1-d parameters decay. A shared parameter goes by its first name.
-    """
-    decayed: list[nn.Parameter] = []
-    undecayed: list[nn.Parameter] = []
+    groups: dict[Any, ParameterGroup] = {}
     components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
     for name, parameter in module.named_parameters():
         if parameter.requires_grad:
-            decays = _decays(name, parameter, components)
-            (decayed if decays else undecayed).append(parameter)
-    return decayed, undecayed
+            factor, decays = factors[name], _decays(name, parameter, components)
+            key = (not decays, isinstance(parameter, DTensor), factor)
+            empty = ParameterGroup(params=[], decays=decays, factor=factor)
+            groups.setdefault(key, empty)["params"].append(parameter)
+    return [groups[key] for key in sorted(groups)]
 
 
-def _decays(name: str, parameter: nn.Parameter, components: dict[str, ModelComponent]) -> bool:
+def _decays(name: str, parameter: nn.Parameter, components: Mapping[str, ModelComponent]) -> bool:
     owners = [prefix for prefix in components if name.startswith(f"{prefix}.") or not prefix]
     if not owners:
         return parameter.ndim != 1
@@ -138,7 +102,12 @@ class MovingAverage:
     def __init__(self, model: nn.Module, decay: float) -> None:
         self._model = model
         self._decay = decay
-        self._averages = {name: _copy(tensor) for name, tensor in unique_tensors(model).items()}
+        self._averages = {
+            name: tensor.detach().clone().float()
+            if isinstance(tensor, nn.Parameter)
+            else tensor.detach().clone()
+            for name, tensor in unique_tensors(model).items()
+        }
 
     @torch.no_grad()
     def update(self) -> None:
@@ -154,29 +123,23 @@ class MovingAverage:
         """The model with the averaged weights, for the `with` block only."""
         tensors = unique_tensors(self._model)
         present = {name: tensor.detach().clone() for name, tensor in tensors.items()}
-        _install(self._averages, tensors)
         try:
+            _copy(self._averages, tensors)
             yield
         finally:
-            _install(present, tensors)
+            _copy(present, tensors)
 
     def state(self) -> dict[str, Tensor]:
-        """See `qgs.engine.checkpoint.Stateful`; named as `qgs.io.checkpoint.save` takes weights."""
+        """The averages, named as `qgs.io.checkpoint.save` takes weights."""
         return {name: whole(tensor) for name, tensor in self._averages.items()}
 
-    @torch.no_grad()
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        for name, average in self._averages.items():
-            average.copy_(placed_like(state[name], average))
-
-
-def _copy(tensor: Tensor) -> Tensor:
-    copy = tensor.detach().clone()
-    return copy.float() if isinstance(tensor, nn.Parameter) else copy
+        """Go on from the averages in `state`."""
+        own = self._averages
+        _copy({name: placed_like(state[name], tensor) for name, tensor in own.items()}, own)
 
 
 @torch.no_grad()
-def _install(tensors: Mapping[str, Tensor], into: Mapping[str, Tensor]) -> None:
+def _copy(tensors: Mapping[str, Tensor], into: Mapping[str, Tensor]) -> None:
     for name, tensor in into.items():
         tensor.copy_(tensors[name])

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from accelerate import Accelerator
-from torch.distributed.tensor import DTensor
 
 from qgs.composer import Recipe
 from qgs.data.evaluation import EvaluationPlan
@@ -26,11 +25,10 @@ from qgs.drawing.images import (
     write_png,
 )
 from qgs.engine.checkpoint import RandomStates
-from qgs.engine.distributed import StopRequest, mean
+from qgs.engine.distributed import StopRequest, mean, sharded
 from qgs.engine.evaluation import evaluate
 from qgs.engine.optimizer import MovingAverage
 from qgs.engine.protocol import index_of
-from qgs.engine.results import METRICS
 from qgs.engine.tracking import Trackers
 from qgs.io.files import read_records, write_text
 from qgs.model import QueryGaussianModel
@@ -39,7 +37,7 @@ SAMPLES = 4
 """Samples that are drawn, the same ones each time."""
 
 _GAP = 4
-
+_COUNTS = ("statement", "scenes", "scenes_in_protocol", "samples")
 
 _log = logging.getLogger(__name__)
 
@@ -68,12 +66,9 @@ class PeriodicEvaluation:
         trackers: Trackers,
     ) -> None:
         self.latest: int | None = None
-        self._accelerator = accelerator
-        self._recipe = recipe
-        self._model = model
-        self._average = average
-        self._folder = folder
-        self._trackers = trackers
+        self._accelerator, self._recipe, self._model = accelerator, recipe, model
+        self._average, self._folder, self._trackers = average, folder, trackers
+        self._in_shards = bool(sharded(model))
         self._random = RandomStates(accelerator)
         self._stop = StopRequest()
 
@@ -84,10 +79,11 @@ class PeriodicEvaluation:
         in a warning and ends no training.
         """
         self.latest = step
+        self._stop = StopRequest() if stop is None else stop
         states = self._random.state()
         try:
             if self._accelerator.is_main_process or self._in_shards:
-                self._evaluate(step, stop)
+                self._evaluate(step)
         except _StoppedError:
             _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
         except Exception as error:  # the run is saved, and worth more than an evaluation
@@ -97,15 +93,14 @@ class PeriodicEvaluation:
         self._accelerator.wait_for_everyone()
         self._random.load_state(states)
 
-    def _evaluate(self, step: int, stop: StopRequest | None) -> None:
-        self._stop = StopRequest() if stop is None else stop
-        records, picture = self._judge(step), self._picture()
+    def _evaluate(self, step: int) -> None:
+        records = [self._record("raw", step)]
+        if self._average:
+            with self._average.applied():
+                records.append(self._record("ema", step))
+        picture = self._picture()
         if self._accelerator.is_main_process:
             self._tell(records, picture, step)
-
-    @property
-    def _in_shards(self) -> bool:
-        return any(isinstance(p, DTensor) for p in self._model.parameters())
 
     def _between_scenes(self, done: int, wanted: int) -> None:
         """Raise _StoppedError when a stop was asked for, of any process where all take part."""
@@ -113,49 +108,42 @@ class PeriodicEvaluation:
         if float(mean(self._accelerator, asked) if self._in_shards else asked):
             raise _StoppedError
 
-    def _judge(self, step: int) -> list[dict[str, Any]]:
-        """A record for the present weights and one for the averaged ones."""
-        records = [self._record("raw", step)]
-        if self._average:
-            with self._average.applied():
-                records.append(self._record("ema", step))
-        return records
-
     def _record(self, weights: str, step: int) -> dict[str, Any]:
         evaluation = evaluate(self._model, self._recipe, step, observe=self._between_scenes)
         summary = evaluation.summary()
-        told = ("statement", "scenes", "scenes_in_protocol", "samples")
         return {
             "step": step,
             "weights": weights,
             "protocol": summary["protocol"]["sha256"],
-            **{name: summary[name] for name in told},
-            **{name: score for name, score in summary["model"].items() if score is not None},
+            **{name: summary[name] for name in _COUNTS},
+            "scores": {n: score for n, score in evaluation.means().items() if score is not None},
         }
 
     def _tell(self, records: Sequence[Mapping[str, Any]], picture: Picture, step: int) -> None:
         _append(self._folder / "evaluations.jsonl", records)
         write_png(picture, self._folder / "pictures" / f"step-{step}.png")
         for record in records:
-            scores = {name: record[name] for name in METRICS if name in record}
-            group = f"evaluation/{record['weights']}"
+            group, scores = f"evaluation/{record['weights']}", record["scores"]
             self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
         self._trackers.picture("evaluation", picture, step)
 
     @torch.no_grad()
     def _picture(self) -> Picture:
         """A row per sample: input views, the first target view, its rendering and its depth."""
-        recipe, training = self._recipe, self._model.training
+        recipe, model, training = self._recipe, self._model, self._model.training
         plan = EvaluationPlan(
             recipe.build_data(), recipe.views, recipe.evaluation, index_of(recipe)
         )
         usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
-        self._model.eval()
+        model.eval()
         try:
-            rows = [_row(self._model, sample) for sample in islice(usable, SAMPLES)]
+            rows = [_row(model, sample) for sample in islice(usable, SAMPLES)]
         finally:
-            self._model.train(training)
-        return _stacked(rows)
+            model.train(training)
+        width = max(row.shape[1] for row in rows)
+        wider = [((0, _GAP), (0, width - row.shape[1]), (0, 0)) for row in rows]
+        padded = [np.pad(r, w, constant_values=255) for r, w in zip(rows, wider, strict=True)]
+        return np.concatenate(padded)[:-_GAP]
 
 
 def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
@@ -165,16 +153,6 @@ def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
     photos = [rgb_picture(image) for image in (*sample.inputs.images[0], target.images[0, 0])]
     depth = depth_picture(rendering.depth[0, 0], *depth_range(rendering.depth))
     return side_by_side([*photos, rgb_picture(rendering.rgb[0, 0]), depth], _GAP)
-
-
-def _stacked(rows: Sequence[Picture]) -> Picture:
-    """Rows below each other, white between them and to the right of shorter ones."""
-    width = max(row.shape[1] for row in rows)
-    parts = []
-    for row in rows:
-        wider = ((0, _GAP), (0, width - row.shape[1]), (0, 0))
-        parts.append(np.pad(row, wider, constant_values=255))
-    return np.concatenate(parts)[:-_GAP]
 
 
 def _append(path: Path, records: Sequence[Mapping[str, Any]]) -> None:

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from qgs.composer import Recipe
-from qgs.contracts import SceneSourceConfig
+from qgs.contracts import Metric, SceneSourceConfig
 from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.engine.tuning import tuning_loss
-from qgs.metrics.images import IMAGE_METRICS
 
 _CROP = "centre crop to the aspect ratio of image_size, then Lanczos resize"
 
@@ -24,8 +23,7 @@ class Protocol:
     content: everything that decides a score of given Gaussians, and nothing else: no path, no name
     of a file. That is the data's images and cameras, which views are judged, their poses, the
     metrics, tuning, and the settings that every renderer obeys; not the renderer's type, as all of
-    them render alike, on whichever device. `canonical` is its JSON with sorted keys and no
-    spaces, `sha256` the hash of that.
+    them render alike, on whichever device.
     """
 
     name: str
@@ -33,24 +31,26 @@ class Protocol:
 
     @property
     def canonical(self) -> str:
-        """What is hashed."""
+        """What is hashed: `content` as JSON with sorted keys and no spaces."""
         return canonical_json(self.content)
 
     @property
     def sha256(self) -> str:
         """Hash of `canonical` in UTF-8, hexadecimal."""
-        return _sha256(self.canonical)
+        return _sha256(self.content)
 
     def __str__(self) -> str:
         return f"{self.name} ({self.sha256[:12]})"
 
     def settings(self) -> dict[str, Any]:
-        """`content` with the index, which may be long, told by its size and hash."""
+        """`content` with size and hash in place of the index, which may be long."""
         index = self.content["views"].get("index")
         if index is None:
             return dict(self.content)
-        short = {"scenes": len(index), "sha256": _sha256(canonical_json(index))}
-        return {**self.content, "views": {"index": short}}
+        return {
+            **self.content,
+            "views": {"index": {"scenes": len(index), "sha256": _sha256(index)}},
+        }
 
 
 def index_of(recipe: Recipe) -> EvaluationIndex | None:
@@ -63,31 +63,40 @@ def protocol_of(
 ) -> Protocol:
     """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
 
-    With an index the kind of data, how it is split, and options at their defaults say nothing, so
+    With an index the kind of data, how it is split, and options at their defaults are left out, so
     that one data set in two formats has one protocol.
     """
-    config = recipe.parts["data",].config
+    evaluation, config = recipe.evaluation, recipe.parts["data",].config
     assert isinstance(config, SceneSourceConfig)
-    undecisive = config.undecisive | (config.split_options if index is not None else set())
-    options = config.model_dump(
-        mode="json",
-        exclude={"image_size", *undecisive},
-        exclude_defaults=index is not None,
-    )
-    evaluation = recipe.evaluation
+    left_out = {"image_size", *config.unhashed_options}
+    data: dict[str, Any] = {}
+    if index is None:
+        data["type"] = recipe.tree["data"]["type"]
+        views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
+        rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
+        judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
+    else:
+        left_out |= config.split_options
+        judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
+    data |= config.model_dump(mode="json", exclude=left_out, exclude_defaults=index is not None)
+    tuning = None
+    if evaluation.tuning_steps:
+        loss = tuning_loss(recipe).config.model_dump(mode="json")
+        budget = {"steps": evaluation.tuning_steps, "rate": evaluation.tuning_rate}
+        tuning = {**budget, "optimizer": "Adam", "loss": loss}
     content = {
-        "format": 1,
+        "format": 2,
         "image_size": list(config.image_size),
         "crop": _CROP,
-        "data": options if index is not None else {"type": recipe.tree["data"]["type"], **options},
+        "data": data,
         "poses": recipe.views.model_dump(include={"frame", "scale", "scale_factor"}),
-        "views": _indexed(index) if index is not None else _drawn(recipe, scenes),
+        "views": judged,
         "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
-        "metrics": {m: IMAGE_METRICS[m] for m in ("psnr", "ssim", *evaluation.metrics)},
-        "ssim_covariance": evaluation.ssim_covariance,
-        "tuning": _tuning(recipe),
+        "metrics": _metrics(recipe),
+        "tuning": tuning,
     }
-    return Protocol(evaluation.protocol or _name(evaluation.index), content)
+    file = (evaluation.index or "drawn").replace("\\", "/").rsplit("/", 1)[-1]
+    return Protocol(evaluation.protocol or file.removesuffix(".json"), content)
 
 
 def canonical_json(value: Any) -> str:
@@ -97,31 +106,15 @@ def canonical_json(value: Any) -> str:
     )
 
 
-def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+def _sha256(value: Any) -> str:
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
-def _name(index: str | None) -> str:
-    return index.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".json") if index else "drawn"
-
-
-def _indexed(index: EvaluationIndex) -> dict[str, Any]:
-    return {"index": {name: entry.model_dump() if entry else None for name, entry in index.items()}}
-
-
-def _drawn(recipe: Recipe, scenes: Sequence[str]) -> dict[str, Any]:
-    views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
-    rule = recipe.evaluation.model_dump(include={"scenes", "samples", "seed"})
-    return {"drawn": {**views, **rule, "names": list(scenes)}}
-
-
-def _tuning(recipe: Recipe) -> dict[str, Any] | None:
-    evaluation = recipe.evaluation
-    if not evaluation.tuning_steps:
-        return None
-    return {
-        "steps": evaluation.tuning_steps,
-        "rate": evaluation.tuning_rate,
-        "optimizer": "Adam",
-        "loss": tuning_loss(recipe).config.model_dump(mode="json"),
-    }
+def _metrics(recipe: Recipe) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for path, chosen in recipe.parts.items():
+        metric = chosen.component
+        if path[0] == "metrics" and issubclass(metric, Metric):
+            options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
+            found[path[1]] = {"type": chosen.type, "definition": metric.definition, **options}
+    return found

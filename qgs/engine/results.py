@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,29 +15,38 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
 from qgs.data.sampling import Frames
 from qgs.engine.protocol import Protocol
 from qgs.io.files import write_text
-from qgs.metrics import OPACITY_USED, spread
+from qgs.metrics import OPACITY_USED
 
-DISPERSIONS = ("dispersion_mean", "dispersion_median")
-"""Over a scene's Gaussians, of the distance to their token's centroid, world units."""
+METHODS = ("model", "nearest_input", "mean_colour")
+TUNING = ("tuning_loss_before", "tuning_loss_after")
+_FRAMES = ("scene", "input_frames", "target_frames")
+"""Columns of scenes.csv before the values; `problem` stands behind them."""
+_NAMED = 10
 
-TUNING: tuple[str, str] = ("tuning_loss_before", "tuning_loss_after")
 
-
-def column(method: str, metric: str) -> str:
-    """What one of METRICS of one of METHODS is called in `SceneScore.values`."""
+def value_name(method: str, metric: str) -> str:
+    """What the value of a metric of one of METHODS is called in `SceneScore.values`."""
     return f"{method}_{metric}"
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Mean, variance (over the population) and median of a value over scenes."""
+    x = torch.tensor(values, dtype=torch.float64)
+    found = {"mean": x.mean(), "variance": x.var(correction=0), "median": x.quantile(0.5)}
+    return {name: float(value) for name, value in found.items()}
 
 
 @dataclass(frozen=True)
 class SceneScore:
     """One scene. views: input and target frames of each of its samples.
 
-    values: image metrics by `column`, means over the target views of a sample, then over samples;
-    DISPERSIONS; "gaussians_used"; of tuned scenes TUNING.
+    values: of every metric by `value_name`, means over the samples; "gaussians_used"; of tuned
+    scenes TUNING. A value is missing where the method or the scene lacks what a metric needs.
     """
 
     scene: str
@@ -55,45 +64,59 @@ class SceneScore:
 class Evaluation:
     """All scenes and what they amount to; the same weights and recipe give the same numbers.
 
-    scores: of the scenes that were judged. wanted: names of all that the protocol names. missing:
-    those without a score. null: scenes that the index lists without frames. unlisted: scenes of the
-    data that the index lacks. gaussians: how many a scene has. empty: metrics that could not be
-    computed, and why. held_out: how many held-out frames were judged, and how many there are; None
-    where the test scenes hold none out. step: optimiser steps behind the weights.
+    columns: name of each value of the metrics to how it is shown. scores: of the scenes that were
+    judged. wanted: names of all that the protocol names. missing: those without a score. null:
+    scenes that the index lists without frames. unlisted: scenes of the data that the index lacks.
+    gaussians: how many a scene has. incomplete: values that scenes of the model lack, and why.
+    held_out: how many held-out frames were judged, and how many there are; None where the test
+    scenes hold none out. step: optimiser steps behind the weights.
     """
 
     protocol: Protocol
+    columns: Mapping[str, Column]
     scores: Sequence[SceneScore]
     wanted: Sequence[str]
     gaussians: int
     missing: Sequence[SceneFailure] = ()
     null: Sequence[str] = ()
     unlisted: Sequence[str] = ()
-    empty: Mapping[str, str] = field(default_factory=dict)
+    incomplete: Mapping[str, str] = field(default_factory=dict)
     held_out: tuple[int, int] | None = None
     step: int | None = None
 
     def mean(self, metric: str, method: str = "model") -> float | None:
-        """Mean over the judged scenes of one of METRICS of one of METHODS; None if it is empty.
+        """Mean over the judged scenes of one of `columns`; None if no scene has this value.
 
         Scenes weigh alike, however many samples and views they have.
         """
-        return None if metric in self.empty else self.mean_value(column(method, metric))
+        values = self._values(value_name(method, metric))
+        return sum(values) / len(values) if values else None
 
-    def mean_value(self, name: str) -> float:
-        """Mean over the judged scenes of one of `SceneScore.values`."""
-        return sum(score.values[name] for score in self.scores) / len(self.scores)
+    def means(self, method: str = "model") -> dict[str, float | None]:
+        """`mean` of all `columns`."""
+        return {name: self.mean(name, method) for name in self.columns}
 
     @property
     def is_complete(self) -> bool:
         """Whether every scene that the protocol names has a score."""
         return not self.missing
 
+    @property
+    def statement(self) -> str:
+        """The model's first value, usually PSNR, and over how many scenes, in one line."""
+        line = f"over {self._of_wanted(len(self.scores))} scene{'s' * (len(self.wanted) != 1)}"
+        if known := [name for name, value in self.means().items() if value is not None]:
+            column = self.columns[known[0]]
+            line = f"{column.heading} {column.shown(self.mean(known[0]))} {line}"
+        missing = [failure.scene for failure in self.missing]
+        return f"{line}; missing: {listed(missing)}" if missing else line
+
     def summary(self) -> dict[str, Any]:
         """Everything but the scores of single scenes, as plain values for JSON.
 
-        Dispersion and used Gaussians: mean, variance and median over scenes.
+        over_scenes: of each value of the model the mean, variance and median over scenes.
         """
+        values = {name: self._values(value_name("model", name)) for name in self.columns}
         return {
             "protocol": {
                 "name": self.protocol.name,
@@ -101,7 +124,7 @@ class Evaluation:
                 "settings": self.protocol.settings(),
             },
             "step": self.step,
-            "statement": statement(self),
+            "statement": self.statement,
             "scenes": len(self.scores),
             "scenes_in_protocol": len(self.wanted),
             "samples": sum(len(score.views) for score in self.scores),
@@ -109,13 +132,15 @@ class Evaluation:
             "null_entries": list(self.null),
             "not_in_index": list(self.unlisted),
             "context_and_target": {s.scene: list(s.given) for s in self.scores if s.given},
-            **{method: {m: self.mean(m, method) for m in METRICS} for method in METHODS},
-            "empty": dict(self.empty),
-            "dispersion_over_gaussians": {
-                name.removeprefix("dispersion_"): self._spread(name) for name in DISPERSIONS
-            },
+            "columns": {name: asdict(column) for name, column in self.columns.items()},
+            **{method: self.means(method) for method in METHODS},
+            "incomplete": dict(self.incomplete),
+            "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
             "gaussians": self.gaussians,
-            "gaussians_used": {"opacity_above": OPACITY_USED, **self._spread("gaussians_used")},
+            "gaussians_used": {
+                "opacity_above": OPACITY_USED,
+                **spread(self._values("gaussians_used")),
+            },
             "tuning": self._tuning(),
             "held_out_frames": self.held_out,
         }
@@ -125,134 +150,114 @@ class Evaluation:
 
         protocol.json is `Protocol.canonical`: its SHA-256 is the protocol's hash.
         """
-        write(self, Path(folder))
+        folder = Path(folder)
+        write_text(folder / "scenes.csv", self._csv())
+        write_text(folder / "summary.json", as_json(self.summary()))
+        write_text(folder / "table.md", self._markdown())
+        write_text(folder / "protocol.json", self.protocol.canonical)
 
     def show(self, console: Console) -> None:
-        """Print the table that a person compares by, and what is to be known beside it."""
-        show(self, console)
+        """Print the tables that a person compares by, and what is to be known beside them."""
+        print_table(console, str(self.protocol), self._rows())
+        print_table(console, "", self._rows_over_scenes())
+        print_lines(console, self._notes())
 
-    def _spread(self, name: str) -> dict[str, float]:
-        values = torch.tensor([score.values[name] for score in self.scores], dtype=torch.float64)
-        return asdict(spread(values))
+    def _values(self, name: str) -> list[float]:
+        return [score.values[name] for score in self.scores if name in score.values]
+
+    def _of_wanted(self, count: int) -> str:
+        wanted = len(self.wanted)
+        return str(count) if count == wanted else f"{count} of {wanted}"
 
     def _tuning(self) -> dict[str, Any] | None:
         settings = self.protocol.content["tuning"]
         if settings is None:
             return None
-        before, after = (self.mean_value(name) for name in TUNING)
+        before, after = (sum(self._values(name)) / len(self.scores) for name in TUNING)
         return {**settings, "loss_before": before, "loss_after": after}
 
+    def _rows(self) -> list[list[str]]:
+        """A row per method, headers first, in it how many scenes it is over."""
+        rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
+        for method in METHODS:
+            cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
+            rows.append([method.replace("_", " "), *cells, self._of_wanted(len(self.scores))])
+        return rows
 
-METHODS = ("model", "nearest_input", "mean_colour")
-HEADERS = {"psnr": "PSNR ↑", "ssim": "SSIM ↑", "lpips": "LPIPS ↓"}
-METRICS = tuple(HEADERS)
-DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
-EMPTY = "–"
-_NAMED = 10
+    def _rows_over_scenes(self) -> list[list[str]]:
+        """A row per value of the model, headers first."""
+        rows = [["over scenes", "mean", "variance", "median", "scenes"]]
+        for name, found in self.summary()["over_scenes"].items():
+            column = self.columns[name]
+            cells = [f"{found[k]:.{column.digits + 1}f}" for k in ("mean", "variance", "median")]
+            unit = f", {column.unit}" if column.unit else ""
+            rows.append([f"{column.heading}{unit}", *cells, self._of_wanted(found["scenes"])])
+        return rows
 
+    def _markdown(self) -> str:
+        notes = "\n".join(f"- {line}" for line in self._notes())
+        tables = [markdown_table(rows) for rows in (self._rows(), self._rows_over_scenes())]
+        return "\n\n".join([*tables, notes]) + "\n"
 
-def write(evaluation: Evaluation, folder: Path) -> None:
-    """See `Evaluation.write`."""
-    summary = json.dumps(evaluation.summary(), indent=2, ensure_ascii=False, allow_nan=False)
-    write_text(folder / "scenes.csv", scenes_csv(evaluation))
-    write_text(folder / "summary.json", summary + "\n")
-    write_text(folder / "table.md", markdown(evaluation))
-    write_text(folder / "protocol.json", evaluation.protocol.canonical)
+    def _csv(self) -> str:
+        """A line per scene that the protocol names, in its order; those without a score say why."""
+        judged = {score.scene: score for score in self.scores}
+        reasons = {failure.scene: failure.reason for failure in self.missing}
+        columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [*_FRAMES, *columns, "problem"], lineterminator="\n")
+        writer.writeheader()
+        for name in self.wanted:
+            row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
+            if name in judged:
+                sides = zip(*judged[name].views, strict=True)
+                shown = ["; ".join(" ".join(map(str, frames)) for frames in side) for side in sides]
+                row |= {**dict(zip(_FRAMES[1:], shown, strict=True)), **judged[name].values}
+            writer.writerow(row)
+        return text.getvalue()
 
-
-def show(evaluation: Evaluation, console: Console) -> None:
-    """See `Evaluation.show`."""
-    table = Table(title=escape(str(evaluation.protocol)), title_justify="left")
-    header, *rows = score_rows(evaluation)
-    for name in header:
-        table.add_column(name, justify="left" if name == "method" else "right")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
-    for line in (*notes(evaluation), _about_dispersion(evaluation)):
-        console.print(escape(line), highlight=False, soft_wrap=True)
-
-
-def statement(evaluation: Evaluation) -> str:
-    """The model's PSNR and over how many scenes, in one line."""
-    scenes = "scene" if len(evaluation.wanted) == 1 else "scenes"
-    line = f"PSNR {_number(evaluation, 'psnr', 'model')} over {coverage(evaluation)} {scenes}"
-    missing = [failure.scene for failure in evaluation.missing]
-    return f"{line}; missing: {listed(missing)}" if missing else line
-
-
-def coverage(evaluation: Evaluation) -> str:
-    """How many scenes have a score, "138 of 140" where some lack it."""
-    judged, wanted = len(evaluation.scores), len(evaluation.wanted)
-    return str(judged) if evaluation.is_complete else f"{judged} of {wanted}"
-
-
-def score_rows(evaluation: Evaluation) -> list[list[str]]:
-    """The table, headers first: a row per method, in it how many scenes it is over."""
-    header = ["method", *HEADERS.values(), "scenes"]
-    covariance = evaluation.protocol.content["ssim_covariance"]
-    if covariance != "population":
-        header[header.index(HEADERS["ssim"])] = f"SSIM ({covariance} covariance) ↑"
-    rows = [
-        [
-            method.replace("_", " "),
-            *(_number(evaluation, metric, method) for metric in HEADERS),
-            coverage(evaluation),
-        ]
-        for method in METHODS
-    ]
-    return [header, *rows]
-
-
-def markdown(evaluation: Evaluation) -> str:
-    """The table in Markdown, token dispersion as published, and the notes."""
-    spreads = evaluation.summary()["dispersion_over_gaussians"]
-    dispersion = [["token dispersion, world units", "mean", "variance", "median", "scenes"]]
-    for name, values in spreads.items():
-        cells = [f"{values[key]:.4f}" for key in ("mean", "variance", "median")]
-        dispersion.append([f"{name} over Gaussians", *cells, coverage(evaluation)])
-    sections = [
-        markdown_table(score_rows(evaluation)),
-        markdown_table(dispersion),
-        "\n".join(f"- {line}" for line in notes(evaluation)),
-    ]
-    return "\n\n".join(sections) + "\n"
-
-
-def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of equal length, headers first, as a Markdown table; numbers to the right."""
-    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = [
-        "| "
-        + " | ".join(
-            cell.rjust(width) if place else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+    def _notes(self) -> Iterator[str]:
+        """What is to be known beside the tables, one line each."""
+        yield self.statement
+        protocol, poses = self.protocol, self.protocol.content["poses"]
+        height, width = protocol.content["image_size"]
+        counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
+        yield (
+            f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
+            f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
+            f"{poses['scale']} {poses['scale_factor']}"
         )
-        + " |"
-        for row in cells
-    ]
-    rule = "|:" + "-" * (widths[0] + 1) + "".join(f"|{'-' * (width + 1)}:" for width in widths[1:])
-    return "\n".join([lines[0], rule + "|", *lines[1:]])
-
-
-def notes(evaluation: Evaluation) -> list[str]:
-    """What is to be known beside the table, one line each."""
-    lines = [statement(evaluation), _about_protocol(evaluation)]
-    lines += [f"missing {f.scene}: {f.reason}" for f in evaluation.missing[:_NAMED]]
-    if len(evaluation.missing) > _NAMED:
-        lines.append(f"{len(evaluation.missing) - _NAMED} more missing scenes are in scenes.csv")
-    for names, what in (
-        (evaluation.null, "null entries of the index"),
-        (evaluation.unlisted, "scenes of the data that the index lacks"),
-    ):
-        if names:
-            lines.append(f"{what}, not judged ({len(names)}): {listed(names)}")
-    lines += _about_given(evaluation)
-    lines += [f"{HEADERS[m].split()[0]} is empty: {why}" for m, why in evaluation.empty.items()]
-    if evaluation.held_out:
-        lines.append("judged on {} of {} held-out frames".format(*evaluation.held_out))
-    return [*lines, *_about_gaussians(evaluation), *_about_tuning(evaluation)]
+        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_NAMED])
+        if len(self.missing) > _NAMED:
+            yield f"{len(self.missing) - _NAMED} more missing scenes are in scenes.csv"
+        if self.null:
+            yield null_entries(self.null)
+        if self.unlisted:
+            count, names = len(self.unlisted), listed(self.unlisted)
+            yield f"scenes of the data that the index lacks, not judged ({count}): {names}"
+        if given := [score for score in self.scores if score.given]:
+            named = [f"{score.scene} ({' '.join(map(str, score.given))})" for score in given]
+            yield (
+                f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the "
+                f"nearest input view is perfect: {listed(named)}"
+            )
+        for name, why in self.incomplete.items():
+            count = len(self._values(value_name("model", name)))
+            over = f"over {self._of_wanted(count)} scenes" if count else "empty"
+            yield f"{self.columns[name].heading} is {over}: {why}"
+        if self.held_out:
+            yield "judged on {} of {} held-out frames".format(*self.held_out)
+        used = spread(self._values("gaussians_used"))
+        yield (
+            f"{self.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "
+            f"above {OPACITY_USED:.4f}; mean over scenes, median {used['median']:,.0f})"
+        )
+        if tuning := self._tuning():
+            yield (
+                f"tokens tuned on the input views: {tuning['steps']} steps of Adam at "
+                f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
+                f"{tuning['loss_after']:.4f}"
+            )
 
 
 def listed(names: Sequence[str], most: int = _NAMED) -> str:
@@ -261,98 +266,61 @@ def listed(names: Sequence[str], most: int = _NAMED) -> str:
     return ", ".join(names[:most]) + more
 
 
-def scenes_csv(evaluation: Evaluation) -> str:
-    """A line per scene that the protocol names, in its order; those without a score say why."""
-    judged = {score.scene: score for score in evaluation.scores}
-    reasons = {failure.scene: failure.reason for failure in evaluation.missing}
-    columns = list(next(iter(judged.values())).values)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["scene", "input_frames", "target_frames", *columns, "problem"])
-    for name in evaluation.wanted:
-        if name in judged:
-            writer.writerow([name, *_frames(judged[name]), *judged[name].values.values(), ""])
-        else:
-            writer.writerow([name, "", "", *("" for _ in columns), reasons[name]])
-    return text.getvalue()
+def null_entries(names: Sequence[str]) -> str:
+    """A note on scenes that an index lists without frames."""
+    return f"null entries of the index, not judged ({len(names)}): {listed(names)}"
 
 
-def _number(evaluation: Evaluation, metric: str, method: str) -> str:
-    value = evaluation.mean(metric, method)
-    return EMPTY if value is None else f"{value:.{DIGITS[metric]}f}"
+def as_json(value: Mapping[str, Any]) -> str:
+    """A file's text; raises ValueError for NaN and infinities."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _about_given(evaluation: Evaluation) -> Iterable[str]:
-    given = {score.scene: score.given for score in evaluation.scores if score.given}
-    if given:
-        named = [f"{scene} ({' '.join(map(str, frames))})" for scene, frames in given.items()]
-        yield (
-            f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the nearest "
-            f"input view is perfect: {listed(named)}"
-        )
+def markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of equal length, headers first, as a Markdown table; numbers to the right."""
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    rule = "|:" + "-" * (widths[0] + 1) + "".join(f"|{'-' * (width + 1)}:" for width in widths[1:])
+    lines = []
+    for first, *rest in cells:
+        right = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+        lines.append("| " + " | ".join([first.ljust(widths[0]), *right]) + " |")
+    return "\n".join([lines[0], rule + "|", *lines[1:]])
 
 
-def _about_gaussians(evaluation: Evaluation) -> Iterable[str]:
-    summary = evaluation.summary()
-    used = summary["gaussians_used"]
-    yield (
-        f"{evaluation.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "
-        f"above {OPACITY_USED:.4f}; mean over scenes, median {used['median']:,.0f})"
-    )
+def print_table(
+    console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
+) -> None:
+    """Print rows, headers first; numbers to the right. options: of rich's Table."""
+    table = Table(title=escape(title) or None, title_justify="left", **options)
+    for place, header in enumerate(rows[0]):
+        table.add_column(header, justify="right" if place else "left")
+    for row in rows[1:]:
+        table.add_row(*row)
+    console.print(table)
 
 
-def _about_dispersion(evaluation: Evaluation) -> str:
-    dispersion = evaluation.summary()["dispersion_over_gaussians"]
-    return (
-        "token dispersion, mean over Gaussians: mean {mean:.4f}, variance {variance:.4f}, median "
-        "{median:.4f} over scenes; ".format(**dispersion["mean"])
-        + "median over Gaussians: mean {mean:.4f}".format(**dispersion["median"])
-    )
-
-
-def _about_protocol(evaluation: Evaluation) -> str:
-    protocol, content = evaluation.protocol, evaluation.protocol.content
-    height, width = content["image_size"]
-    poses = content["poses"]
-    counts = sorted({len(inputs) for score in evaluation.scores for inputs, _ in score.views})
-    return (
-        f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
-        f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
-        f"{poses['scale']} {poses['scale_factor']}"
-    )
-
-
-def _about_tuning(evaluation: Evaluation) -> Iterable[str]:
-    tuning = evaluation.summary()["tuning"]
-    if tuning:
-        yield (
-            f"tokens tuned on the input views: {tuning['steps']} steps of Adam at {tuning['rate']},"
-            f" photometric loss {tuning['loss_before']:.4f} -> {tuning['loss_after']:.4f}"
-        )
-
-
-def _frames(score: SceneScore) -> list[str]:
-    """Input and target frames; those of several samples with semicolons between."""
-    return ["; ".join(" ".join(map(str, frames)) for frames in side) for side in _sides(score)]
-
-
-def _sides(score: SceneScore) -> Iterable[Iterable[Frames]]:
-    return zip(*score.views, strict=True)
+def print_lines(console: Console, lines: Iterator[str] | Sequence[str]) -> None:
+    """Print lines of plain text."""
+    for line in lines:
+        console.print(escape(line), highlight=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
 class StoredResults:
     """Results of one evaluation. name: the folder, as it was given. protocol: its content.
 
-    scenes: name to values as `SceneScore.values`, of the scenes that were judged. frames: their
-    input and target frames, as scenes.csv writes them. wanted: how many scenes the protocol names.
-    missing: those without a score. null: scenes that the index lists without frames.
+    columns, scenes: as `Evaluation.columns` and `SceneScore.values`, of the scenes that were
+    judged. frames: their input and target frames, as scenes.csv writes them. wanted: how many
+    scenes the protocol names. missing: those without a score. null: scenes that the index lists
+    without frames.
     """
 
     name: str
     protocol_name: str
     sha256: str
     protocol: Mapping[str, Any]
+    columns: Mapping[str, Column]
     scenes: Mapping[str, Mapping[str, float]]
     frames: Mapping[str, tuple[str, str]]
     wanted: int
@@ -384,24 +352,19 @@ def read_results(path: str | Path) -> StoredResults:
 
 def _read(folder: Path, name: str) -> StoredResults:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    protocol = json.loads((folder / "protocol.json").read_text(encoding="utf-8"))
     with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    told = {"scene", "input_frames", "target_frames", "problem"}
-    judged = {row["scene"]: row for row in rows if not row["problem"]}
-    scenes = {
-        scene: {key: float(value) for key, value in row.items() if key not in told}
-        for scene, row in judged.items()
-    }
-    frames = {s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()}
-    stated = summary["protocol"]
+        judged = {row["scene"]: row for row in csv.DictReader(file) if not row["problem"]}
     return StoredResults(
         name=name,
-        protocol_name=stated["name"],
-        sha256=stated["sha256"],
-        protocol=protocol,
-        scenes=scenes,
-        frames=frames,
+        protocol_name=summary["protocol"]["name"],
+        sha256=summary["protocol"]["sha256"],
+        protocol=json.loads((folder / "protocol.json").read_text(encoding="utf-8")),
+        columns={name: Column(**column) for name, column in summary["columns"].items()},
+        scenes={
+            scene: {k: float(v) for k, v in row.items() if k not in _FRAMES and v}
+            for scene, row in judged.items()
+        },
+        frames={s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()},
         wanted=summary["scenes_in_protocol"],
         missing=list(summary["missing"]),
         null=summary["null_entries"],

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
@@ -20,7 +19,8 @@ from qgs.composer.recipe import flat
 from qgs.contracts.component import MissingExtraError
 from qgs.io.files import write_text
 
-_PLAIN = (bool, int, float, str)
+_REFRESH_SECONDS = 0.25
+_LOG_SECONDS = 15.0
 
 
 class Trackers:
@@ -35,17 +35,20 @@ class Trackers:
             if find_spec(name) is None:
                 raise MissingExtraError(
                     f"training.trackers names {name}, which is not installed: run "
-                    f"`pip install qgs[{name}]`, or take it out of training.trackers"
+                    f'`pip install "query-gaussians[{name}]"`, or take it out of training.trackers'
                 )
         self._names = names
         self._open: list[GeneralTracker] = []
 
     def open(self, run: Path, recipe: Recipe, step: int = 0) -> None:
         """Track into the folder `run` from step `step` + 1 on; tell the options of `recipe`."""
-        self._open = [_OPENERS[name](run, step) for name in self._names]
-        values = {k: v if isinstance(v, _PLAIN) else str(v) for k, v in flat(recipe.tree).items()}
-        for tracker in self._open:
-            tracker.store_init_configuration(values)
+        options = flat(recipe.tree).items()
+        plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in options}
+        for name in self._names:
+            tracker = _tensorboard(run, step) if name == "tensorboard" else _wandb(run)
+            tracker.start()
+            tracker.store_init_configuration(plain)
+            self._open.append(tracker)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Numbers of a step, by name."""
@@ -67,28 +70,16 @@ class Trackers:
         self._open = []
 
 
-def _tensorboard(run: Path, step: int) -> GeneralTracker:
-    tracker = TensorBoardTracker("tensorboard", logging_dir=run, purge_step=step + 1)
-    tracker.start()
-    return tracker
+def _tensorboard(run: Path, step: int) -> TensorBoardTracker:
+    return TensorBoardTracker("tensorboard", logging_dir=run, purge_step=step + 1)
 
 
-def _wandb(run: Path, step: int) -> GeneralTracker:
+def _wandb(run: Path) -> WandBTracker:
     place = run / "wandb" / "id"
     if not place.is_file():
         write_text(place, uuid.uuid4().hex)
-    tracker = WandBTracker(
-        "qgs", name=run.resolve().name, dir=str(run), id=place.read_text(), resume="allow"
-    )
-    tracker.start()
-    return tracker
-
-
-_OPENERS: Mapping[str, Callable[[Path, int], Any]] = {"tensorboard": _tensorboard, "wandb": _wandb}
-
-
-_REFRESH_SECONDS = 0.25
-_LOG_SECONDS = 15.0
+    options = {"name": run.resolve().name, "dir": str(run), "id": place.read_text()}
+    return WandBTracker("qgs", **options, resume="allow")
 
 
 class TrainingProgress:
@@ -96,14 +87,12 @@ class TrainingProgress:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._bar = Progress(
+        columns = (
             TextColumn("step {task.fields[step]}"),
             BarColumn(),
             TextColumn("{task.fields[line]}"),
-            console=console,
-            auto_refresh=False,
-            transient=True,
         )
+        self._bar = Progress(*columns, console=console, auto_refresh=False, transient=True)
         self._task = self._bar.add_task("training", total=1.0, step=0, line="")
         self._next = 0.0
         self._start: tuple[int, float, float] | None = None

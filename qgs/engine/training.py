@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,96 +14,40 @@ import torch
 from accelerate import Accelerator
 from rich.console import Console
 from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from qgs.composer import Recipe
-from qgs.contracts import TrainingConfig
+from qgs.contracts import Optimizer, TrainingConfig
 from qgs.data.sampling import Batch
 from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
 from qgs.engine.checkpoint import (
-    Counters,
-    Moments,
+    OptimizerState,
     RandomStates,
     SavedState,
-    Stateful,
+    Saver,
     initialise,
+    refuse_other_data,
     saved_state,
     set_seed,
 )
 from qgs.engine.distributed import (
     StopRequest,
+    average_gradients,
     choose_device,
     make_accelerator,
     mean,
     shard,
     stop_requests,
+    unsynchronised,
     wants_shards,
+    whole,
 )
 from qgs.engine.folder import RunFolder
-from qgs.engine.guard import CollapseDetector, GoodWeights, Vitals, not_finite
-from qgs.engine.nonfinite import Incidents
-from qgs.engine.objective import Gradients, Objective
-from qgs.engine.optimizer import MovingAverage, OneCycle, make_optimizer
+from qgs.engine.guard import Guard, not_finite
+from qgs.engine.objective import Objective, Outcome
+from qgs.engine.optimizer import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
-from qgs.engine.saving import Endings, Saver
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.model import QueryGaussianModel
-
-
-class Clock:
-    """Seconds of training, over all sessions of a run.
-
-    A session's clock starts after its first step, in which kernels compile.
-    """
-
-    def __init__(self, accelerator: Accelerator) -> None:
-        self.seconds = 0.0
-        self._accelerator = accelerator
-        self._before = 0.0
-        self._started: float | None = None
-
-    def tick(self) -> None:
-        """Bring `seconds` up to date: the mean over processes, so that all decide alike."""
-        now = time.perf_counter()
-        if self._started is None:
-            self._started = now
-        elapsed = torch.tensor(now - self._started, device=self._accelerator.device)
-        self.seconds = self._before + float(mean(self._accelerator, elapsed))
-
-    @contextmanager
-    def stopped(self) -> Iterator[None]:
-        """Leave the time of the `with` block out."""
-        since = time.perf_counter()
-        yield
-        if self._started is not None:
-            self._started += time.perf_counter() - since
-
-    def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        return {"seconds": self.seconds}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`."""
-        self.seconds = self._before = state["seconds"]
-
-
-def prepared(
-    accelerator: Accelerator, objective: Objective, config: TrainingConfig
-) -> tuple[nn.Module, Optimizer]:
-    """`objective`, wrapped where processes must exchange gradients, and its optimiser.
-
-    Under `accelerate launch --use_fsdp` the model's parameters are laid in shards, in place and
-    before the optimiser is made, so that its moments lie in shards too; else several processes run
-    DistributedDataParallel.
-    """
-    if wants_shards(accelerator):
-        shard(objective.model)
-        return objective, make_optimizer(objective, config)
-    return accelerator.prepare(objective, make_optimizer(objective, config))
-
-
-_FLAGS = ("stop", "failed")
-"""Of a step's record: whether a process was asked to stop, and whether one has no next batch."""
 
 
 @dataclass(frozen=True)
@@ -144,13 +88,14 @@ def train(
     it where there is none yet. A run whose budget is used is left as it is.
 
     Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
-    as `choose_device` and `OneCycle`, `OtherRunError` for another recipe or data
-    than the run's, what the data source raises, CollapseError when the model died, the checkpoint
-    then holding the last good weights, and NonFiniteError for a step that gave NaN. An error of the
-    data, between two steps, leaves the run saved where it stood; a note of the error says so.
+    as `choose_device`, `make_optimizer` and the optimiser, `OtherRunError` for another recipe or
+    data than the run's, what the data source raises, CollapseError when the model died, the
+    checkpoint then holding the last good weights, and NonFiniteError for a step that gave NaN. An
+    error of the data, between two steps, leaves the run saved where it stood; a note of the error
+    says so.
     """
     if not resume:
-        RunFolder(run).refuse_used()
+        RunFolder(run).refuse_other(resume)
     terminal = console or Console(stderr=True)
     chosen = choose_device(device, terminal.print)
     set_seed(recipe.seed)
@@ -164,152 +109,177 @@ def train(
 
 
 class Trainer:
-    """The state of one run: model, optimiser, data, clock, detector.
+    """One run: its state, and the loop.
 
-    Making one opens the data and draws the first batch, but touches no file of `run`; the folder is
-    made after the first step, when nothing is missing any more. What must survive an interruption
-    is in parts that the saver knows, each with `state` and `load_state`.
+    Making one opens the data and draws the first batch, but touches no file of a new run; its
+    folder is made after the first step, when nothing is missing any more.
+
+    step, samples, seconds: optimiser steps, samples over all processes, and time spent so far, in
+        all sessions. A session's clock starts after its first step, in which kernels compile.
+    resumed_at: the step from which this session continues the run, None if it begins it.
+    notes: what is to be said of the initial weights.
     """
 
     def __init__(
         self, recipe: Recipe, run: str | Path, device: str = "cpu", resume: bool = False
     ) -> None:
-        self.recipe = recipe
-        self.config = recipe.training
-        self._resumes = resume
-        self.folder = RunFolder(run)
-        self.trackers = Trackers(self.config.trackers)
-        self.schedule = OneCycle(self.config)
-        self.accelerator = make_accelerator(device)
-        self.device = self.accelerator.device
+        self.recipe, self.config = recipe, recipe.training
+        self.folder, self.trackers = RunFolder(run), Trackers(recipe.training.trackers)
+        self.step, self.samples, self.seconds = 0, 0, 0.0
+        self._last_tick: float | None = None
+        self._resumes, self._folder_is_open = resume, False
         with ExitStack() as resources:
             resources.callback(self.folder.close)
             resources.callback(self.trackers.close)
-            saved = self._claim_folder() if resume else None
-            self._build(fresh=saved is None)
-            self.resumed_at = self._restore(saved) if saved else None
-            self._stream = self._open_stream()
-            resources.callback(self._stream.close)
-            self.feed = Feed(self._stream, self.config.accumulate)
-            self.feed.fetch()
-            if self.feed.error:
-                raise self.feed.error
+            self._build(device, resources)
             self._resources = resources.pop_all()
-        self._folder_is_open = False
+
+    def _build(self, device: str, resources: ExitStack) -> None:
+        """Everything that has a state, as it is saved where the run is continued; then the data."""
+        recipe, config = self.recipe, self.config
+        self.optimizer = recipe.build_optimizer()
+        self.accelerator = make_accelerator(device)
+        saved = self._claim_folder() if self._resumes else None
+        self.model = recipe.build_model(device=self.accelerator.device).train()
+        self.notes = [] if saved else initialise(self.model, recipe)
+        objective = Objective(self.model, recipe.build_losses(), config.render_views)
+        objective.to(self.accelerator.device)
+        self.objective, self.torch_optimizer = prepared(self.accelerator, objective, self.optimizer)
+        self.average = MovingAverage(self.model, config.ema) if config.ema else None
+        self.saver = Saver(self.accelerator, self.folder, self.model)
+        self.guard = Guard(self.accelerator, objective, self.saver, config, self._gradients)
+        self.evaluations = PeriodicEvaluation(
+            self.accelerator, recipe, self.model, self.average, self.folder.path, self.trackers
+        )
+        source, processes = recipe.build_data(), self.accelerator.num_processes
+        self._conditions = {
+            "step_size": config.batch_size * config.accumulate * processes,
+            "scenes": scenes_fingerprint(source),
+        }
+        self.saver.parts |= {
+            "counters": self,
+            "moments": OptimizerState(objective, self.torch_optimizer),
+            "schedule": self.optimizer,
+            "random": RandomStates(self.accelerator),
+            **({"ema": self.average} if self.average else {}),
+        }
+        if saved:
+            self.saver.restore(saved)
+        self.resumed_at = self.step if saved else None
+        batches = training_batches(
+            source,
+            recipe.views,
+            config.batch_size,
+            recipe.seed,
+            start=self.samples // (config.batch_size * processes),
+            share=Share(self.accelerator.process_index, processes),
+            workers=config.workers,
+        )
+        resources.callback(batches.close)
+        self.feed = Feed(batches, config.accumulate)
+        self.feed.fetch()
+        if self.feed.error:
+            raise self.feed.error
 
     def _claim_folder(self) -> SavedState | None:
         """The state to continue from; a folder that holds a run is this one's from now on."""
-        self.folder.refuse_foreign()
+        self.folder.refuse_other(resume=True)
         if self.accelerator.is_main_process and not self.folder.is_new:
             self.folder.take()
         self.accelerator.wait_for_everyone()
         return saved_state(self.folder, self.recipe)
 
-    def _build(self, fresh: bool) -> None:
-        """Everything with a state, as it is before the first step."""
-        self.model = self.recipe.build_model(device=self.device).train()
-        self.notes = initialise(self.model, self.recipe) if fresh else []
-        losses = self.recipe.build_losses()
-        objective = Objective(self.model, losses, self.config.render_views).to(self.device)
-        self.objective, self.optimizer = prepared(self.accelerator, objective, self.config)
-        self.gradients = Gradients(self.accelerator, self.objective, self.config)
-        self.detector = CollapseDetector(self.config.collapse_window)
-        self.good = GoodWeights(self.model, keep=self.accelerator.is_main_process)
-        self.clock = Clock(self.accelerator)
-        decay, run = self.config.ema, self.folder.path
-        self.average = MovingAverage(self.model, decay) if decay else None
-        self.incidents = Incidents(self.accelerator, objective, self.gradients, run)
-        self.evaluations = PeriodicEvaluation(
-            self.accelerator, self.recipe, self.model, self.average, run, self.trackers
-        )
-        self.source = self.recipe.build_data()
-        batches = self.config.accumulate * self.accelerator.num_processes
-        conditions = {
-            "step_size": self.config.batch_size * batches,
-            "scenes": scenes_fingerprint(self.source),
-        }
-        self.counters = Counters(conditions, self.folder)
-        parts: dict[str, Stateful] = {
-            "counters": self.counters,
-            "moments": Moments(objective, self.optimizer),
-            "schedule": self.schedule,
-            "clock": self.clock,
-            "detector": self.detector,
-            "incidents": self.incidents,
-            "random": RandomStates(self.accelerator),
-        }
-        if self.average:
-            parts["ema"] = self.average
-        self.saver = Saver(self.accelerator, self.folder, self.model, self.good, parts)
-        skips = self.config.on_nonfinite == "skip"
-        self.endings = Endings(self.saver, self.counters, self.detector, self.incidents, skips)
+    def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
+        """Train until the budget is used, a stop is asked for, or the model dies."""
+        if self.used >= 1:
+            if not self.folder.checkpoint.exists():
+                self.guard.save(self.step)
+            return self._result(None)
+        stopped_by = None
+        while self.used < 1 and not stopped_by:
+            # Gradients of this step's batches; those of the next step are fetched meanwhile.
+            rate = self.optimizer.learning_rate(self.step, self.seconds)
+            for group in self.torch_optimizer.param_groups:
+                group["lr"] = rate * group["factor"]
+            self.torch_optimizer.zero_grad(set_to_none=True)
+            batches = self.feed.batches
+            measured = self._gradients(batches)
+            if not stop and self.step + 1 < self.config.steps:
+                self.feed.fetch()
+            numbers, asked_to_stop, no_data = self._means(measured, stop)
 
-    def _restore(self, saved: SavedState) -> int:
-        """Continue from `saved`; the step at which that is."""
-        self.saver.restore(saved)
-        return self.counters.step
+            # The optimiser step, unless something is not finite.
+            symptom = not_finite(numbers, self.model)
+            if symptom:
+                self._open_folder()
+                self.guard.leave_out(self.step, batches, symptom)
+            else:
+                self.torch_optimizer.step()
+                if self.average:
+                    self.average.update()
+                self.guard.passed(numbers)
+            self.step += 1
+            self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
+            self._tick()
 
-    def _open_stream(self) -> Generator[Batch, None, None]:
-        """Batches from the first one that no optimiser step has seen."""
-        processes = self.accelerator.num_processes
-        return training_batches(
-            self.source,
-            self.recipe.views,
-            self.config.batch_size,
-            self.recipe.seed,
-            start=self.counters.samples // (self.config.batch_size * processes),
-            share=Share(self.accelerator.process_index, processes),
-            workers=self.config.workers,
-        )
+            # What is told, saved and evaluated.
+            self._open_folder()
+            record = {"step": self.step, "seconds": self.seconds, "lr": rate, **numbers}
+            self._report(record | ({"skipped": True} if symptom else {}), progress)
+            self.guard.refuse_collapse(self.step)
+            evaluates = self._every(self.config.evaluate_every)
+            if not self.guard.detector.dead_steps:
+                if self._every(self.config.collapse_window):
+                    self.guard.keep_good(self.step)
+                if self._every(self.config.save_every) or evaluates:
+                    self.guard.save(self.step)
+            if evaluates:
+                self._evaluate(stop)
+            if asked_to_stop or evaluates:
+                stopped_by = self._stopped_by(stop)
+            if no_data and self.used < 1 and not stopped_by:
+                self._end_without_data()
+        stopped_by = stopped_by or self._stopped_by(stop)
+        self.guard.finish(self.step, stopped=stopped_by is not None)
+        if self.average and not stopped_by and self.evaluations.latest != self.step:
+            self._evaluate(stop)
+            stopped_by = self._stopped_by(stop)
+        return self._result(stopped_by)
+
+    @property
+    def used(self) -> float:
+        """Fraction of the budget that is used, the larger of steps and seconds."""
+        of_seconds = self.seconds / self.config.seconds if self.config.seconds else 0.0
+        return max(self.step / self.config.steps, of_seconds)
+
+    def state(self) -> dict[str, Any]:
+        """What was counted so far, and what must not change for this to mean the same."""
+        counted = {"step": self.step, "samples": self.samples, "seconds": self.seconds}
+        return counted | self._conditions
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
+        refuse_other_data(state, self._conditions, self.folder)
+        self.step, self.samples, self.seconds = state["step"], state["samples"], state["seconds"]
 
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""
         self._resources.close()
 
-    def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
-        """Train until the budget is used, a stop is asked for, or the model dies."""
-        if self.used >= 1:
-            if not self.folder.checkpoint.exists():
-                self.endings.save()
-            return self._result(None)
-        stopped_by = None
-        while self.used < 1 and not stopped_by:
-            record = self._optimise(stop)
-            self._open_folder()
-            self._report(record, progress)
-            self.endings.refuse_collapse()
-            self._keep_good_weights()
-            if self._every(self.config.evaluate_every):
-                self._evaluate(stop)
-            if record["stop"] or self._every(self.config.evaluate_every):
-                stopped_by = self._stopped_by(stop)
-            if record["failed"] and self.used < 1 and not stopped_by:
-                self._end_without_data()
-        stopped_by = stopped_by or self._stopped_by(stop)
-        self.endings.finish(stopped_by)
-        if self.average and not stopped_by and self.evaluations.latest != self.counters.step:
-            self._evaluate(stop)
-            stopped_by = self._stopped_by(stop)
-        return self._result(stopped_by)
+    def _gradients(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
+        return compute_gradients(self.accelerator, self.objective, self.config, batches)
 
-    def _result(self, stopped_by: str | None) -> TrainingResult:
-        return TrainingResult(
-            self.saver.whole_model().eval(),
-            self.folder,
-            self.counters.step,
-            self.clock.seconds,
-            stopped_by,
-            self.accelerator.is_main_process,
-            self.resumed_at,
-        )
+    def _means(
+        self, measured: Mapping[str, Tensor], stop: StopRequest
+    ) -> tuple[dict[str, float], bool, bool]:
+        """The numbers of a step, means over processes; the only synchronisation of a step.
 
-    @property
-    def used(self) -> float:
-        """Fraction of the budget that is used, the larger of steps and seconds."""
-        of_steps = self.counters.step / self.config.steps
-        budget = self.config.seconds
-        of_seconds = self.clock.seconds / budget if budget else 0.0
-        return max(of_steps, of_seconds)
+        Also whether any process was asked to stop, and whether any has no next batch.
+        """
+        flags = torch.tensor([bool(stop), bool(self.feed.error)]).to(self.accelerator.device)
+        values = torch.stack([value.float() for value in (*measured.values(), *flags)])
+        *numbers, asked_to_stop, no_data = mean(self.accelerator, values).tolist()
+        return dict(zip(measured, numbers, strict=True)), asked_to_stop > 0, no_data > 0
 
     def _open_folder(self) -> None:
         """Make the folder, once, write the recipe, and drop records of steps that were lost.
@@ -321,96 +291,105 @@ class Trainer:
         self._folder_is_open = True
         if self.accelerator.is_main_process:
             if not self._resumes:
-                self.folder.refuse_used()
+                self.folder.refuse_other(resume=False)
             self.folder.take()
             self.folder.write_recipe(self.recipe)
             self.folder.cut_history(self.resumed_at or 0)
             self.trackers.open(self.folder.path, self.recipe, self.resumed_at or 0)
         self.accelerator.wait_for_everyone()
 
-    def _optimise(self, stop: StopRequest) -> dict[str, float]:
-        """One optimiser step; returns its record for the history."""
-        rate = self.schedule.rate(self.counters.step, self.clock.seconds)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        self.optimizer.zero_grad(set_to_none=True)
-        batches = self.feed.batches
-        measured = self.gradients.compute(batches)
-        if not stop and self.counters.step + 1 < self.config.steps:
-            self.feed.fetch()
-        scenes = sum(len(batch.scenes) for batch in batches)
-        record = self._read(measured, stop)
-        symptom = self._nonfinite(record)
-        if symptom:
-            self._open_folder()
-            self.endings.leave_out(batches, symptom)
-            record["skipped"] = True
-        else:
-            self._apply(record)
-        self.counters.step += 1
-        self.counters.samples += scenes * self.accelerator.num_processes
-        self.clock.tick()
-        return {"step": self.counters.step, "seconds": self.clock.seconds, "lr": rate, **record}
-
-    def _apply(self, record: Mapping[str, float]) -> None:
-        """Let the optimiser use the gradients of a step that `record` tells of."""
-        self.optimizer.step()
-        if self.average:
-            self.average.update()
-        self.incidents.passed()
-        self.detector.observe(Vitals(record["alpha"], record["deviation"], record["gradient"]))
-
-    def _end_without_data(self) -> NoReturn:
-        """Save the run and raise what kept this process, or another one, from its next batch."""
-        self.endings.keep()
-        error = self.feed.error or SampleError(
-            "another process of this training has no next batch; its own message tells why"
-        )
-        error.add_note(f"The run is saved at step {self.counters.step}; continue with --resume")
-        raise error
-
-    def _evaluate(self, stop: StopRequest) -> None:
-        with self.clock.stopped():
-            self.evaluations.run(self.counters.step, stop)
+    def _report(self, record: dict[str, float], progress: TrainingProgress) -> None:
+        if self.accelerator.is_main_process:
+            finite = {name: value for name, value in record.items() if math.isfinite(value)}
+            self.folder.append(finite)
+            self.trackers.log(finite, self.step)
+        images = self.samples * self.recipe.views.targets
+        shown = record["loss"], record["psnr"], images, self.seconds, self.used
+        if progress.update(self.step, *shown):
+            self.folder.flush()
 
     def _every(self, steps: int) -> bool:
         """Whether this step is one of every `steps`; none is where that is 0."""
-        return bool(steps) and self.counters.step % steps == 0
+        return bool(steps) and self.step % steps == 0
 
-    def _report(self, record: dict[str, float], progress: TrainingProgress) -> None:
-        if self.accelerator.is_main_process:
-            numbers = {name: value for name, value in record.items() if name not in _FLAGS}
-            told = {name: value for name, value in numbers.items() if math.isfinite(value)}
-            self.folder.append(told)
-            self.trackers.log(told, self.counters.step)
-        images, seconds = self.counters.samples * self.recipe.views.targets, self.clock.seconds
-        shown = record["loss"], record["psnr"], images, seconds, self.used
-        if progress.update(self.counters.step, *shown):
-            self.folder.flush()
+    def _tick(self) -> None:
+        """Bring `seconds` up to date: the mean over processes, so that all decide alike."""
+        now = time.perf_counter()
+        spent = torch.tensor(now - (self._last_tick or now), device=self.accelerator.device)
+        self.seconds += float(mean(self.accelerator, spent))
+        self._last_tick = now
 
-    def _read(self, measured: dict[str, Tensor], stop: StopRequest) -> dict[str, float]:
-        """Numbers of one step, the mean over processes; the only synchronisation of a step."""
-        flags = torch.tensor([bool(stop), bool(self.feed.error)], device=self.device).float()
-        values = torch.stack([v.float() for v in (*measured.values(), *flags)])
-        numbers = mean(self.accelerator, values).tolist()
-        return dict(zip([*measured, *_FLAGS], numbers, strict=True))
-
-    def _nonfinite(self, record: dict[str, float]) -> str:
-        """What of a step is NaN or infinite; "" if nothing is."""
-        terms = {k: v for k, v in record.items() if k not in ("gradient", "psnr", *_FLAGS)}
-        return not_finite(terms, self.model, record["gradient"])
-
-    def _keep_good_weights(self) -> None:
-        if self.detector.dead_steps:
-            return
-        if self._every(self.config.collapse_window):
-            self.endings.refuse_broken_weights()
-            self.good.refresh(self.counters.step)
-        if self._every(self.config.save_every) or self._every(self.config.evaluate_every):
-            self.endings.save()
+    def _evaluate(self, stop: StopRequest) -> None:
+        """Evaluate, which takes no time on the clock."""
+        self._tick()
+        self.evaluations.run(self.step, stop)
+        self._last_tick = time.perf_counter()
 
     def _stopped_by(self, stop: StopRequest) -> str | None:
         """The signal's name when any process was asked to stop."""
-        asked = mean(self.accelerator, torch.tensor(float(bool(stop)), device=self.device))
+        asked = mean(self.accelerator, torch.tensor(float(bool(stop))).to(self.accelerator.device))
         name = stop.signal.name if stop.signal else "SIGTERM"
         return name if float(asked) else None
+
+    def _end_without_data(self) -> NoReturn:
+        """Save the run and raise what kept this process, or another one, from its next batch."""
+        self.guard.save_to_go_on(self.step)
+        error = self.feed.error or SampleError(
+            "another process of this training has no next batch; its own message tells why"
+        )
+        error.add_note(f"The run is saved at step {self.step}; continue with --resume")
+        raise error
+
+    def _result(self, stopped_by: str | None) -> TrainingResult:
+        return TrainingResult(
+            self.saver.whole_model().eval(),
+            self.folder,
+            self.step,
+            self.seconds,
+            stopped_by,
+            self.accelerator.is_main_process,
+            self.resumed_at,
+        )
+
+
+def prepared(
+    accelerator: Accelerator, objective: Objective, optimizer: Optimizer
+) -> tuple[nn.Module, torch.optim.Optimizer]:
+    """`objective`, wrapped where processes must exchange gradients, and torch's optimiser of it.
+
+    Under `accelerate launch --use_fsdp` the model's parameters are laid in shards, in place and
+    before the optimiser is made, so that its moments lie in shards too; else several processes run
+    DistributedDataParallel.
+    """
+    if wants_shards(accelerator):
+        shard(objective.model)
+        return objective, make_optimizer(objective, optimizer)
+    return accelerator.prepare(objective, make_optimizer(objective, optimizer))
+
+
+def compute_gradients(
+    accelerator: Accelerator,
+    objective: nn.Module,
+    config: TrainingConfig,
+    batches: Sequence[Batch],
+) -> dict[str, Tensor]:
+    """Leave the gradients of the mean loss of `batches`, clipped; what was measured, 0-d.
+
+    objective: as `prepared` gives it. Only the last batch exchanges gradients between processes.
+    "gradient" is the norm before clipping, over all processes; the rest is of this one.
+    """
+    device, sums = accelerator.device, dict[str, Tensor]()
+    for number, batch in enumerate(batches, start=1):
+        last = number == len(batches)
+        with nullcontext() if last else unsynchronised(accelerator, objective):
+            inputs, targets = batch.inputs.to(device), batch.targets.to(device)
+            with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
+                outcome: Outcome = objective(inputs, targets)
+            accelerator.backward(outcome.total / len(batches))
+        found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
+        for name, value in found.items():
+            sums[name] = sums.get(name, 0) + value / len(batches)
+    average_gradients(accelerator, objective)
+    norm = accelerator.clip_grad_norm_(objective.parameters(), config.clip)
+    sums["gradient"] = whole(torch.as_tensor(norm)).to(device)
+    return sums

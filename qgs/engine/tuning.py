@@ -11,7 +11,7 @@ from torch import Tensor
 from qgs.composer import Recipe
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
-from qgs.types import Prediction, QueryState, Views
+from qgs.types import Prediction, Views, map_tensors, named_tensors
 
 
 @dataclass(frozen=True)
@@ -45,38 +45,25 @@ def tune(
     with torch.no_grad():
         memory = model.encoder(views)
         start = model.queries(views.images.shape[0])
-    state, leaves = _leaves(start)
+    state = map_tensors(lambda x: x.detach().clone().requires_grad_(x.is_floating_point()), start)
+    leaves = [tensor for _, tensor in named_tensors(state) if tensor.requires_grad]
     optimizer = torch.optim.Adam(leaves, lr=rate)
+
+    def predicted() -> tuple[Prediction, Tensor]:
+        prediction = model.predict(memory, state, ())
+        rendering = model.render(prediction.gaussians, views.cameras)
+        terms = loss(prediction.layers[model.depth], rendering, views)
+        return prediction, torch.stack(list(terms.values())).sum()
+
     losses = []
     with torch.enable_grad():
         for _ in range(steps):
-            value = _loss(model, model.predict(memory, state, ()), views, loss)
+            _, value = predicted()
             gradients = torch.autograd.grad(value, leaves, allow_unused=True)
             for leaf, gradient in zip(leaves, gradients, strict=True):
                 leaf.grad = gradient
             optimizer.step()
             losses.append(float(value.detach()))
     with torch.no_grad():
-        prediction = model.predict(memory, state, ())
-        losses.append(float(_loss(model, prediction, views, loss)))
-    return Tuning(prediction, losses)
-
-
-def _leaves(start: QueryState) -> tuple[QueryState, list[Tensor]]:
-    """A copy of `start` whose floating tensors want gradients, and these."""
-
-    def leaf(tensor: Tensor) -> Tensor:
-        copy = tensor.detach().clone()
-        return copy.requires_grad_() if copy.is_floating_point() else copy
-
-    fields = {name: leaf(tensor) for name, tensor in start.fields.items()}
-    state = QueryState(leaf(start.features), fields)
-    return state, [t for t in (state.features, *fields.values()) if t.requires_grad]
-
-
-def _loss(
-    model: QueryGaussianModel, prediction: Prediction, views: Views, loss: Photometric
-) -> Tensor:
-    rendering = model.render(prediction.gaussians, views.cameras)
-    layer = prediction.layers[model.depth]
-    return torch.stack(list(loss(layer, rendering, views).values())).sum()
+        prediction, value = predicted()
+    return Tuning(prediction, [*losses, float(value)])

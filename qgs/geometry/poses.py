@@ -1,4 +1,4 @@
-"""Bringing the poses of a scene into the frame and scale a model expects (TokenGS release)."""
+"""Poses in the frame and scale that the model expects (TokenGS release)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def mean_camera(c2w: Tensor) -> Tensor:
 
 @full_precision
 def relative_to(reference: Tensor, c2w: Tensor) -> Tensor:
-    """Poses c2w (..., V, 4, 4) seen from the frame `reference` (..., 4, 4)."""
+    """Poses c2w (..., V, 4, 4) relative to the pose `reference` (..., 4, 4)."""
     return torch.linalg.inv(reference)[..., None, :, :] @ c2w
 
 

@@ -1,4 +1,4 @@
-"""Geometry keeps its precision whatever the autocast setting of the caller."""
+"""Float32 or better for geometry, also inside autocast."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ HALF = (torch.float16, torch.bfloat16)
 
 
 def at_least_float32(x: Tensor) -> Tensor:
-    """Half-precision tensors raised to float32, others as they are."""
+    """`x` in float32 if it is in half precision, else as it is."""
     return x.float() if x.dtype in HALF else x
 
 
 def full_precision(function: F) -> F:
     """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
 
-    Tensors are found as arguments, and in lists, tuples, mappings and the containers of
-    `qgs.types`; what holds no half-precision tensor is handed on itself. A raised ImageMemory is a
-    copy, whose `once` starts anew. float64 stays float64, so that gradient checks work.
+    Tensors are found wherever `qgs.types.map_tensors` finds them; what holds no half-precision
+    tensor is passed on itself. A raised ImageMemory is a copy, whose `once` starts empty. float64
+    stays float64, so that gradient checks work.
     """
 
     @wraps(function)

@@ -26,16 +26,13 @@ def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.stack([x, y, torch.ones_like(x)], -1)
 
 
+@full_precision
 def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """World-frame origins and unit directions through the pixel centres, both (..., H, W, 3)."""
+    c2w = cameras.c2w
     directions = F.normalize(pixel_directions(cameras.intrinsics, cameras.size), dim=-1)
-    return _to_world(cameras.c2w, directions)
-
-
-@full_precision
-def _to_world(c2w: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    world = torch.einsum("...ij,...hwj->...hwi", c2w[..., :3, :3], directions)
-    return c2w[..., None, None, :3, 3].expand_as(world), world
+    directions = torch.einsum("...ij,...hwj->...hwi", c2w[..., :3, :3], directions)
+    return c2w[..., None, None, :3, 3].expand_as(directions), directions
 
 
 def plucker_rays(cameras: Cameras) -> Tensor:

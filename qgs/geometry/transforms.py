@@ -22,13 +22,10 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 @full_precision
-def _transform(w2c: Tensor, points: Tensor) -> Tensor:
-    return points @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
-
-
 def to_camera(points: Tensor, cameras: Cameras) -> Tensor:
     """Camera-frame points (B, V, P, 3) of world points (B, P, 3) in cameras (B, V)."""
-    return _transform(cameras.w2c, points[:, None])
+    w2c = cameras.w2c
+    return points[:, None] @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
 
 
 @full_precision

@@ -24,11 +24,18 @@ from qgs.io.differences import differing_tensors, shapes_of
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FORMAT_VERSION = 1
+"""Raised when what a checkpoint holds changes."""
+
+_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_RECIPE, _CONTRACT = "qgs.recipe", "qgs.contract_version"
+_PLUGINS, _DISTRIBUTIONS = "qgs.plugins", "qgs.distributions"
+_FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
+_PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
 class CheckpointError(ValueError):
-    """A file that is no usable checkpoint; the message says why and what to do."""
+    """A file that holds no weights that can be used; the message says why and what to do."""
 
 
 def write_tensors(
@@ -43,7 +50,7 @@ def write_tensors(
         with replacing(path) as temporary:
             save_file(dict(tensors), temporary, dict(metadata))
     except (SafetensorError, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in _FULL:
+        if isinstance(error, OSError) and error.errno not in _DISK_IS_FULL:
             raise
         needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
         free = shutil.disk_usage(Path(path).parent).free
@@ -69,14 +76,19 @@ def opened_tensors(path: str | os.PathLike[str]) -> Iterator[Any]:
         ) from error
 
 
-FORMAT_VERSION = 1
-"""Raised when the layout of the file changes."""
+def read_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """All tensors of a safetensors file, memory-mapped. Raises as `opened_tensors` does."""
+    with opened_tensors(path) as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
-_RECIPE, _CONTRACT = "qgs.recipe", "qgs.contract_version"
-_PLUGINS, _DISTRIBUTIONS = "qgs.plugins", "qgs.distributions"
-_FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
 
-_PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
+def pickle_kind(path: str | os.PathLike[str]) -> str:
+    """What a file is that can run code when it is read, in words; "" for any other file."""
+    with open(path, "rb") as file:
+        start = file.read(9)
+    if start[8:] == b"{":  # safetensors: a length that may look like a pickle, then JSON
+        return ""
+    return next((kind for magic, kind in _PICKLES.items() if start.startswith(magic)), "")
 
 
 def save(
@@ -135,9 +147,7 @@ def load(
     where a plugin is missing or another release of it cannot stand for it.
     """
     model = load_recipe(path).build_model()
-    with opened_tensors(path) as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    load_weights(model, tensors, str(path))
+    load_weights(model, read_tensors(path), str(path))
     return (model if device is None else model.to(device)).eval()
 
 
@@ -147,7 +157,17 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     try:
         return resolve(json.loads(metadata[_RECIPE]))
     except RecipeError as error:
-        raise CheckpointError(f"{path} {_made_with(metadata)}\n{error}") from error
+        names = {"qgs": "query-gaussians", **json.loads(metadata.get(_DISTRIBUTIONS, "{}"))}
+        releases = {
+            plugin: f"{names.get(plugin) or f'the plugin `{plugin}`'} {version}"
+            for plugin, version in json.loads(metadata.get(_PLUGINS, "{}")).items()
+        }
+        available = {"qgs", *available_plugins()}
+        absent = [release for plugin, release in releases.items() if plugin not in available]
+        raise CheckpointError(
+            f"{path} was made with {', '.join(releases.values())}, and its recipe fails here; "
+            f"install {', '.join(absent) or 'those releases'}:\n{error}"
+        ) from error
 
 
 def load_extra(path: str | os.PathLike[str]) -> dict[str, str]:
@@ -186,7 +206,12 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
 def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
     if not Path(path).is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
-    _refuse_pickle(path)
+    kind = pickle_kind(path)
+    if kind:
+        raise CheckpointError(
+            f"{path} is {kind}, whatever its name says; such files can run code when they are "
+            "read, so qgs never opens them: use the safetensors file of the run"
+        )
     with opened_tensors(path) as file:
         metadata: dict[str, str] = file.metadata() or {}
     if _RECIPE not in metadata:
@@ -195,37 +220,6 @@ def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
             "or `qgs train` can be loaded. If it holds published weights, turn them into a "
             f"checkpoint: `qgs import {path} --recipe auto --out CHECKPOINT.safetensors`"
         )
-    _refuse_newer(path, metadata)
-    return metadata
-
-
-def _made_with(metadata: Mapping[str, str]) -> str:
-    """The releases that wrote a checkpoint whose recipe fails here, and what to install."""
-    versions: dict[str, str] = json.loads(metadata.get(_PLUGINS, "{}"))
-    distributions = {"qgs": "qgs", **json.loads(metadata.get(_DISTRIBUTIONS, "{}"))}
-    available = {"qgs", *available_plugins()}
-    releases = {
-        name: f"{distributions.get(name) or f'the plugin `{name}`'} {version}"
-        for name, version in versions.items()
-    }
-    absent = [release for name, release in releases.items() if name not in available]
-    fix = f"install {', '.join(absent)}" if absent else "install those releases"
-    return f"was made with {', '.join(releases.values())}, and its recipe fails here; {fix}:"
-
-
-def _refuse_pickle(path: str | os.PathLike[str]) -> None:
-    with open(path, "rb") as file:
-        start = file.read(4)
-        json_follows = file.seek(8) and file.read(1) == b"{"
-    for magic, kind in _PICKLES.items():
-        if start.startswith(magic) and not json_follows:
-            raise CheckpointError(
-                f"{path} is {kind}, whatever its name says; such files can run code when they are "
-                "read, so qgs never opens them: use the safetensors file of the run"
-            )
-
-
-def _refuse_newer(path: str | os.PathLike[str], metadata: Mapping[str, str]) -> None:
     for key, known in ((_CONTRACT, CONTRACT_VERSION), (_FORMAT, FORMAT_VERSION)):
         written = int(metadata.get(key, 0))
         if written > known:
@@ -233,3 +227,4 @@ def _refuse_newer(path: str | os.PathLike[str], metadata: Mapping[str, str]) -> 
                 f"{path} was written by qgs {metadata.get(_VERSION, '?')} with {key} {written}; "
                 f"this is qgs {qgs.__version__}, which knows {known}: install the newer qgs"
             )
+    return metadata

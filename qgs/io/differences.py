@@ -12,16 +12,10 @@ from qgs.composer.recipe import flat
 from qgs.composer.yaml_text import dump
 from qgs.contracts.weights import Shapes
 
-ABSENT = "none"
-
-
-"""Stands for the value of an option that a recipe does not have."""
-
-
-_INITIAL = re.compile(r"(\b|_)(init|std|layer_scale)(\b|_)")
-
-
-_ELSEWHERE = re.compile(r"^model\.(supervision|renderer)\.")
+_WITHOUT_EFFECT_ON_TRAINED = re.compile(
+    r"(\b|_)(init|std|layer_scale)(\b|_)|^model\.(supervision|renderer)\."
+)
+"""Options that do not change what a model with given weights predicts."""
 
 
 def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
@@ -43,6 +37,11 @@ def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()
     ]
 
 
+def one_line(value: Any) -> str:
+    """`value` as YAML on one line."""
+    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
+
+
 def differing_options(
     a: Mapping[str, Any], b: Mapping[str, Any]
 ) -> dict[str, tuple[str | None, str | None]]:
@@ -51,28 +50,29 @@ def differing_options(
     None stands for an option that a recipe does not have.
     """
     of_a, of_b = flat(a), flat(b)
-    return {
-        path: (_word(of_a, path), _word(of_b, path))
+    different = (
+        path
         for path in dict.fromkeys([*of_a, *of_b])
         if path not in of_a or path not in of_b or of_a[path] != of_b[path]
+    )
+    return {
+        path: (
+            one_line(of_a[path]) if path in of_a else None,
+            one_line(of_b[path]) if path in of_b else None,
+        )
+        for path in different
     }
 
 
 def options_beside_weights(
     a: Mapping[str, Any], b: Mapping[str, Any]
 ) -> dict[str, tuple[str, str]]:
-    """`differing_options` that decide what a model with given weights predicts.
+    """`differing_options` that decide what a model with given weights predicts, "none" for None.
 
     Initial values, supervision and the renderer do not.
     """
     return {
-        path: (ours or ABSENT, theirs or ABSENT)
+        path: (ours or "none", theirs or "none")
         for path, (ours, theirs) in differing_options(a, b).items()
-        if path.startswith("model.") and not (_INITIAL.search(path) or _ELSEWHERE.search(path))
+        if path.startswith("model.") and not _WITHOUT_EFFECT_ON_TRAINED.search(path)
     }
-
-
-def _word(options: Mapping[str, Any], path: str) -> str | None:
-    if path not in options:
-        return None
-    return dump(options[path], flow=True).removesuffix("\n").removesuffix("\n...")

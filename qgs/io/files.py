@@ -16,6 +16,8 @@ from upath import UPath
 
 from qgs.data.paths import is_local
 
+_log = logging.getLogger(__name__)
+
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -88,17 +90,18 @@ def new_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     when it appeared while the block ran. When the block raises, there is no `folder`.
     """
     target = Path(folder)
-    _refuse_existing(target)
+    refuse_existing(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
         fresh = Path(temporary, target.name)
         fresh.mkdir()
         yield fresh
-        _refuse_existing(target)
+        refuse_existing(target)
         fresh.rename(target)
 
 
-def _refuse_existing(target: Path) -> None:
+def refuse_existing(target: Path) -> None:
+    """Raise FileExistsError for a path at which something lies already."""
     if target.exists() or target.is_symlink():
         raise FileExistsError(f"{target} exists and is never overwritten; choose another name")
 
@@ -107,9 +110,6 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-_log = logging.getLogger(__name__)
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
@@ -123,20 +123,16 @@ def read_records(path: Path) -> list[dict[str, Any]]:
     *lines, _ = path.read_text(encoding="utf-8", errors="replace").split("\n")
     records = []
     for number, line in enumerate(lines, start=1):
-        record = _parsed(line)
-        if record is None:
-            _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
-        else:
+        try:
+            record = json.loads(line)
+            sound = isinstance(record["step"], int)
+        except (ValueError, TypeError, KeyError):
+            sound = False
+        if sound:
             records.append(record)
+        else:
+            _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
     return records
-
-
-def _parsed(line: str) -> dict[str, Any] | None:
-    try:
-        record = json.loads(line)
-    except ValueError:
-        return None
-    return record if isinstance(record, dict) and isinstance(record.get("step"), int) else None
 
 
 @contextmanager

@@ -34,13 +34,30 @@ def write_ply(gaussians: Gaussians, path: str | Path) -> None:
     zero. The file appears whole or not at all. Raises ValueError for several scenes or for numbers
     that are not finite.
     """
-    table = _table(_single_scene(gaussians))
+    batch = gaussians.means.shape[:-2]
+    if batch not in ((), (1,)):
+        raise ValueError(
+            f"a PLY file holds one scene, got Gaussians of batch shape {tuple(batch)}; "
+            "write them one by one, as gaussians[i]"
+        )
+    scene = gaussians[0] if batch else gaussians
+    parts = [
+        scene.means,
+        torch.zeros_like(scene.means),
+        (scene.colors - 0.5) / SH_C0,
+        scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
+        scene.scales.clamp_min(SCALE_MIN).log(),
+        scene.quats,
+    ]
+    table = torch.cat([part.detach().float().cpu() for part in parts], -1)
+    broken = int((~table.isfinite()).any(-1).sum())
+    if broken:
+        raise ValueError(f"{broken} of {len(table)} Gaussians have numbers that are not finite")
     vertices = np.empty(len(table), dtype=[(name, "<f4") for name in PROPERTIES])
     for column, name in enumerate(PROPERTIES):
         vertices[name] = table[:, column]
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<")
     with replacing(path) as temporary, temporary.open("wb") as file:
-        ply.write(file)
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
 
 
 def read_ply(path: str | Path) -> Gaussians:
@@ -49,7 +66,10 @@ def read_ply(path: str | Path) -> Gaussians:
     Raises ValueError for a file without the 3DGS properties, and for view-dependent colour
     (f_rest not zero), which `Gaussians` cannot hold.
     """
-    vertices = _read_vertices(Path(path))
+    try:
+        vertices = PlyData.read(BytesIO(Path(path).read_bytes()))["vertex"].data
+    except (PlyParseError, KeyError) as error:
+        raise ValueError(f"{path} is not a readable PLY file of vertices: {error}") from error
     names = vertices.dtype.names or ()
     missing = [name for name in PROPERTIES if name not in names and name not in ("nx", "ny", "nz")]
     if missing:
@@ -71,39 +91,3 @@ def read_ply(path: str | Path) -> Gaussians:
         opacities=columns("opacity")[:, 0].sigmoid(),
         colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * SH_C0 + 0.5,
     )[None]
-
-
-def _single_scene(gaussians: Gaussians) -> Gaussians:
-    batch = gaussians.means.shape[:-2]
-    if batch == ():
-        return gaussians
-    if batch != (1,):
-        raise ValueError(
-            f"a PLY file holds one scene, got Gaussians of batch shape {tuple(batch)}; "
-            "write them one by one, as gaussians[i]"
-        )
-    return gaussians[0]
-
-
-def _table(gaussians: Gaussians) -> np.ndarray:
-    """(G, 17) in the order of PROPERTIES."""
-    parts = [
-        gaussians.means,
-        torch.zeros_like(gaussians.means),
-        (gaussians.colors - 0.5) / SH_C0,
-        gaussians.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
-        gaussians.scales.clamp_min(SCALE_MIN).log(),
-        gaussians.quats,
-    ]
-    table = torch.cat([part.detach().float().cpu() for part in parts], -1)
-    broken = int((~table.isfinite()).any(-1).sum())
-    if broken:
-        raise ValueError(f"{broken} of {len(table)} Gaussians have numbers that are not finite")
-    return table.numpy()
-
-
-def _read_vertices(path: Path) -> np.ndarray:
-    try:
-        return PlyData.read(BytesIO(path.read_bytes()))["vertex"].data
-    except (PlyParseError, KeyError) as error:
-        raise ValueError(f"{path} is not a readable PLY file of vertices: {error}") from error

@@ -30,6 +30,7 @@ class Names:
     unnamed: ours that the codebase has no name for. unused: what a published file may hold besides.
     """
 
+    layout: WeightLayout
     shapes: Shapes
     published: Mapping[str, str]
     unnamed: tuple[str, ...]
@@ -38,11 +39,24 @@ class Names:
     def mismatches(self, shapes: Shapes) -> list[str]:
         """What stands against taking a published state dict of these `shapes`, line by line."""
         found = [f"no published name: {name}" for name in self.unnamed]
-        named = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
-        return found + differing_tensors(shapes, named, set(self.unused))
+        return found + differing_tensors(shapes, self.published_shapes(), set(self.unused))
+
+    def published_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Published names of our parameters to their shapes."""
+        return {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
 
     def from_published(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A published state dict without mismatches under our names, `unused` left out."""
+        """A published state dict under our names, `unused` left out.
+
+        Raises PublishedError that lists every name that is missing or unexpected, and every shape
+        that is another one.
+        """
+        found = self.mismatches(shapes_of(weights))
+        if found:
+            raise PublishedError(
+                f"the weights do not fit the recipe, {len(found)} differences:\n  "
+                + "\n  ".join(found)
+            )
         return {ours: weights[theirs] for ours, theirs in self.published.items()}
 
     def to_published(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -50,123 +64,89 @@ class Names:
         return {theirs: weights[ours] for ours, theirs in self.published.items()}
 
 
-def layouts_of(recipe: Recipe) -> list[WeightLayout]:
-    """The published layouts of the plugins that `recipe` uses, the framework's first."""
-    names = [name for name in recipe.plugin_versions if name != "qgs"]
-    plugins = load_registry(names).plugins.values()
+def names_of(recipe: Recipe) -> Names:
+    """Both names of the parameters of the model of `recipe`, by the first layout that can hold it.
+
+    Raises PublishedError that says of each layout what stands against it.
+    """
+    registry = load_registry([name for name in recipe.plugin_versions if name != "qgs"])
+    reasons = []
+    for layout in _layouts(registry.plugins.values()):
+        found = _unknown_components(recipe, layout)
+        if not found:
+            return _names_in(recipe, layout)
+        reasons += [f"\n  {layout.name}: {line}" for line in found]
+    raise PublishedError("no published layout can hold this model:" + "".join(reasons))
+
+
+def exact_names_of(recipe: Recipe) -> Names:
+    """`names_of` for a model that has exactly the parameters that the codebase builds.
+
+    Raises PublishedError that lists what the codebase lacks, and what it has besides.
+    """
+    names = names_of(recipe)
+    layout = names.layout
+    extra, theirs = list(names.unnamed), names.shapes
+    problems = []
+    if not extra:
+        try:
+            theirs = _names_in(resolve(layout.read(names.published_shapes())), layout).shapes
+        except (LayoutError, ValueError) as error:
+            problems.append(str(error))
+        else:
+            extra = [name for name in names.shapes if name not in theirs]
+    problems += [f"{name}: {layout.name} has no such parameter" for name in extra]
+    problems += [
+        f"{name}: {layout.name} has it with the shape {shape}, this model has "
+        f"{names.shapes.get(name, 'no such parameter')}"
+        for name, shape in theirs.items()
+        if names.shapes.get(name) != shape
+    ]
+    if problems:
+        raise PublishedError(
+            f"the layout of {layout.name} cannot hold this model:\n  " + "\n  ".join(problems)
+        )
+    return names
+
+
+def _layouts(plugins: Any) -> list[WeightLayout]:
     return [layout for installed in plugins for layout in installed.plugin.layouts]
 
 
-def strangers(recipe: Recipe, layout: WeightLayout) -> list[str]:
-    """Components of `recipe` that a codebase does not know, each told in one line."""
+def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
+    """Components of `recipe` that a codebase does not know, one line each."""
     found: dict[str, None] = {}
-    varied: dict[str, set[str]] = {}
+    types: dict[str, set[str]] = {}
     for path, chosen in recipe.parts.items():
         slot = path[-1]
         if path[0] != "model" or slot not in layout.components:
             continue
         known = layout.components[slot]
-        varied.setdefault(slot, set()).add(chosen.type)
+        types.setdefault(slot, set()).add(chosen.type)
         if chosen.type not in known:
-            found[f"{chosen.written_at} is {chosen.type}; {layout.name} has {_or(known)}"] = None
-    for slot, types in varied.items():
-        if len(types) > 1:
-            found[f"decoder layers differ in their {slot} ({', '.join(sorted(types))})"] = None
-    return list(found)
-
-
-def layout_of(recipe: Recipe) -> WeightLayout:
-    """The published layout that can hold the model of `recipe`.
-
-    Raises PublishedError that says of each layout what stands against it.
-    """
-    reasons = []
-    for layout in layouts_of(recipe):
-        found = strangers(recipe, layout)
-        if not found:
-            return layout
-        reasons += [f"{layout.name}: {line}" for line in found]
-    raise PublishedError(
-        "no published layout can hold this model:" + "".join(f"\n  {line}" for line in reasons)
-    )
-
-
-def names_in(recipe: Recipe, layout: WeightLayout) -> Names:
-    """The parameters of the model of `recipe`; composed on the meta device."""
-    model = recipe.build_model("meta")
-    shapes = {name: tuple(tensor.shape) for name, tensor in unique_tensors(model).items()}
-    named = {name: layout.published_name(name) for name in shapes}
-    published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
-    assert len(set(published.values())) == len(published)
-    unused = layout.unused_names(published.values())
-    unnamed = tuple(name for name, theirs in named.items() if theirs is None)
-    return Names(shapes, published, unnamed, tuple(unused))
-
-
-def from_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
-    """A published state dict under our names, what the codebase never uses left out.
-
-    Raises PublishedError that lists every name that is missing or unexpected, and every shape that
-    is another one.
-    """
-    names = names_in(recipe, layout_of(recipe))
-    found = names.mismatches(shapes_of(weights))
-    if found:
-        raise PublishedError(
-            f"the weights do not fit the recipe, {len(found)} differences:\n  " + "\n  ".join(found)
-        )
-    return names.from_published(weights)
-
-
-def to_published(weights: Mapping[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
-    """Weights under our names, as `unique_tensors` has them, under their published names.
-
-    The inverse of `from_published`. Raises PublishedError for a model that no layout can hold.
-    """
-    return names_in(recipe, exact_layout_of(recipe)).to_published(weights)
-
-
-def exact_layout_of(recipe: Recipe) -> WeightLayout:
-    """The layout whose codebase has exactly the parameters of the model of `recipe`.
-
-    Raises PublishedError that lists what the codebase lacks, and what it has besides.
-    """
-    layout = layout_of(recipe)
-    names = names_in(recipe, layout)
-    problems = [f"{name}: {layout.name} has no such parameter" for name in names.unnamed]
-    if not problems:
-        problems = _differences(names, layout)
-    if problems:
-        raise PublishedError(
-            f"the layout of {layout.name} cannot hold this model:\n  " + "\n  ".join(problems)
-        )
-    return layout
-
-
-def _differences(names: Names, layout: WeightLayout) -> list[str]:
-    """How the model that the codebase builds at these sizes differs from this one."""
-    shapes = {theirs: names.shapes[ours] for ours, theirs in names.published.items()}
-    try:
-        theirs = names_in(resolve(layout.read(shapes)), layout)
-    except (LayoutError, ValueError) as error:
-        return [str(error)]
-    extra = [name for name in names.shapes if name not in theirs.shapes]
-    return [f"{name}: {layout.name} has no such parameter" for name in extra] + [
-        f"{name}: {layout.name} has it with the shape {shape}, this model has "
-        + (f"{names.shapes[name]}" if name in names.shapes else "no such parameter")
-        for name, shape in theirs.shapes.items()
-        if names.shapes.get(name) != shape
+            has = f"{layout.name} has {' or '.join(known)}"
+            found[f"{chosen.written_at} is {chosen.type}; {has}"] = None
+    return list(found) + [
+        f"decoder layers differ in their {slot} ({', '.join(sorted(several))})"
+        for slot, several in types.items()
+        if len(several) > 1
     ]
 
 
-def _or(words: tuple[str, ...]) -> str:
-    return " or ".join(words)
+def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
+    model = recipe.build_model("meta")
+    shapes = shapes_of(unique_tensors(model))
+    named = {name: layout.published_name(name) for name in shapes}
+    published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
+    assert len(set(published.values())) == len(published)
+    unnamed = tuple(name for name in shapes if name not in published)
+    unused = tuple(layout.unused_names(published.values()))
+    return Names(layout, shapes, published, unnamed, unused)
 
 
 def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
     """The layout, of any installed plugin, that a state dict is of; and all that there are."""
-    registry, _ = load_sound_plugins()
-    layouts = [layout for p in registry.plugins.values() for layout in p.plugin.layouts]
+    layouts = _layouts(load_sound_plugins()[0].plugins.values())
     return next((layout for layout in layouts if layout.marks_all_in(shapes)), None), layouts
 
 
@@ -235,40 +215,29 @@ def advice(recipe: Recipe, expected: WeightLayout | None, shapes: Shapes) -> lis
     if expected is not None and expected.name != layout.name:
         lines.append(f"these are weights of {layout.name}, the recipe composes {expected.name}")
     try:
-        tree = layout.read(shapes)
-        fitting = resolve(tree)
+        fitting = resolve(layout.read(shapes))
     except (LayoutError, RecipeError) as error:
         return [*lines, f"no recipe fits the shapes: {error}"]
-    options = _differing(recipe, fitting, layout)
+    differing = differing_options(recipe.tree, fitting.tree)
+    options = [
+        f"  {path}: {wanted} ({f'the recipe has {has}' if has else 'not in it'})"
+        for path, (has, wanted) in ((p, differing.get(p, (None, None))) for p in layout.read_options)
+        if wanted is not None
+    ]
     if options:
-        lines.append("options that would fit, by names and shapes:")
-        lines += [f"  {option}" for option in options]
-        lines.append("names and shapes cannot tell:")
-        lines += [f"  {choice}" for choice in layout.undecided]
+        lines += ["options that would fit, by names and shapes:", *options]
+        lines += ["names and shapes cannot tell:", *(f"  {line}" for line in layout.undecided)]
         lines.append("`--recipe auto` writes a recipe that fits")
-    remaining = names_in(fitting, layout).mismatches(shapes)
-    if remaining:
-        lines.append(_whatever_the_recipe(remaining, layout))
-    return lines
-
-
-def _whatever_the_recipe(remaining: list[str], layout: WeightLayout) -> str:
-    number = len(remaining)
-    if all(line.startswith("unexpected: ") for line in remaining):
-        keys = "key" if number == 1 else "keys"
-        return f"whatever the recipe says, the file has {number} {keys} that {layout.name} has not"
-    return (
-        f"{number} of the differences stay whatever the recipe says: the file is no whole state "
-        f"dict of {layout.name}, or more than one"
-    )
-
-
-def _differing(recipe: Recipe, fitting: Recipe, layout: WeightLayout) -> list[str]:
-    """`path: value (the recipe has ...)` of every legible option that differs."""
-    apart = differing_options(recipe.tree, fitting.tree)
-    lines = []
-    for path in layout.legible:
-        has, wanted = apart.get(path, (None, None))
-        if wanted is not None:
-            lines.append(f"{path}: {wanted} ({f'the recipe has {has}' if has else 'not in it'})")
+    remaining = _names_in(fitting, layout).mismatches(shapes)
+    count = len(remaining)
+    if remaining and all(line.startswith("unexpected: ") for line in remaining):
+        keys = "key" if count == 1 else "keys"
+        lines.append(
+            f"whatever the recipe says, the file has {count} {keys} that {layout.name} has not"
+        )
+    elif remaining:
+        lines.append(
+            f"{count} of the differences stay whatever the recipe says: the file is no whole "
+            f"state dict of {layout.name}, or more than one"
+        )
     return lines

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
+
+from qgs.io.checkpoint import CheckpointError, opened_tensors, pickle_kind, read_tensors
 
 SAFETENSORS = (".safetensors",)
 TORCH = (".pt", ".pth", ".bin", ".ckpt")
@@ -17,12 +18,6 @@ NESTING = ("model", "state_dict", "module")
 """Keys under which training scripts store the weights beside other things."""
 DISTRIBUTED = "module."
 """What DistributedDataParallel puts before every name."""
-
-_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"
-
-
-class WeightFileError(ValueError):
-    """A file that holds no weights that can be read; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +32,15 @@ class WeightFile:
 def read_weight_file(path: str | Path) -> WeightFile:
     """The tensors in a file; pages are read when they are used.
 
-    Raises FileNotFoundError and WeightFileError.
+    Raises FileNotFoundError and CheckpointError.
     """
     path = Path(path)
-    _refuse_what_is_no_file(path)
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; give the file of weights in it")
+    if not path.is_file():
+        raise FileNotFoundError(f"no weights at {path}")
+    if not path.stat().st_size:
+        raise CheckpointError(f"{path} is empty; copy it again")
     suffix = path.suffix.lower()
     if suffix in SAFETENSORS:
         tensors, notes = _read_safetensors(path), []
@@ -48,7 +48,7 @@ def read_weight_file(path: str | Path) -> WeightFile:
         tensors, notes = _read_torch(path)
     else:
         known = ", ".join((*SAFETENSORS, *TORCH))
-        raise WeightFileError(
+        raise CheckpointError(
             f"{path} has the suffix {suffix!r}; weights are read from files named {known}"
         )
     if tensors and all(name.startswith(DISTRIBUTED) for name in tensors):
@@ -57,81 +57,56 @@ def read_weight_file(path: str | Path) -> WeightFile:
     return WeightFile(path, tensors, tuple(notes))
 
 
-def _refuse_what_is_no_file(path: Path) -> None:
-    if path.is_dir():
-        raise WeightFileError(f"{path} is a folder; give the file of weights in it")
-    if not path.is_file():
-        raise FileNotFoundError(f"no weights at {path}")
-    if not path.stat().st_size:
-        raise WeightFileError(f"{path} is empty; copy it again")
-
-
-def _start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(9)
-
-
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    start = _start(path)
-    if start.startswith((_ZIP, _PICKLE)) and start[8:] != b"{":
-        kind = "a PyTorch (zip) file" if start.startswith(_ZIP) else "a Python pickle"
-        raise WeightFileError(
+    kind = pickle_kind(path)
+    if kind:
+        raise CheckpointError(
             f"{path} is {kind}, whatever its name says; if it holds weights, name it .pt: it is "
             "then read without running code in it"
         )
-    try:
-        with safe_open(path, "pt") as file:
-            if "qgs.recipe" in (file.metadata() or {}):
-                raise WeightFileError(
-                    f"{path} is a qgs checkpoint, no published weights; qgs.load reads it, and "
-                    "`qgs export` writes published weights from it"
-                )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise WeightFileError(
-            f"{path} is not a whole safetensors file ({error}); it may be cut off: copy it again"
-        ) from error
+    with opened_tensors(path) as file:
+        if "qgs.recipe" in (file.metadata() or {}):
+            raise CheckpointError(
+                f"{path} is a qgs checkpoint, no published weights; qgs.load reads it, and "
+                "`qgs export` writes published weights from it"
+            )
+    tensors = read_tensors(path)
     if not tensors:
-        raise WeightFileError(f"{path} holds no tensors")
+        raise CheckpointError(f"{path} holds no tensors")
     return tensors
 
 
 def _read_torch(path: Path) -> tuple[dict[str, Tensor], list[str]]:
-    start = _start(path)
-    if start[8:] == b"{":
-        raise WeightFileError(f"{path} is a safetensors file; name it .safetensors")
+    kind = pickle_kind(path)
+    with path.open("rb") as file:
+        if file.read(9)[8:] == b"{":
+            raise CheckpointError(f"{path} is a safetensors file; name it .safetensors")
     try:
-        content = torch.load(
-            path, map_location="cpu", weights_only=True, mmap=start.startswith(_ZIP)
-        )
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap="zip" in kind)
     except Exception as error:  # whatever torch raises about a file that it cannot read
-        raise WeightFileError(
-            f"{path} is not a whole torch file of plain tensors ({_told(error)}); copy it again, "
-            "or save `model.state_dict()` alone"
+        reason = "it is cut off, or holds Python objects whose reading could run code"
+        if type(error).__name__ != "UnpicklingError":
+            reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+        raise CheckpointError(
+            f"{path} is not a whole torch file of plain tensors ({reason}); copy it again, or save "
+            "`model.state_dict()` alone"
         ) from error
     notes: list[str] = []
     return _state_dict(content, path, notes), notes
-
-
-def _told(error: Exception) -> str:
-    if type(error).__name__ == "UnpicklingError":
-        return "it is cut off, or holds Python objects whose reading could run code"
-    lines = str(error).strip().splitlines() or [""]
-    return f"{type(error).__name__}: {lines[0]}"
 
 
 def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]:
     """The tensors of a state dict, flat or below the keys in NESTING."""
     if not isinstance(content, Mapping) or not content:
         found = "nothing" if isinstance(content, Mapping) else type(content).__name__
-        raise WeightFileError(f"{path} holds {found}, no state dict of names and tensors")
+        raise CheckpointError(f"{path} holds {found}, no state dict of names and tensors")
     others = [str(key) for key, value in content.items() if not isinstance(value, Tensor)]
     if not others:
         return {str(name): tensor.detach() for name, tensor in content.items()}
     inner = [key for key in NESTING if isinstance(content.get(key), Mapping)]
     if len(inner) != 1:
         among = f"more than one of them ({', '.join(inner)})" if inner else "none of them"
-        raise WeightFileError(
+        raise CheckpointError(
             f"{path} holds entries that are no tensors ({', '.join(others)}); a state dict may lie "
             f"below {', '.join(NESTING)}, and {among} is a mapping here: save it alone"
         )

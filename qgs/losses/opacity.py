@@ -1,20 +1,20 @@
-"""`qgs/opacity` and `qgs/mask`: opacities and coverage, drawn to known values (TokenGS release)."""
+"""`qgs/opacity`, `qgs/mask`: Gaussians become opaque, alpha becomes the mask (TokenGS release)."""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
-import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss
 from qgs.geometry.precision import full_precision
+from qgs.losses.photometric import mean_squared_error
 from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Opacity(Loss):
-    """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release; weight 0 in its recipes)."""
+    """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release, weight 0 in its recipes)."""
 
     name: ClassVar[str] = "opacity"
     renderings = "none"
@@ -31,12 +31,12 @@ class Opacity(Loss):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
         """One term, `opacity`."""
-        surprise = _surprise(prediction.gaussians.opacities, self.config.eps)
-        return {"opacity": self.config.weight * surprise}
+        mean = _negative_log_mean(prediction.gaussians.opacities, self.config.eps)
+        return {"opacity": self.config.weight * mean}
 
 
 @full_precision
-def _surprise(opacities: Tensor, eps: float) -> Tensor:
+def _negative_log_mean(opacities: Tensor, eps: float) -> Tensor:
     return -(opacities + eps).log().mean()
 
 
@@ -61,9 +61,4 @@ class Mask(Loss):
                 "the loss qgs/mask needs views with masks and these have none; "
                 "choose data with masks, or take the loss out of the recipe"
             )
-        return {"mask": self.config.weight * _squared_error(rendering.alpha, target.masks)}
-
-
-@full_precision
-def _squared_error(alpha: Tensor, masks: Tensor) -> Tensor:
-    return F.mse_loss(alpha, masks)
+        return {"mask": self.config.weight * mean_squared_error(rendering.alpha, target.masks)}

@@ -1,4 +1,4 @@
-"""`qgs/photometric`: rendered against true images by MSE and SSIM (TokenGS, LocusGS)."""
+"""`qgs/photometric`: MSE and SSIM of rendered against true images (TokenGS, LocusGS)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ Padding = Literal["same", "valid"]
 def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
     """Mean structural similarity, 0-d, of images (..., H, W) in [0, 1] (Wang et al. 2004).
 
-    "same" pads with zeros, as the releases do; "valid" keeps to windows inside the image.
-    Raises ValueError for images smaller than the window with "valid".
+    padding: "same" pads with zeros, as the releases do; "valid" uses windows inside the image, and
+    raises ValueError for images smaller than one.
     """
     height, width = images.shape[-2:]
     if padding == "valid" and min(height, width) < WINDOW:
@@ -45,7 +45,7 @@ def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
 
 
 def _window(size: int, padding: Padding) -> Tensor:
-    """(size, outputs): column j holds the window's weights around output pixel j."""
+    """(size, outputs) matrix that blurs along one axis: column j weighs the pixels around j."""
     position = torch.arange(size, dtype=torch.float64)
     offset = position[:, None] - position
     weight = torch.exp(-(offset**2) / (2 * SIGMA**2)) * (offset.abs() <= WINDOW // 2)

@@ -1,4 +1,4 @@
-"""`qgs/visibility`: points that no supervised view sees are drawn towards one (TokenGS)."""
+"""`qgs/visibility`: moves points that no target view sees towards the nearest one (TokenGS)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class VisibilityOptions(ComponentConfig):
         return self.near if self.behind_camera == "invisible" else None
 
     def conflicts(self) -> Iterator[Problem]:
-        """Options that do not go together, or that nothing reads."""
+        """Options that contradict each other or have no effect."""
         if self.behind_camera == "published":
             yield from without_effect(self, ("near",), "`behind_camera` is published")
         elif self.clamp is None:
@@ -71,7 +71,7 @@ class Visibility(Loss):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options must go together, and each must matter."""
+        """Options that contradict each other or have no effect."""
         yield from config.conflicts()
         if config.clamp is not None:
             yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
@@ -90,6 +90,7 @@ class Visibility(Loss):
         return {"visibility": self.config.weight * per_point.mean()}
 
 
+@full_precision
 def view_visibility(
     points: Tensor,
     cameras: Cameras,
@@ -99,17 +100,17 @@ def view_visibility(
     z_guard: float | None = None,
     infinite_pixel: float = INFINITE_PIXEL,
 ) -> Tensor:
-    """How far each point is from the nearest view that would see it, 0 if one does (B, P).
+    """Distance (B, P) of each point to the nearest view's image, 0 if a view sees it.
 
-    points: (B, P, 3) world. cameras: (B, V). Per view, with u and v scaled to [-1, 1] over the
-    image: relu(|u| - 1) + relu(|v| - 1); then the minimum over views, at most `clamp` (TokenGS,
-    LocusGS releases). behind: z at or below which a point is infinitely far from a view's image;
-    None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard (LocusGS anchors);
-    None leaves z alone, where x / 0 is at `infinite_pixel` and 0 / 0 visible (TokenGS).
+    Per view, with u and v scaled to [-1, 1] over the image: relu(|u| - 1) + relu(|v| - 1); then the
+    minimum over views, at most `clamp` (TokenGS, LocusGS releases).
 
-    Gradients go to the nearest view alone (of several, the first), so that memory does not grow
-    with the views. Values and gradients are finite everywhere, as long as `clamp` is set whenever
-    `behind` is.
+    points: (B, P, 3) world. cameras: (B, V). behind: z at or below which a point is infinitely far
+    from a view's image; None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard
+    (LocusGS anchors); None leaves z, where x / 0 is `infinite_pixel` and 0 / 0 visible (TokenGS).
+
+    The gradient goes to the nearest view alone (the first of several), so that memory does not grow
+    with the views. Values and gradients are finite if `clamp` is set whenever `behind` is.
     """
     options = (behind, z_guard, infinite_pixel)
     with torch.no_grad():
@@ -130,34 +131,20 @@ def _image_excess(
 ) -> Tensor:
     """relu(|u| - 1) + relu(|v| - 1) of world points (B, P, 3) -> (B, P).
 
-    cameras: (B, P), one for each point, or (B, 1).
+    cameras: (B, P), one for each point, or (B, 1); both give the same bits.
     """
-    camera_points = _into_camera(points, cameras.c2w)
-    pixels = _guarded_pixels(camera_points, cameras.intrinsics, z_guard, infinite_pixel)
+    from_camera = points - cameras.c2w[..., :3, 3]
+    camera_points = (from_camera[..., None] * cameras.c2w[..., :3, :3]).sum(-2)
+    xy, z = camera_points[..., :2], camera_points[..., 2:]
+    if z_guard is not None:
+        z = torch.where(z.abs() < z_guard, z_guard, z)
+    at_zero = z.abs() < _TINY_Z
+    focal, principal = cameras.intrinsics[..., :2], cameras.intrinsics[..., 2:]
+    pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
+    pixels = torch.where(at_zero, torch.where(xy == 0, 0.0, infinite_pixel * xy.sign()), pixels)
     height, width = cameras.size
     normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1
     excess = (normalised.abs() - 1).relu().sum(-1)
     if behind is None:
         return excess
     return torch.where(camera_points[..., 2] <= behind, torch.inf, excess)
-
-
-@full_precision
-def _into_camera(points: Tensor, c2w: Tensor) -> Tensor:
-    """Camera-frame points (B, P, 3), to the bit alike for c2w (B, 1, 4, 4) and (B, P, 4, 4)."""
-    from_camera = points - c2w[..., :3, 3]
-    return (from_camera[..., None] * c2w[..., :3, :3]).sum(-2)
-
-
-@full_precision
-def _guarded_pixels(
-    camera_points: Tensor, intrinsics: Tensor, z_guard: float | None, infinite_pixel: float
-) -> Tensor:
-    """Pixels (B, P, 2) of camera-frame points (B, P, 3), finite at z = 0."""
-    xy, z = camera_points[..., :2], camera_points[..., 2:]
-    if z_guard is not None:
-        z = torch.where(z.abs() < z_guard, z_guard, z)
-    at_zero = z.abs() < _TINY_Z
-    pixels = intrinsics[..., :2] * xy / torch.where(at_zero, 1.0, z) + intrinsics[..., 2:]
-    limit = torch.where(xy == 0, 0.0, infinite_pixel * xy.sign())
-    return torch.where(at_zero, limit, pixels)

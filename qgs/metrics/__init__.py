@@ -1,17 +1,23 @@
 """How good a reconstruction is, and what needs no model to reach."""
 
 from qgs.metrics.baselines import mean_colour, nearest_input
-from qgs.metrics.dispersion import OPACITY_USED, Spread, gaussians_used, spread, token_dispersion
-from qgs.metrics.images import psnr, ssim
+from qgs.metrics.dispersion import OPACITY_USED, Dispersion, gaussians_used, token_dispersion
+from qgs.metrics.images import Psnr, Ssim, psnr, ssim
+from qgs.metrics.lpips import Lpips
+
+COMPONENTS = (Psnr, Ssim, Lpips, Dispersion)
 
 __all__ = [
+    "COMPONENTS",
     "OPACITY_USED",
-    "Spread",
+    "Dispersion",
+    "Lpips",
+    "Psnr",
+    "Ssim",
     "gaussians_used",
     "mean_colour",
     "nearest_input",
     "psnr",
-    "spread",
     "ssim",
     "token_dispersion",
 ]

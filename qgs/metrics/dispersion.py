@@ -1,21 +1,47 @@
-"""How far the Gaussians of one token scatter (LocusGS)."""
+"""What is measured on Gaussians alone: how far those of one token scatter, how many are used."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from qgs.contracts import Column, Metric, MetricInput
 from qgs.geometry.precision import full_precision
+
+OPACITY_USED = 1 / 255
+"""A Gaussian of lower opacity is never drawn: renderers skip alpha below 1/255."""
+
+
+class Dispersion(Metric):
+    """Mean and median over Gaussians of the distance to the centroid of their token's (LocusGS).
+
+    The published figure is the mean; the median is not ruled by a few far ones.
+    """
+
+    name: ClassVar[str] = "dispersion"
+    definition: ClassVar[str] = "distance of Gaussians to their token's centroid, world units"
+    needs = ("gaussians",)
+
+    def columns(self) -> Mapping[str, Column]:
+        """Both in world units."""
+        headings = {"mean": "dispersion mean", "median": "dispersion med."}
+        return {key: Column(h, "lower", unit="world units") for key, h in headings.items()}
+
+    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
+        """Distances (1, G), and their median (1,)."""
+        assert given.gaussians is not None
+        distances = token_dispersion(given.gaussians.means, given.gaussians_per_query)
+        return {"mean": distances, "median": torch.quantile(distances, 0.5, dim=-1)}
 
 
 @full_precision
 def token_dispersion(means: Tensor, gaussians_per_query: int) -> Tensor:
     """Distance of each Gaussian to the centroid of its token's, world units.
 
-    means: (B, N * K, 3) ordered query by query -> (B, N * K). The published figure is the mean over
-    Gaussians; the median is not ruled by a few far ones.
+    means: (B, N * K, 3) ordered query by query -> (B, N * K).
     Raises ValueError when K does not divide the number of Gaussians.
     """
     if means.shape[-2] % gaussians_per_query:
@@ -24,34 +50,6 @@ def token_dispersion(means: Tensor, gaussians_per_query: int) -> Tensor:
         )
     tokens = means.unflatten(-2, (-1, gaussians_per_query))
     return (tokens - tokens.mean(-2, keepdim=True)).norm(dim=-1).flatten(-2)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Mean, variance (over the population) and median of a figure over scenes."""
-
-    mean: float
-    variance: float
-    median: float
-
-
-def spread(values: Tensor) -> Spread:
-    """Summary of one figure per scene, values (S,). Raises ValueError for no scene at all."""
-    if not values.numel():
-        raise ValueError("there is no scene to summarise")
-    values = values.double()
-    return Spread(
-        float(values.mean()), float(values.var(correction=0)), float(values.quantile(0.5))
-    )
-
-
-def median(values: Tensor) -> Tensor:
-    """Median over the last dimension, the mean of the middle two for an even count."""
-    return torch.quantile(values, 0.5, dim=-1)
-
-
-OPACITY_USED = 1 / 255
-"""A Gaussian of lower opacity is never drawn: renderers skip alpha below 1/255."""
 
 
 def gaussians_used(opacities: Tensor) -> Tensor:

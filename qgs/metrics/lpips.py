@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from qgs.contracts import Column, ComponentConfig, Metric, MetricInput
 from qgs.geometry.precision import full_precision
 
 VGG_FILE = "vgg16-397923af.pth"
@@ -29,46 +31,51 @@ _EPS = 1e-10
 _SMALLEST = 2 ** (len(_BLOCKS) - 1)
 
 
-class LpipsUnavailableError(RuntimeError):
-    """LPIPS cannot be computed here; the message says what is missing and how to get it."""
+class Lpips(Metric):
+    """Distance of each view to the truth in the features of VGG-16, weighted as people judge.
 
-
-class Lpips(nn.Module):
-    """Distance of two images in the features of VGG-16, weighted as people judge.
-
-    vgg: `features.N.weight` and `.bias` of torchvision's VGG-16. linear: `linN.model.1.weight`
-    (1, C, 1, 1) of the `lpips` package. Raises KeyError for a missing one.
+    Nothing is downloaded: `unavailable` says which package or file is missing, and how to get it.
     """
 
-    def __init__(self, vgg: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
-        super().__init__()
-        self.blocks = nn.ModuleList(
-            nn.Sequential(*(_convolution(vgg, number) for number in block)) for block in _BLOCKS
-        )
-        weights = [linear[f"lin{index}.model.1.weight"].float() for index in range(len(_BLOCKS))]
-        self.linear = nn.ParameterList(weights).requires_grad_(False)
-        self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
-        self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
+    name: ClassVar[str] = "lpips"
+    definition: ClassVar[str] = "VGG-16, version 0.1, images in [-1, 1]"
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"weights"})
+    column: ClassVar[Column] = Column("LPIPS", "lower")
+
+    class Config(ComponentConfig):
+        """Options of LPIPS."""
+
+        weights: str | None = None
+        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
+        the one in torch's cache."""
 
     shift: Tensor
     scale: Tensor
 
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
+        self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
+        self.unavailable = self._load(config.weights)
+        self.requires_grad_(False)
+
+    def forward(self, given: MetricInput) -> Tensor:
+        """(1, T). Raises ValueError when a side is shorter than 16 pixels."""
+        return self.distance(given.images, given.targets.images)
+
     @full_precision
     @torch.no_grad()
-    def forward(self, images: Tensor, truth: Tensor) -> Tensor:
-        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones.
-
-        Raises ValueError when a side is shorter than 16 pixels.
-        """
+    def distance(self, images: Tensor, truth: Tensor) -> Tensor:
+        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones."""
         if min(images.shape[-2:]) < _SMALLEST:
             raise ValueError(
                 f"LPIPS needs images of at least {_SMALLEST} pixels a side, got "
                 f"{images.shape[-2]}x{images.shape[-1]}"
             )
         pairs = zip(images.flatten(0, -4), truth.flatten(0, -4), strict=True)
-        return torch.stack([self._distance(*pair) for pair in pairs]).reshape(images.shape[:-3])
+        return torch.stack([self._pair(*pair) for pair in pairs]).reshape(images.shape[:-3])
 
-    def _distance(self, image: Tensor, truth: Tensor) -> Tensor:
+    def _pair(self, image: Tensor, truth: Tensor) -> Tensor:
         x = torch.stack([image, truth]).clamp(0, 1) * 2 - 1
         x = (x - self.shift) / self.scale
         total = x.new_zeros(())
@@ -79,41 +86,43 @@ class Lpips(nn.Module):
             total = total + F.conv2d(apart, weight).mean()
         return total
 
+    def _load(self, weights: str | None) -> str:
+        """Read the weights; why they cannot be read, "" if they were."""
+        package = find_spec("lpips")
+        if package is None or not package.submodule_search_locations:
+            return (
+                "the package lpips, which holds its weights, is not installed: "
+                'pip install "query-gaussians[lpips]"'
+            )
+        linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
+        vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE
+        if not vgg.is_file():
+            place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
+            return (
+                f"there are no VGG-16 weights {place}: download torchvision's {VGG_FILE} and name "
+                "it in the option `weights` of qgs/lpips"
+            )
+        try:
+            tensors, factors = _read(vgg), _read(linear)
+            self.blocks = nn.ModuleList(
+                nn.Sequential(*(layer for number in block for layer in _layers(tensors, number)))
+                for block in _BLOCKS
+            )
+            names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
+            self.linear = nn.ParameterList([factors[name].float() for name in names])
+        except (KeyError, RuntimeError, ValueError, OSError) as error:
+            return (
+                f"{vgg.name} or {linear.name} does not hold the weights of VGG-16 and LPIPS 0.1 "
+                f"({type(error).__name__}: {error})"
+            )
+        return ""
 
-def load_lpips(weights: str | None = None) -> Lpips:
-    """LPIPS-VGG as published; nothing is downloaded.
 
-    weights: file of VGG-16's weights (.safetensors, or torchvision's .pth), None for torch's cache.
-    Raises LpipsUnavailableError when the package or the weights are missing or unfit.
-    """
-    package = find_spec("lpips")
-    if package is None or not package.submodule_search_locations:
-        raise LpipsUnavailableError(
-            "the package lpips, which holds its weights, is not installed: "
-            'pip install "query-gaussians[lpips]"'
-        )
-    linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
-    vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE
-    if not vgg.is_file():
-        place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
-        raise LpipsUnavailableError(
-            f"there are no VGG-16 weights {place}: download torchvision's {VGG_FILE} and name it "
-            "in evaluation.lpips_weights"
-        )
-    try:
-        return Lpips(_read(vgg), _read(linear)).eval()
-    except (KeyError, RuntimeError, ValueError, OSError) as error:
-        raise LpipsUnavailableError(
-            f"{vgg.name} or {linear.name} does not hold the weights of VGG-16 and LPIPS 0.1 "
-            f"({type(error).__name__}: {error})"
-        ) from error
-
-
-def _convolution(vgg: Mapping[str, Tensor], number: int) -> nn.Sequential:
+def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]:
     weight, bias = vgg[f"features.{number}.weight"], vgg[f"features.{number}.bias"]
     convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
     convolution.load_state_dict({"weight": weight, "bias": bias})
-    return nn.Sequential(convolution.requires_grad_(False), nn.ReLU(inplace=True))
+    return convolution, nn.ReLU(inplace=True)
 
 
 def _read(path: Path) -> Mapping[str, Tensor]:

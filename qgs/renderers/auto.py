@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 
 from torch import Tensor
 
@@ -13,19 +14,27 @@ from qgs.types import Cameras, Gaussians, Rendering
 
 
 class AutoRenderer(Renderer):
-    """Chooses by where the Gaussians are, each time, and never by what can be imported."""
+    """Chooses at every call by the device of the Gaussians, never by what is installed."""
 
     name = "auto"
     camera_gradients = GsplatRenderer.camera_gradients
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """What gsplat cannot do is refused on the CPU too, so that a recipe means one thing."""
+        """Options that gsplat lacks: refused on the CPU too, so that a recipe means one thing."""
         return GsplatRenderer.problems(config, context)
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
         """See `Renderer`. Raises RuntimeError when the package it needs is not installed."""
-        renderer = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
-        return renderer(self.config)(gaussians, cameras, background)
+        renderer = self._on_cuda if gaussians.means.is_cuda else self._on_cpu
+        return renderer(gaussians, cameras, background)
+
+    @cached_property
+    def _on_cuda(self) -> GsplatRenderer:
+        return GsplatRenderer(self.config)
+
+    @cached_property
+    def _on_cpu(self) -> CpuRenderer:
+        return CpuRenderer(self.config)

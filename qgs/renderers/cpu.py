@@ -1,10 +1,9 @@
-"""`qgs/cpu`: projection and tiles of 16 x 16 pixels in numba, fused in one autograd function."""
+"""`qgs/cpu`: projection and blending by tiles of 16 x 16 pixels, in numba."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
@@ -92,9 +91,9 @@ class _Splat(torch.autograd.Function):
             scene = opacities[image[0]], colors[image[0]]
             kernels.forward_unit(rows[image], *scene, stripe, blending, out[image])
 
-        with _workers() as run:
-            run(project, _scene_units(batch, count))
-            run(blend, _image_units(batch, views, size[0]))
+        _in_threads(
+            (project, _scene_units(batch, count)), (blend, _image_units(batch, views, size[0]))
+        )
         ctx.save_for_backward(*tensors, splats, sums)
         ctx.config = config
         return sums
@@ -133,9 +132,7 @@ class _Splat(torch.autograd.Function):
                 of_colors[scene], camera_parts[scene, part],
             )  # fmt: skip
 
-        with _workers() as run:
-            run(blend, stripes)
-            run(project, units)
+        _in_threads((blend, stripes), (project, units))
         cameras = _camera_gradients(of_cameras.sum(1)) if wants_cameras else (None, None)
         return *of_inputs, *cameras, None, None
 
@@ -166,44 +163,33 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
 
 def _scene_units(batch: int, count: int) -> list[tuple[int, tuple[int, int], int]]:
     """Scene, range of Gaussians, number of the range."""
-    starts = range(0, count, _CHUNK)
     return [
         (b, (start, min(start + _CHUNK, count)), part)
         for b in range(batch)
-        for part, start in enumerate(starts)
+        for part, start in enumerate(range(0, count, _CHUNK))
     ]
 
 
 def _image_units(
     batch: int, views: int, height: int
 ) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
-    """Scene and view, range of tile rows, number of the range."""
-    stripes = _stripes(batch * views, height)
+    """Scene and view, range of tile rows, number of the range (several if images are few)."""
+    rows = -(-height // _TILE)
+    parts = min(rows, -(-_MIN_UNITS // max(batch * views, 1)))
+    edges = [rows * part // parts for part in range(parts + 1)]
     return [
-        ((b, v), rows, part)
+        ((b, v), stripe, part)
         for b in range(batch)
         for v in range(views)
-        for part, rows in enumerate(stripes)
+        for part, stripe in enumerate(pairwise(edges))
     ]
 
 
-def _stripes(images: int, height: int) -> list[tuple[int, int]]:
-    """Ranges of tile rows: one per image, or several when there are few images."""
-    rows = -(-height // _TILE)
-    parts = min(rows, -(-_MIN_UNITS // max(images, 1)))
-    edges = [rows * part // parts for part in range(parts + 1)]
-    return list(pairwise(edges))
+def _in_threads(*stages: tuple[Callable[..., None], Sequence[tuple[Any, ...]]]) -> None:
+    """Stage by stage, call `unit(*item)` for every item, on as many threads as torch uses.
 
-
-@contextmanager
-def _workers() -> Iterator[Callable[[Callable[..., None], Sequence[tuple[Any, ...]]], None]]:
-    """`run(unit, work)` calls `unit(*item)` for every item, on as many threads as torch uses.
-
-    Every unit of work writes to memory of its own, so their order does not matter.
+    Every unit of work writes to its own memory, so the order within a stage does not matter.
     """
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-
-        def run(unit: Callable[..., None], work: Sequence[tuple[Any, ...]]) -> None:
-            list(pool.map(lambda item: unit(*item), work))
-
-        yield run
+        for unit, work in stages:
+            list(pool.map(lambda item, unit=unit: unit(*item), work))

@@ -1,4 +1,4 @@
-"""Numba kernels of `qgs/cpu`: splats to sums of weighted features, and the way back.
+"""Numba kernels of `qgs/cpu`: splats to sums of weighted features, and their gradients.
 
 A unit of work is a stripe of tile rows of one image. It sorts the splats that touch it by depth,
 then walks its tiles of 16 x 16 pixels, front to back. A row of a tile is 16 lanes without branches
@@ -8,19 +8,34 @@ Splats are rows of 9 float32: u, v, conic xx, xy, yy, depth, half extents in x a
 positive for what is not visible), and the power of 2 below which alpha cannot reach alpha_min.
 Sums are 5 planes: w r, w g, w b, w z, w.
 
-For each row of a tile, the buffer holds blocks of 16 lanes: transmittance, 1 until the
-pixel stops, then the sums (forward) or what `_load_gradients` puts there (backward).
+For each row of a tile, the buffer holds blocks of 16 lanes: the transmittance; 1 until the pixel
+stops, then 0; the sums (forward) or what `_load_gradients` puts there (backward).
 
-The backward pass repeats the forward one, so both take the same decisions. With v_i = dL/dw_i,
-transmittance T_i and what is still to come, S_i = sum_{j>i} w_j v_j,
-dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
+The backward pass repeats the forward one, so both skip and stop alike. With v_i = dL/dw_i,
+transmittance T_i and the rest S_i = sum_{j>i} w_j v_j, dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from typing import Any
 
-from qgs.renderers.jit import kernel
+import numpy as np
+from numba import njit
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile `function` on first use, kept on disk where there is a place that can be written."""
+    options = {
+        "nogil": True,
+        "error_model": "numpy",  # no branch on a division by zero
+        "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+    }
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # numba found no such place
+        return njit(**options)(function)
+
 
 TILE = 16
 SPLAT_FIELDS = 9

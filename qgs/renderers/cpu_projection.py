@@ -1,6 +1,6 @@
-"""Numba kernels of `qgs/cpu`: Gaussians to splats, and the way back.
+"""Numba kernels of `qgs/cpu`: Gaussians to splats, and their gradients.
 
-The formulas are those of `projection.project`, whose autograd these kernels are tested against.
+The formulas are those of `reference.project`, whose autograd these kernels are tested against.
 A unit of work is a range of one scene's Gaussians in all of its views, so that gradients add up
 over the views in a fixed order. Vectors are tuples; a matrix is the tuple of its rows.
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qgs.renderers.jit import kernel
+from qgs.renderers.cpu_kernels import kernel
 
 CAMERA_GRADIENTS = 16  # of C by rows, p, fx, fy, cx, cy
 

@@ -20,9 +20,8 @@ _FIXED = ("alpha_min", "alpha_cap", "transmittance_min")
 class GsplatRenderer(Renderer):
     """For tensors on CUDA, in float32.
 
-    Differentiable in the Gaussians and in c2w; gsplat has no gradient for intrinsics, so
-    intrinsics that require one are refused. Its kernels fix alpha_min, alpha_cap and
-    transmittance_min at the defaults.
+    gsplat has no gradient for intrinsics, so intrinsics that require one are refused. Its kernels
+    fix alpha_min, alpha_cap and transmittance_min at the defaults.
     """
 
     name = "gsplat"
@@ -44,8 +43,7 @@ class GsplatRenderer(Renderer):
     ) -> Rendering:
         """See `Renderer`.
 
-        Raises ValueError for tensors that are not on CUDA and for intrinsics that require a
-        gradient, RuntimeError when gsplat is not installed.
+        Also raises ValueError for tensors that are not on CUDA, RuntimeError without gsplat.
         """
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
@@ -118,6 +116,5 @@ def _check_supported(gaussians: Gaussians, cameras: Cameras) -> None:
 def _calibration(intrinsics: Tensor) -> Tensor:
     """Matrices (..., 3, 3) of intrinsics (..., 4)."""
     fx, fy, cx, cy = intrinsics.unbind(-1)
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    rows = [fx, zero, cx, zero, fy, cy, zero, zero, one]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    o, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack([fx, o, cx, o, fy, cy, o, o, one], -1).unflatten(-1, (3, 3))

@@ -1,4 +1,4 @@
-"""What every renderer does with its inputs first: check them and bring them to one precision."""
+"""What renderers share: checks of their inputs, one precision, the background."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Both in one dtype: float64 if the means are, float32 otherwise."""
+    """Both as float64 if the means are, as float32 otherwise."""
     dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
 

@@ -88,7 +88,7 @@ def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tens
 
 
 class TorchRenderer(Renderer):
-    """The oracle: any device, float32 or float64, memory and time G x H x W per camera.
+    """The reference for tests: any device, float32 or float64, time and memory G x H x W.
 
     Gaussians at the same depth are drawn in their given order.
     """
@@ -105,18 +105,17 @@ class TorchRenderer(Renderer):
             gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, config.background, gaussians.means)
             splats = project(gaussians, cameras, config.near, config.far, config.dilation)
-            height, width = cameras.size
             sums = [
-                _composite(splats, gaussians, (b, v), height, width, config)
+                _composite(splats, gaussians, (b, v), cameras.size, config)
                 for b in range(cameras.shape[0])
                 for v in range(cameras.shape[1])
             ]
-            sums = torch.stack(sums).reshape(*cameras.shape, 5, height, width)
+            sums = torch.stack(sums).reshape(*cameras.shape, 5, *cameras.size)
             return resolve(sums, backdrop)
 
 
 def resolve(sums: Tensor, background: Tensor) -> Rendering:
-    """Sums (B, V, 5, H, W) of w r, w g, w b, w z and w into a Rendering."""
+    """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
     hit = torch.where(alpha > 0, alpha, 1.0)
     return Rendering(
@@ -130,11 +129,11 @@ def _composite(
     splats: Splats,
     gaussians: Gaussians,
     image: tuple[int, int],
-    height: int,
-    width: int,
+    size: tuple[int, int],
     config: RendererConfig,
 ) -> Tensor:
-    """Sums (5, H, W) of one image, front to back."""
+    """Sums (5, H, W) of one image (scene, view), front to back."""
+    height, width = size
     order = splats.depths[image].argsort(stable=True)
     order = order[splats.visible[image][order]]
     means, conics, depths = (

@@ -1,8 +1,7 @@
-"""A component with options and sizes, as the checks see it."""
+"""A component with options and sizes, as the checks see it, and what a check raises."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 from pydantic_core import to_jsonable_python
 from torch import Tensor, nn
 
+from qgs.composer.errors import did_you_mean
 from qgs.composer.registry import component_fault
 from qgs.composer.yaml_text import dump
 from qgs.contracts import (
@@ -23,23 +23,29 @@ from qgs.contracts import (
     Renderer,
     component_of,
 )
-from qgs.testing.arguments import (
-    refuse_other_dims,
-    refuse_other_makers,
-    refuse_other_shapes,
-    refuse_other_size,
-)
-from qgs.testing.chance import drawn_from
-from qgs.testing.faults import CannotCheck
-from qgs.testing.wording import case_of, named
+from qgs.testing.modules import seeded
 
 SMALL = ModelDims(width=32, heads=2, depth=2)
 
 IMAGE_SIZES = ((16, 24), (24, 16), (28, 42), (32, 48), (64, 96))
-"""Sizes that are tried, in turn, until the component's `problems` accepts one."""
+"""Sizes that are tried in turn until the component's `problems` accepts one."""
 
-LIVELINESS = 0.1
-"""Noise on parameters where initial zeros would hide what a component does."""
+NOISE = 0.1
+"""Added to parameters where initial zeros would hide what a component does."""
+
+
+class ContractError(AssertionError):
+    """A component does not keep its contract; the message says what it did instead."""
+
+
+class CannotCheck(Exception):  # noqa: N818 (not an error: the reason of a skip)
+    """A check cannot be run here; the message is the reason."""
+
+
+def expect(holds: bool, seen: str) -> None:
+    """Raise ContractError with what was `seen` unless the contract `holds`."""
+    if not holds:
+        raise ContractError(seen)
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,8 @@ class Case:
         of normally distributed numbers, such as `{"my.quat": lambda x: F.normalize(x, dim=-1)}`.
     state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
         pins nothing.
-    Raises TypeError for what is no options, and for those of no component that recipes could name;
-    TypeError or ValueError for sizes, fields and shapes that are none.
+    Raises TypeError for anything but the options of a complete component, ValueError for `fields`
+    that the component neither requires nor provides.
     """
 
     config: ComponentConfig
@@ -63,18 +69,20 @@ class Case:
     state_dict: Mapping[str, tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
-        if inspect.isclass(self.config) or isinstance(self.config, Component):
-            raise TypeError(f"{named(self.config)} is no options; write {case_of(self.config)}")
+        if not isinstance(self.config, ComponentConfig):
+            raise TypeError(
+                f"{self.config!r} is not a component's options; write Case(MyComponent.Config())"
+            )
         component = component_of(self.config)
         fault = component_fault(component)
         if fault:
-            raise TypeError(f"no case can be made of {component.__qualname__}, {fault}")
-        refuse_other_dims(self.dims)
-        refuse_other_size(self.image_size)
-        refuse_other_shapes(self.state_dict)
-        if self.fields:
-            read, written = component.requires(self.config), component.provides(self.config)
-            refuse_other_makers(self.fields, {*read, *written})
+            raise TypeError(f"{component.__qualname__} cannot be checked: {fault}")
+        known = {*component.requires(self.config), *component.provides(self.config)}
+        for name in self.fields.keys() - known:
+            raise ValueError(
+                f"fields names {name!r}, which this component neither requires nor provides; "
+                f"{did_you_mean(name, known, 'fields')}"
+            )
 
     @property
     def component(self) -> type[Component]:
@@ -94,12 +102,13 @@ class Case:
     @property
     def label(self) -> str:
         """Slot and name, and the options that differ from their defaults, in YAML."""
-        changed = [
-            _in_yaml(name, getattr(self.config, name))
+        changed = {
+            name: getattr(self.config, name)
             for name, option in type(self.config).model_fields.items()
             if option.is_required() or getattr(self.config, name) != option.get_default()
-        ]
-        options = f"({', '.join(changed)})" if changed else ""
+        }
+        written = dump(to_jsonable_python(changed, fallback=repr), flow=True).strip()
+        options = f"({written[1:-1]})" if changed else ""
         return f"{self.slot}/{self.component.name}{options}"
 
     @property
@@ -111,7 +120,7 @@ class Case:
 
     @property
     def device(self) -> str:
-        """Where it runs: the CPU, if it can. Raises CannotCheck where its device is missing."""
+        """The CPU if it can run there, else its GPU; raises CannotCheck if that is missing."""
         component = self.component
         if not issubclass(component, Renderer) or "cpu" in component.devices:
             return "cpu"
@@ -124,8 +133,8 @@ class Case:
         return list(self.component.problems(self.config, RecipeContext(self.dims, size)))
 
     def build(self, seed: int = 0) -> Any:
-        """A new instance with initial parameters drawn from `seed`, as the composer draws them."""
-        with drawn_from(seed):
+        """A new instance whose initial parameters are drawn under `seed`."""
+        with seeded(seed):
             built = self.construct()
         return built.to(self.device) if isinstance(built, nn.Module) else built
 
@@ -135,21 +144,14 @@ class Case:
         return make(self.config, self.dims) if self.has_parameters else make(self.config)
 
     def lively(self, seed: int = 0) -> Any:
-        """An instance for evaluation in which no parameter is zero by initialisation."""
+        """An instance in evaluation mode in which no parameter is zero by initialisation."""
         module = self.build(seed).eval()
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():
             for parameter in module.parameters():
-                noise = torch.randn(parameter.shape, generator=generator)
-                parameter += LIVELINESS * noise.to(parameter)
+                parameter += NOISE * torch.randn(parameter.shape, generator=generator).to(parameter)
         return module
 
     def with_dims(self, **sizes: int) -> Case:
         """The same component in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes), state_dict=None)
-
-
-def _in_yaml(option: str, value: Any) -> str:
-    """`option: value`, of an option that recipes cannot express too."""
-    written = {option: to_jsonable_python(value, fallback=repr)}
-    return dump(written, flow=True).strip().removeprefix("{").removesuffix("}")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from qgs.composer.registry import (
@@ -13,53 +12,54 @@ from qgs.composer.registry import (
     file_of,
     load_plugin,
 )
-from qgs.contracts import Component, ComponentConfig, Expected, ModelDims, Plugin
+from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
 from qgs.testing.case import Case
-from qgs.testing.expected import expectation_fault
-from qgs.testing.places import raised
-from qgs.testing.registry import TIERS, Tier, checks_for, tiers_given
-from qgs.testing.running import CaseRun, Outcome
-from qgs.testing.wording import named, options_of
+from qgs.testing.registry import TIERS, Tier, checked_tiers, checks_for
+from qgs.testing.running import CaseRun, CheckResult, refuse_unexpectable, with_place
 
 DEPTHS = (2, 12)
-"""Decoder depths that are tried, in turn, until the component's `problems` accepts one."""
+"""Decoder depths that are tried in turn until the component's `problems` accepts one."""
 
 
 def cases_of(installed: InstalledPlugin) -> list[Case]:
-    """The plugin's examples, and every component with its default options.
+    """Every component of the plugin with its default options, and the plugin's examples.
 
-    Raises TypeError for what is no InstalledPlugin, PluginError for `examples` that are no options
-    of its components.
+    Raises PluginError for `examples` that are not options of its components.
     """
-    if not isinstance(installed, InstalledPlugin):
-        raise TypeError(f"{named(installed)} is no installed plugin; {_loading(installed)}")
     plugin = installed.plugin
     for example in plugin.examples:
-        fault = _example_fault(example, plugin.components)
-        if fault:
+        if not isinstance(example, ComponentConfig):
+            fault = f"{example!r} is not a component's options; list MyComponent.Config()"
             raise _unsound(installed, "examples", fault)
-    configs = [default_config(component) for component in plugin.components]
-    configs = [config for config in configs if config is not None]
-    configs += [e for e in plugin.examples if e not in configs]
-    return [_fitting(config) for config in configs]
+        if type(example).__component__ not in plugin.components:
+            raise _unsound(installed, "examples", f"{example!r} is of no component of the plugin")
+    defaults = [default_config(component) for component in plugin.components]
+    configs = [config for config in defaults if config is not None]
+    configs += [example for example in plugin.examples if example not in configs]
+    return [_case(config) for config in configs]
 
 
 def without_case(installed: InstalledPlugin) -> dict[type[Component], str]:
-    """Components that have no example and cannot be made with default options, and why not."""
+    """Components that have no example and no usable default options, and why."""
     checked = {case.component for case in cases_of(installed)}
-    return {c: _lacking(c) for c in installed.plugin.components if c not in checked}
+    return {c: _why_no_default(c) for c in installed.plugin.components if c not in checked}
 
 
 def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping[str, Expected]]:
-    """The known failures of each of the `cases`: those of its class, and of its options.
+    """The known failures of each of the `cases`: those of its class and those of its options.
 
     Raises PluginError for exemptions that no check of the cases can have.
     """
     exemptions = installed.plugin.exemptions
     for owner, exempted in exemptions.items():
-        fault = _exemption_fault(owner, exempted, cases)
-        if fault:
+        concerned = [case for case in cases if _concerns(owner, case)]
+        if not concerned:
+            fault = f"{owner!r} is neither a component of the plugin nor the options of a case"
             raise _unsound(installed, "exemptions", fault)
+        try:
+            refuse_unexpectable(exempted, concerned)
+        except (ValueError, AttributeError) as error:
+            raise _unsound(installed, "exemptions", f"those of {owner!r}: {error}") from error
     return [
         {
             name: expected
@@ -71,78 +71,42 @@ def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping
     ]
 
 
-def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[Outcome]:
-    """Every check of every case of the plugin `name`, case by case.
+def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
+    """Run every check on every case of the plugin `name`, case by case.
 
-    Raises TypeError for what is no name, PluginError for a plugin that is unusable or has unsound
-    examples or exemptions, and ValueError as `tiers_given` does.
+    Raises PluginError for a plugin that is unusable or has unsound examples or exemptions, and
+    ValueError for no tiers and for unknown ones.
     """
-    wanted = tiers_given(tiers)
-    if not isinstance(name, str):
-        raise TypeError(f"{named(name)} is no name of a plugin; write one, such as 'locus'")
-    installed = load_plugin(name)
+    wanted, installed = checked_tiers(tiers), load_plugin(name)
     cases = cases_of(installed)
     runs = map(CaseRun, cases, exemptions_of(installed, cases))
     return (run.make(check) for run in runs for check in checks_for(run.case, wanted))
 
 
-def _loading(given: Any) -> str:
-    """What to write for an InstalledPlugin, after `qgs.composer.registry`'s functions."""
-    if isinstance(given, Plugin):
-        return "write cases_of(qgs.composer.registry.not_installed(plugin))"
-    name = given if isinstance(given, str) else "locus"
-    return f"write cases_of(qgs.composer.registry.load_plugin({name!r}))"
-
-
-def _fitting(config: ComponentConfig) -> Case:
-    """A case as small as the options allow."""
+def _case(config: ComponentConfig) -> Case:
+    """A case with as few decoder layers as the options allow."""
     cases = [Case(config, ModelDims(width=32, heads=2, depth=depth)) for depth in DEPTHS]
     return next((case for case in cases if _accepts(case)), cases[0])
 
 
 def _accepts(case: Case) -> bool:
-    """Whether `problems` has none; where it raises, the checks of the case tell it."""
+    """Whether `problems` finds none; if it raises, the checks of the case report that."""
     try:
         return not case.problems(case.size)
     except (Exception, SystemExit):
         return False
 
 
-def _lacking(component: type[Component]) -> str:
-    fields = component.Config.model_fields.items()
-    required = [f"`{name}`" for name, field in fields if field.is_required()]
+def _why_no_default(component: type[Component]) -> str:
+    options = component.Config.model_fields.items()
+    required = [f"`{name}`" for name, option in options if option.is_required()]
     if required:
         return f"there is no default for {', '.join(required)}"
     try:
         component.Config()
     except (Exception, SystemExit) as error:
-        return f"its default options are refused: {raised(error, file_of(component))}"
+        return f"its default options are refused: {with_place(error, file_of(component))}"
     raise AssertionError("a component with default options has a case")
-
-
-def _example_fault(example: Any, components: Sequence[type[Component]]) -> str:
-    if not isinstance(example, ComponentConfig):
-        return f"{named(example)} is no options; list {options_of(example)}"
-    component = type(example).__component__
-    if component is None or component not in components:
-        return f"{named(example)} is of no component of the plugin"
-    return ""
-
-
-def _exemption_fault(owner: Any, exempted: Any, cases: list[Case]) -> str:
-    concerned = [case for case in cases if _concerns(owner, case)]
-    if not concerned:
-        what = named(owner)
-        if inspect.isclass(owner) and issubclass(owner, Component):
-            return f"{what} is no component of the plugin that is checked"
-        return f"{what} is neither a component of the plugin nor the options of one of its cases"
-    if not isinstance(exempted, Mapping):
-        return f"those of {named(owner)} are no mapping of checks to reasons"
-    for name, expected in exempted.items():
-        fault = expectation_fault(name, expected, concerned)
-        if fault:
-            return f"those of {named(owner)}: {fault}"
-    return ""
 
 
 def _concerns(owner: Any, case: Case) -> bool:

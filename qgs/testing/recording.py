@@ -1,9 +1,9 @@
-"""Tensors that note when their numbers are read, and fields that note when they are asked for."""
+"""Inputs that record what a component looks at: which numbers, and which fields of a state."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,29 +16,16 @@ from qgs.testing.trees import mapped
 from qgs.types import LayerPrediction, QueryState
 
 METADATA = {
-    getattr(Tensor, name).__get__
-    for name in (
-        "shape",
-        "dtype",
-        "device",
-        "ndim",
-        "requires_grad",
-        "layout",
-        "is_cuda",
-        "grad_fn",
-    )
-} | {Tensor.size, Tensor.dim, Tensor.numel, Tensor.__len__, Tensor.is_floating_point}
+    *(
+        getattr(Tensor, name).__get__
+        for name in ("shape", "dtype", "device", "ndim", "requires_grad", "layout", "grad_fn")
+    ),
+    *(Tensor.size, Tensor.dim, Tensor.numel, Tensor.__len__, Tensor.is_floating_point),
+}
 """What can be asked of a tensor without reading a number of it."""
 
-PASSING_ON = {
-    function.__code__
-    for function in (
-        QueryState.__post_init__,
-        QueryState.replace,
-        types._items,
-    )
-}
-"""Code that goes through all fields for the component, which sees none of them."""
+PASSING_ON = {f.__code__ for f in (QueryState.__post_init__, QueryState.replace, types._items)}
+"""Code of the framework that goes through all fields on behalf of a component."""
 
 
 @dataclass
@@ -55,15 +42,16 @@ class Reads:
 
 
 class RecordedTensor(Tensor):
-    """A tensor that adds `read_as` to `readers` as soon as anything is computed of it."""
+    """A tensor that adds `read_as` to `readers` as soon as anything is computed from it."""
 
     read_as: str
     readers: set[str]
 
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Note the read; results are plain tensors, but for copies elsewhere or in a dtype."""
-        read = func not in METADATA and func is not Tensor.to
+        """Note the read. Results are plain tensors, except for copies by `Tensor.to`."""
+        moved = func is Tensor.to and isinstance(args[0], RecordedTensor)
+        read = func not in METADATA and not moved
 
         def plain(value: Any) -> Any:
             if not isinstance(value, RecordedTensor):
@@ -74,81 +62,51 @@ class RecordedTensor(Tensor):
                 return value.as_subclass(Tensor)
 
         given = func(*tree_map(plain, args), **tree_map(plain, kwargs or {}))
-        moved = func is Tensor.to and isinstance(args[0], RecordedTensor)
-        return args[0].again(given) if moved else given
-
-    def again(self, moved: Tensor) -> RecordedTensor:
-        """The same numbers on another device or in another dtype, which count as this tensor's."""
-        return _noted(moved, self.read_as, self.readers)
+        return _recorded(given, args[0].read_as, args[0].readers) if moved else given
 
 
-def _noted(tensor: Tensor, name: str, readers: set[str]) -> RecordedTensor:
-    note = tensor.as_subclass(RecordedTensor)
-    note.read_as, note.readers = name, readers
-    return note
+def _recorded(tensor: Tensor, name: str, readers: set[str]) -> RecordedTensor:
+    copy = tensor.as_subclass(RecordedTensor)
+    copy.read_as, copy.readers = name, readers
+    return copy
 
 
 class RecordedFields(Mapping[str, Tensor]):
-    """Fields of a state that note who asks, and have whatever is asked for.
+    """Fields of a state that record which of them are asked for."""
 
-    absent: makes the tensor of a field that is not there.
-    """
-
-    def __init__(
-        self, held: Mapping[str, Tensor], absent: Callable[[str], Tensor], reads: Reads
-    ) -> None:
-        self._held = dict(held)
-        self._absent = absent
-        self._reads = reads
-
-    def changed(self, fields: Mapping[str, Tensor]) -> RecordedFields:
-        """With other fields besides or instead."""
-        return RecordedFields({**self._held, **fields}, self._absent, self._reads)
-
-    def to(self, *args: Any, **kwargs: Any) -> RecordedFields:
-        """With every field moved; none of them is looked at."""
-        moved = {name: tensor.to(*args, **kwargs) for name, tensor in self._held.items()}
-        return RecordedFields(
-            moved, lambda name: self._absent(name).to(*args, **kwargs), self._reads
-        )
-
-    def __getitem__(self, name: str) -> Tensor:
-        """The field, held or made up; `get` and `in` come here too."""
-        if not isinstance(name, str):
-            raise KeyError(name)
-        if sys._getframe(1).f_code not in PASSING_ON:
-            self._reads.asked.add(name)
-        return self._held[name] if name in self._held else self._absent(name)
+    def __init__(self, held: Mapping[str, Tensor], reads: Reads) -> None:
+        self.held = dict(held)
+        self.reads = reads
 
     def __or__(self, fields: Mapping[str, Tensor]) -> RecordedFields:
-        """As of the dict that a state usually holds; none of its fields is looked at."""
-        return self.changed(fields)
+        """With other fields besides or instead, as of a dict; none is looked at."""
+        return RecordedFields({**self.held, **fields}, self.reads)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """One field; `get` and `in` come here too."""
+        if not _is_passed_on():
+            self.reads.asked.add(name)
+        return self.held[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._every(sys._getframe(1).f_code))
+        self.reads.all_asked |= not _is_passed_on()
+        return iter(self.held)
 
     def __len__(self) -> int:
-        return len(self._every(sys._getframe(1).f_code))
+        self.reads.all_asked |= not _is_passed_on()
+        return len(self.held)
 
-    def keys(self) -> Any:
-        """All names."""
-        return self._every(sys._getframe(1).f_code).keys()
 
-    def values(self) -> Any:
-        """All tensors."""
-        return self._every(sys._getframe(1).f_code).values()
-
-    def items(self) -> Any:
-        """All of both."""
-        return self._every(sys._getframe(1).f_code).items()
-
-    def _every(self, asker: Any) -> dict[str, Tensor]:
-        self._reads.all_asked |= asker not in PASSING_ON
-        return self._held
+def _is_passed_on() -> bool:
+    """Whether the framework asks, rather than the component."""
+    frame: Any = sys._getframe(2)
+    while "_collections_abc" in frame.f_code.co_filename:
+        frame = frame.f_back
+    return frame.f_code in PASSING_ON
 
 
 class RecordedState(QueryState):
-    """A state whose copies note who asks for their fields, as it does itself."""
+    """A state whose copies record what is asked of their fields, as it does itself."""
 
     fields: RecordedFields  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -156,31 +114,28 @@ class RecordedState(QueryState):
         self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
     ) -> QueryState:
         """As of any state."""
-        kept = self.features if features is None else features
-        return RecordedState(kept, self.fields.changed(fields or {}))
+        return RecordedState(
+            self.features if features is None else features, self.fields | (fields or {})
+        )
 
     def to(self, *args: Any, **kwargs: Any) -> RecordedState:
         """As of any state."""
-        return RecordedState(self.features.to(*args, **kwargs), self.fields.to(*args, **kwargs))
+        moved = {name: x.to(*args, **kwargs) for name, x in self.fields.held.items()}
+        return RecordedState(self.features.to(*args, **kwargs), self.fields | moved)
 
 
-def recorded(inputs: dict[str, Any], absent: Callable[[str], Tensor]) -> tuple[Any, Reads]:
-    """A copy of the inputs of a component, and what was looked at in it so far.
-
-    absent: makes a field that a component asks for and that `inputs` lack.
-    """
+def recorded(inputs: dict[str, Any]) -> tuple[dict[str, Any], Reads]:
+    """A copy of the inputs of a component, and the record of what is looked at in it."""
     reads = Reads()
 
-    def wrap(name: str, tensor: Tensor) -> Tensor:
-        return _noted(tensor.detach().clone(), name, reads.numbers)
-
-    def watched(value: Any) -> Any:
+    def with_record(value: Any) -> Any:
         if isinstance(value, QueryState):
-            return RecordedState(value.features, RecordedFields(value.fields, absent, reads))
+            return RecordedState(value.features, RecordedFields(value.fields, reads))
         if isinstance(value, LayerPrediction):
-            return replace(value, state=watched(value.state))
+            return replace(value, state=with_record(value.state))
         return value
 
-    copy = {name: watched(value) for name, value in mapped(inputs, wrap).items()}
+    copy = mapped(inputs, lambda name, x: _recorded(x.detach().clone(), name, reads.numbers))
+    copy = {name: with_record(value) for name, value in copy.items()}
     reads.numbers.clear()
     return copy, reads

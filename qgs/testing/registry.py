@@ -1,38 +1,38 @@
-"""All checks, by name, and the slots that each applies to."""
+"""All checks by name, and the slots that each applies to."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from inspect import cleandoc
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
-from qgs.composer.errors import did_you_mean
 from qgs.composer.slots import SLOTS
+from qgs.contracts import ModelComponent
 from qgs.testing.case import Case
-from qgs.testing.wording import case_of, named
+from qgs.testing.inputs import ARGUMENTS
 
 Tier: TypeAlias = Literal["core", "extended"]
-"""core: what every component needs to work at all; extended: what takes seconds for each case."""
+"""core: what every component needs to work at all; extended: takes seconds for each case."""
 TIERS: tuple[Tier, ...] = get_args(Tier)
 
 BASICS = ("builds", "runs")
-"""Checks that nobody may be exempt from: without them the others mean nothing."""
+"""Checks that cannot be expected to fail: without them the others say nothing."""
 
-LIKELY_CAUSES = ("forward_keeps_no_state", "eval_repeats_bitwise")
-"""Checks without which many others cannot but fail: these compare one forward pass with another."""
+FIRST = (*BASICS, "forward_keeps_no_state", "eval_repeats_bitwise")
+"""Checks that come first: when they fail, others do too, which compare two forward passes."""
 
 ALL_SLOTS = frozenset(SLOTS)
-MODULES = ALL_SLOTS - {"supervision", "data"}
-"""Slots whose components have a forward pass."""
-PARAMETRIC = MODULES - {"renderer", "losses"}
+MODULES = ALL_SLOTS & frozenset(ARGUMENTS)
+"""Slots whose components are modules with a forward pass that the suite knows inputs for."""
+PARAMETRIC = frozenset(n for n in MODULES if issubclass(SLOTS[n].contract, ModelComponent))
 """Slots whose components are built with the sizes of the model."""
 STATEFUL = frozenset(
     {"cross_attention", "self_attention", "refinement", "head", "centers", "losses"}
 )
 """Slots whose components read the state of the queries."""
 PER_QUERY = STATEFUL - {"losses"} | {"feed_forward"}
-"""Slots whose components give something for every query they are given."""
+"""Slots whose components give something for every query."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +46,16 @@ class Check:
     contract: str
 
 
-class _Checks(dict[str, Check]):
-    def __missing__(self, name: Any) -> Check:
-        raise KeyError(f"there is no check `{name}`; {did_you_mean(str(name), self, 'checks')}")
-
-
-CHECKS: dict[str, Check] = _Checks()
+CHECKS: dict[str, Check] = {}
 
 
 def check(
     slots: Collection[str], tier: Tier = "core"
 ) -> Callable[[Callable[[Case], None]], Callable[[Case], None]]:
-    """Register `check_NAME(case)` as the check NAME of components of `slots`."""
+    """Register `check_NAME(case)` as the check NAME of components of `slots`.
+
+    The first paragraph of its docstring is the contract.
+    """
 
     def register(function: Callable[[Case], None]) -> Callable[[Case], None]:
         name = function.__name__.removeprefix("check_")
@@ -69,41 +67,18 @@ def check(
 
 
 def checks_for(case: Case, tiers: Iterable[Tier] = TIERS) -> list[Check]:
-    """The checks that apply to the slot of `case`.
+    """The checks that apply to the slot of `case`, causes before what they cause.
 
-    Raises TypeError for what is no case, ValueError as `tiers_given` does.
+    Raises ValueError for no tiers and for unknown ones.
     """
-    case_given(case)
-    wanted = tiers_given(tiers)
+    wanted = checked_tiers(tiers)
     found = [c for c in CHECKS.values() if case.slot in c.slots and c.tier in wanted]
-    return sorted(found, key=_rank)
+    return sorted(found, key=lambda c: FIRST.index(c.name) if c.name in FIRST else len(FIRST))
 
 
-def _rank(check: Check) -> int:
-    """Causes come before what they cause."""
-    first = (*BASICS, *LIKELY_CAUSES)
-    return first.index(check.name) if check.name in first else len(first)
-
-
-def case_given(given: Any) -> None:
-    """Raise TypeError for what is no case."""
-    if not isinstance(given, Case):
-        raise TypeError(f"{named(given)} is no case; give {case_of(given)}")
-
-
-def tiers_given(given: Iterable[Tier]) -> tuple[Tier, ...]:
-    """At least one tier; raises ValueError for anything else."""
-    if isinstance(given, str):
-        tier = given if given in TIERS else TIERS[0]
-        raise ValueError(f'tiers is the text "{given}" and no list; write tiers=["{tier}"]')
-    if not isinstance(given, Iterable):
-        raise ValueError(f'tiers is {given!r} and no list; leave them out, or tiers=["core"]')
+def checked_tiers(given: Iterable[Tier]) -> tuple[Tier, ...]:
+    """`given` as a tuple; raises ValueError if it is empty, a text, or names unknown tiers."""
     tiers = tuple(given)
-    if not tiers:
-        raise ValueError('with no tiers nothing is checked; leave them out, or tiers=["core"]')
-    for tier in tiers:
-        if tier not in TIERS:
-            raise ValueError(
-                f"there is no tier `{tier}`; {did_you_mean(str(tier), TIERS, 'tiers')}"
-            )
+    if not tiers or not set(tiers) <= set(TIERS):
+        raise ValueError(f"tiers is {given!r}; give a list of some of {', '.join(TIERS)}")
     return tiers

@@ -1,31 +1,45 @@
-"""Making checks of one case, and telling how they went."""
+"""Run the checks of a case and report how they went, alone or as pytest tests."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import traceback
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from qgs.composer.registry import file_of
-from qgs.contracts import Expected, ExpectedError
+import torch
+
+from qgs.composer.errors import did_you_mean
+from qgs.composer.registry import file_of, lies_in, package_of, place_in
+from qgs.contracts import CONTRACT_VERSION, ComponentConfig, Expected, ExpectedError
 from qgs.contracts.component import MissingExtraError
-from qgs.testing.case import Case
-from qgs.testing.expected import expectation_fault, is_expected, reason_of
-from qgs.testing.faults import CannotCheck, ContractError
-from qgs.testing.places import raised
-from qgs.testing.registry import BASICS, CHECKS, LIKELY_CAUSES, Check, case_given
-from qgs.testing.wording import named
+from qgs.testing.case import CannotCheck, Case, ContractError
+from qgs.testing.registry import (
+    BASICS,
+    CHECKS,
+    TIERS,
+    Check,
+    Tier,
+    checked_tiers,
+    checks_for,
+)
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
 
+ExpectedFailures: TypeAlias = Mapping[str, Expected] | Callable[[Case], Mapping[str, Expected]]
+"""Check -> why it fails, for all cases, or as a function of the case."""
+
+NOT_THE_AUTHORS = (Path(__file__).parent, Path(torch.__file__).parent)
+"""Code that an error passes through but that a component's author cannot mend."""
+
 
 @dataclass(frozen=True)
-class Outcome:
+class CheckResult:
     """How a check of a case went.
 
-    message: why it did not simply pass. cause: the check that tells why this one could not be
-    made, "" for every outcome of its own. crashed: whether it failed with an error, and not by
-    seeing the contract broken.
+    message: why it did not simply pass. cause: name of the failed check that explains why this one
+    was skipped, else "". crashed: whether it ended with an error of the component's own code.
     """
 
     case: Case
@@ -42,98 +56,217 @@ class Outcome:
 
     @property
     def leaves_unchecked(self) -> bool:
-        """Whether the component could not be built, or not be called, in this place."""
+        """Whether the component could not be built or called here."""
         return self.verdict == "skipped" and self.check.name in BASICS and not self.cause
 
 
 class CaseRun:
-    """Checks of one case, made one after the other, in which one cause is told once.
+    """The checks of one case, run one after the other, so that one cause is reported once.
 
-    After `builds` or `runs` failed, a check that ends with an error is skipped and refers to it:
-    a component that cannot be built or called ends all of them. One that sees the contract broken
-    fails, and one that can be made passes. After one of LIKELY_CAUSES failed, the failures of
-    others name it.
+    After `builds` or `runs` failed, checks that end with an error are skipped and refer to it.
     """
 
     def __init__(self, case: Case, expected: Mapping[str, Expected] | None = None) -> None:
         self.case = case
         self.expected = expected or {}
         self.cause = ""
-        self.likely: set[str] = set()
 
-    def make(self, check: Check) -> Outcome:
-        """Make the next check."""
-        outcome = run_check(check, self.case, self.expected.get(check.name))
-        if outcome.verdict != "failed":
+    def make(self, check: Check) -> CheckResult:
+        """Run the next check."""
+        result = run_check(check, self.case, self.expected.get(check.name))
+        if result.verdict != "failed":
             self.cause = "" if check.name == self.cause else self.cause
-            self.likely.discard(check.name)
-            return outcome
-        if self.cause and outcome.crashed and check.name != self.cause:
+            return result
+        if self.cause and result.crashed and check.name != self.cause:
             why = f"ends with an error as `{self.cause}` does: see that check"
-            return replace(outcome, verdict="skipped", message=why, cause=self.cause)
+            return replace(result, verdict="skipped", message=why, cause=self.cause)
         if check.name in BASICS:
             self.cause = check.name
-        elif check.name in LIKELY_CAUSES:
-            self.likely.add(check.name)
-        elif self.likely:
-            causes = " and ".join(f"`{name}`" for name in LIKELY_CAUSES if name in self.likely)
-            told = f"{outcome.message}\n  likely cause: that of {causes}; mend this first"
-            return replace(outcome, message=told)
-        return outcome
+        return result
 
 
-def run_check(check: Check, case: Case, expected: Expected | None = None) -> Outcome:
-    """Make `check` of `case`. expected: why it is known to fail; then a pass is a fault.
+def run_check(check: Check, case: Case, expected: Expected | None = None) -> CheckResult:
+    """Run `check` on `case`. expected: why it is known to fail; then passing is a fault.
 
-    Raises TypeError for what is no check or no case, ValueError for a check of other slots and for
-    what no check can be expected to fail with.
+    Raises ValueError for a check of other slots, and for an expected failure that cannot be.
     """
-    _refuse_others(check, case, expected)
+    if case.slot not in check.slots:
+        raise ValueError(f"the check `{check.name}` is not for {case.label}; see checks_for(case)")
+    if expected is not None:
+        refuse_unexpectable({check.name: expected}, [case])
     try:
         check.function(case)
     except (CannotCheck, MissingExtraError) as error:
-        return Outcome(case, check, "skipped", str(error))
+        return CheckResult(case, check, "skipped", str(error))
     except (Exception, SystemExit) as error:
         return _failed(check, case, error, expected)
     if expected is None:
-        return Outcome(case, check, "passed")
+        return CheckResult(case, check, "passed")
     why = f"{case.label}: {check.name} passes, although it is expected to fail: "
     fix = "drop the expected failure, or restrict it to the options with which it fails"
-    return Outcome(case, check, "unexpected pass", f"{why}{reason_of(expected)}\n  fix: {fix}")
+    return CheckResult(case, check, "unexpected pass", f"{why}{_reason(expected)}\n  fix: {fix}")
 
 
-def _refuse_others(check: Any, case: Any, expected: Any) -> None:
-    if not isinstance(check, Check):
-        fix = CHECKS[check].name if isinstance(check, str) else "runs"
-        raise TypeError(f'{named(check)} is no check; give CHECKS["{fix}"], then the case')
-    case_given(case)
-    if case.slot not in check.slots:
-        slots = ", ".join(sorted(check.slots))
-        raise ValueError(
-            f"the check `{check.name}` applies to {slots}, and {case.label} is none of them; "
-            "checks_for(case) lists those that apply"
-        )
-    fault = "" if expected is None else expectation_fault(check.name, expected, [case])
-    if fault:
-        raise ValueError(fault)
+def refuse_unexpectable(expected: Mapping[str, Any], cases: Iterable[Case]) -> None:
+    """Raise ValueError for an expected failure of no check, of no case, or without a reason.
+
+    expected: name of a check -> why it fails.
+    """
+    slots = {case.slot for case in cases}
+    for name, why in expected.items():
+        if name not in CHECKS:
+            fix = did_you_mean(str(name), CHECKS, "checks")
+            raise ValueError(f"there is no check `{name}`; {fix}")
+        if not slots & set(CHECKS[name].slots):
+            others = ", ".join(sorted(CHECKS[name].slots))
+            raise ValueError(f"the check `{name}` applies to none of the cases, but to {others}")
+        if name in BASICS:
+            raise ValueError(f"`{name}` cannot fail as expected: no other check would mean a thing")
+        reason = _reason(why)
+        if not (isinstance(reason, str) and reason.strip()):
+            raise ValueError(f"the expected failure of `{name}` needs a reason, as a text")
+        if isinstance(why, ExpectedError) and not _names_errors(why.error):
+            raise ValueError(
+                f"the expected error of `{name}` is {why.error!r}; name a class that neither every "
+                "error nor a broken contract (ContractError) is"
+            )
 
 
-def _failed(check: Check, case: Case, error: BaseException, expected: Expected | None) -> Outcome:
+def _names_errors(kinds: Any) -> bool:
+    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+    return bool(kinds) and all(
+        isinstance(kind, type)
+        and issubclass(kind, Exception)
+        and not issubclass(ContractError, kind)
+        for kind in kinds
+    )
+
+
+def _reason(expected: Expected) -> str:
+    return expected.reason if isinstance(expected, ExpectedError) else expected
+
+
+def _failed(
+    check: Check, case: Case, error: BaseException, expected: Expected | None
+) -> CheckResult:
     crashed = not isinstance(error, ContractError)
-    seen = raised(error, file_of(case.component)) if crashed else error.seen
-    if expected is not None and is_expected(error, expected):
-        told = f"{reason_of(expected)} (seen: {seen})"
-        return Outcome(case, check, "expected failure", told, crashed=crashed)
-    told = f"{case.label}: {check.name}\n  seen: {seen}\n  contract: {check.contract}"
-    if expected is not None:
-        told += f"\n  expected: {_otherwise(error, expected)}"
-    return Outcome(case, check, "failed", told, crashed=crashed)
-
-
-def _otherwise(error: BaseException, expected: Expected) -> str:
-    """What was expected instead of `error`, and what to write if `error` is meant."""
+    seen = with_place(error, file_of(case.component))
+    awaited = expected.error if isinstance(expected, ExpectedError) else ContractError
+    if expected is not None and isinstance(error, awaited):
+        why = f"{_reason(expected)} (seen: {seen})"
+        return CheckResult(case, check, "expected failure", why, crashed=crashed)
+    message = f"{case.label}: {check.name}\n  seen: {seen}\n  contract: {check.contract}"
     if isinstance(expected, ExpectedError):
-        kinds = expected.error if isinstance(expected.error, tuple) else (expected.error,)
-        return f"{' or '.join(kind.__name__ for kind in kinds)}: {expected.reason}"
-    fix = f"ExpectedError({type(error).__name__}, ...) if the error is meant"
-    return f"a broken contract: {expected}\n  fix: mend the error, or write {fix}"
+        message += f"\n  expected: {expected.error!r}: {expected.reason}"
+    elif expected is not None:
+        fix = f"ExpectedError({type(error).__name__}, ...) if the error is meant"
+        message += f"\n  expected: a broken contract: {expected}\n  fix: mend the error, or {fix}"
+    return CheckResult(case, check, "failed", message, crashed=crashed)
+
+
+def with_place(error: BaseException, file: str | None) -> str:
+    """Type and message of `error`, and the place in the component's package that raised it.
+
+    file: the one that defines the component, None if there is none. An error that never passed
+    its package is placed in the first frame outside of this suite and of torch. What breaks the
+    contract has no place.
+    """
+    if isinstance(error, ContractError):
+        return str(error)
+    place = place_in(error, [package_of(file)]) if file else ""
+    if not place:
+        frames = traceback.extract_tb(error.__traceback__)
+        others = [f for f in frames if not any(lies_in(f.filename, x) for x in NOT_THE_AUTHORS)]
+        frame = (others or frames[-1:])[0]
+        place = f"{frame.filename}:{frame.lineno}"
+    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return f"{what} (raised under {place})"
+
+
+@dataclass(frozen=True)
+class BoundCheck:
+    """A check of a case, to be called inside a pytest test."""
+
+    check: Check
+    run: CaseRun
+
+    def __call__(self) -> None:
+        """Pass, or end the pytest test as failed, skipped or expected to fail."""
+        import pytest
+
+        result = self.run.make(self.check)
+        if result.verdict == "skipped":
+            pytest.skip(result.message)
+        if result.verdict == "expected failure":
+            pytest.xfail(result.message)
+        if not result.ok:
+            pytest.fail(result.message, pytrace=False)
+
+
+def parametrize_with_checks(
+    cases: Iterable[Case],
+    *,
+    expected_failures: ExpectedFailures | None = None,
+    tiers: Iterable[Tier] = TIERS,
+    contract_version: int = CONTRACT_VERSION,
+) -> Callable[[Callable[..., Any]], Any]:
+    """Parametrise a pytest test with every check that applies to each case.
+
+        @parametrize_with_checks([Case(MyAttention.Config())])
+        def test_contract(check):
+            check()
+
+    expected_failures: check -> why the cases fail it, or a function that gives that for a case.
+        A check that passes nevertheless is a failure. A reason is for a check that sees the
+        contract broken; for one that ends with an error, write `ExpectedError(ItsClass, reason)`.
+    tiers: "core", "extended". contract_version: what the components were written for.
+    Raises TypeError if `cases` is not a list of cases; ValueError for no cases, unknown tiers,
+    expected failures that no check can have, and another contract version than the installed one;
+    MissingExtraError without pytest.
+    """
+    try:
+        import pytest
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            "parametrize_with_checks needs pytest, which is not installed: run `pip install "
+            "pytest`, or run the checks with `qgs check-plugin` or qgs.testing.run_check"
+        ) from error
+    if contract_version != CONTRACT_VERSION:
+        raise ValueError(
+            f"these tests are of contract version {contract_version}, this qgs has version "
+            f"{CONTRACT_VERSION}; install the qgs they were written for, or bring them up to date"
+        )
+    chosen, wanted = _listed(cases), checked_tiers(tiers)
+    parameters = []
+    for case, expected in zip(chosen, _expected_of(expected_failures, chosen), strict=True):
+        run = CaseRun(case, expected)
+        parameters += [
+            pytest.param(BoundCheck(check, run), id=f"{case.label}-{check.name}")
+            for check in checks_for(case, wanted)
+        ]
+    return pytest.mark.parametrize("check", parameters)
+
+
+def _listed(given: Any) -> list[Case]:
+    # A Config can be iterated over too: it gives its options.
+    cases = list(given) if isinstance(given, Iterable) else given
+    if (
+        not isinstance(cases, list)
+        or isinstance(given, ComponentConfig)
+        or not all(isinstance(case, Case) for case in cases)
+    ):
+        raise TypeError(f"{given!r} is no list of cases; give [Case(MyComponent.Config())]")
+    if not cases:
+        raise ValueError("there are no cases to check; give [Case(MyComponent.Config())]")
+    return cases
+
+
+def _expected_of(given: ExpectedFailures | None, cases: list[Case]) -> list[Mapping[str, Expected]]:
+    """The known failures of each case."""
+    if callable(given):
+        found = [given(case) for case in cases]
+        for case, expected in zip(cases, found, strict=True):
+            refuse_unexpectable(expected, [case])
+        return found
+    refuse_unexpectable(given or {}, cases)
+    return [given or {}] * len(cases)

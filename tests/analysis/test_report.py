@@ -1,9 +1,9 @@
 import pytest
 
 from qgs.analysis.report import Baseline, Contender, Report, report_html
-from qgs.cli.contest import true_depth
 from qgs.composer import resolve
-from qgs.data.evaluation import evaluation_samples
+from qgs.contracts import Column
+from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
 
 PLAIN = {
@@ -36,7 +36,7 @@ def anchored() -> dict:
         },
         "centers": {"type": "locus/radius_scaled"},
     }
-    return {**PLAIN, "plugins": ["locus"], "model": model}
+    return {**PLAIN, "plugins": ["locus", "rooms"], "model": model}
 
 
 def page_of(tree: dict, name: str) -> str:
@@ -46,10 +46,7 @@ def page_of(tree: dict, name: str) -> str:
     contender = Contender(
         name=name,
         model=recipe.build_model().eval(),
-        psnr=12.34,
-        ssim=0.5,
-        dispersion_mean=0.7,
-        dispersion_median=0.6,
+        scores={"psnr": 12.34, "mine": 0.5, "none": None},
         gaussians=64,
         parameters=1000,
         seconds=1.0,
@@ -57,9 +54,14 @@ def page_of(tree: dict, name: str) -> str:
         recipe="recipe: 1",
     )
     report = Report(
+        columns={
+            "psnr": Column("PSNR", "higher", 2, "dB"),
+            "mine": Column("my metric", "lower"),
+            "none": Column("no value", "lower"),
+        },
         title="A title",
         contenders=[contender],
-        baselines=[Baseline("Mean colour", 11.11, 0.4)],
+        baselines=[Baseline("Mean colour", {"psnr": 11.11, "mine": None, "none": None})],
         samples=samples,
         depths=[true_depth(source, sample) for sample in samples],
         facts={"Budget": "none"},
@@ -80,8 +82,10 @@ def test_queries_without_a_place_have_no_anchor_section():
     assert "geometry bias</figcaption>" not in page
     assert "content logits" in page
     assert "Truth, depth" in page
-    assert "12.34" in page
-    assert "11.11" in page
+    assert '<td class="best">12.34</td>' in page
+    assert '<td class="best">0.500</td>' in page
+    assert "<th>my metric ↓<small>" in page
+    assert "<td>11.11</td>" in page
 
 
 def test_names_cannot_break_the_page():

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from qgs.cli import app
-from qgs.cli.bench_tables import short_names
+from qgs.cli.bench import short_names
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 TOKENGS, LOCUS = RECIPES / "tiny/tokengs.yaml", RECIPES / "tiny/locus.yaml"

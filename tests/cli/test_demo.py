@@ -25,7 +25,8 @@ RECIPE = {
     "plugins": ["rooms"],
     "data": {"type": "rooms/procedural", "image_size": [16, 16], "scenes": 4, "test_scenes": 3},
     "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
-    "training": {"batch_size": 2, "warmup": 5, "precision": "float32"},
+    "optimizer": {"warmup": 5},
+    "training": {"batch_size": 2, "precision": "float32"},
     "evaluation": {"scenes": 2},
 }
 

@@ -105,7 +105,7 @@ def test_two_runs_compare_scene_by_scene(runs: Path, tmp_path: Path) -> None:
     record = json.loads((tmp_path / "comparison.json").read_text())
     psnr = record["pairs"][0]["differences"][0]
     means = [summary(run / "evaluation")["model"]["psnr"] for run in (first, second)]
-    assert psnr["metric"] == "model_psnr"
+    assert psnr["metric"] == "psnr"
     assert psnr["difference"] == pytest.approx(means[0] - means[1])
     assert psnr["low"] <= psnr["difference"] <= psnr["high"]
     assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 3

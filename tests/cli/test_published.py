@@ -15,7 +15,7 @@ SMALL = (
     "model.heads=2",
     "model.queries.count=8",
     "training.steps=2",
-    "training.warmup=1",
+    "optimizer.warmup=1",
 )
 ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"
 

@@ -24,7 +24,7 @@ SMALL = (
     "evaluation.scenes=2",
     "training.seconds=null",
     "training.steps=2",
-    "training.warmup=1",
+    "optimizer.warmup=1",
 )
 
 

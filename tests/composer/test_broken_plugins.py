@@ -148,7 +148,7 @@ BROKEN_PLUGINS = {
         "from qgs.contracts import Plugin\nfrom qgs.renderers import TorchRenderer\n"
         "class Odd(TorchRenderer):\n    name = 'odd'\n    devices = ('tpu',)\n"
         "plugin = Plugin('bad', 1, (Odd,))",
-        "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda') as a tuple",
+        "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda', 'mps') as a tuple",
     ),
     "no component": (
         "from qgs.contracts import Plugin\nplugin = Plugin('bad', 1, (int,))",

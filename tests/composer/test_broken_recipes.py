@@ -218,8 +218,9 @@ BROKEN = {
         3, "model.renderer", "got near 500 and far 125", "near below 125",
     ),
     "decay of 1": (
-        "recipe: 1\ntraining: {betas: [0.9, 1.0]}\n",
-        2, "training.betas.1", "must be less than 1, got the number 1.0", "fits",
+        "recipe: 1\noptimizer: {betas: [0.9, 1.0]}\n",
+        2, "optimizer.betas.1", "must be less than 1, got the number 1.0",
+        "fits (default: [0.9, 0.95])",
     ),
     "background out of range": (
         "recipe: 1\nmodel: {renderer: {background: [0, 0, 255]}}\n",

@@ -198,8 +198,8 @@ def test_defaults_that_stay_lie_under_what_is_written_and_null_drops_one(monkeyp
 
 
 def test_overrides_are_read_like_files_and_the_last_wins():
-    recipe = resolve(SMALL, ["training.learning_rate=1e-4", "seed=3", "seed=0o10"])
-    assert recipe.tree["training"]["learning_rate"] == 1e-4
+    recipe = resolve(SMALL, ["optimizer.learning_rate=1e-4", "seed=3", "seed=0o10"])
+    assert recipe.tree["optimizer"]["learning_rate"] == 1e-4
     assert recipe.seed == 8
     assert recipe.provenance["seed"] == "--set #3"
 

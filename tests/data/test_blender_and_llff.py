@@ -11,7 +11,7 @@ from photo_formats import PhotoSet, centred, synthetic, write_blender, write_llf
 from PIL import Image
 
 from qgs.data import PhotosSource
-from qgs.data.photos.scene import PhotoScene
+from qgs.data.photos.source import PhotoScene
 
 
 def read(folder: Path, size=(30, 40), **options) -> PhotoScene:

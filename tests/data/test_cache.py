@@ -2,7 +2,7 @@ from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 
-from qgs.data.lazy import BoundedCache
+from qgs.data.scenes import BoundedCache
 
 
 def test_what_was_used_last_is_kept():

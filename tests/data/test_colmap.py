@@ -14,9 +14,10 @@ from PIL import Image
 from qgs.contracts.component import MissingExtraError
 from qgs.data import PhotosSource
 from qgs.data.paths import opened_path
-from qgs.data.photos.formats import formats_of, read_listing
-from qgs.data.photos.frames import PhotoFrame, frame_faults
-from qgs.data.photos.scene import PhotoScene
+from qgs.data.photos import formats_of, read_listing
+from qgs.data.photos.checks import frame_problems
+from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.source import PhotoScene
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -95,7 +96,7 @@ def test_other_camera_models_are_refused_and_listed(tmp_path):
         read(folder)
     listed = frames(folder)
     assert len(listed) == 2
-    assert [fault.fatal for fault in frame_faults(listed[1])] == [True]
+    assert [problem.fatal for problem in frame_problems(listed[1])] == [True]
     assert np.isfinite(listed[1].c2w).all()
 
 
@@ -140,7 +141,7 @@ def test_quaternions_of_any_length_and_no_rotation_at_all(tmp_path):
     file.write_text(f"1 {' '.join(map(str, longer))} 7 view_000.png\n\n2 0 0 0 0 1 2 3 7 b.png\n\n")
     first, second = frames(folder)[::-1]
     np.testing.assert_allclose(first.c2w, photos.c2w[0], atol=1e-9)
-    assert [fault.reason for fault in frame_faults(second)] == [
+    assert [problem.reason for problem in frame_problems(second)] == [
         "the pose has NaN or infinite numbers"
     ]
 
@@ -197,8 +198,8 @@ def test_photos_beside_the_model_are_needed(tmp_path):
 def test_a_missing_package_is_told(tmp_path, monkeypatch):
     photos = synthetic(tmp_path / "photos", 2)
     folder = write_colmap(tmp_path, photos, "text")
-    monkeypatch.setattr("qgs.data.photos.colmap_model.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"pip install qgs\[colmap\]"):
+    monkeypatch.setattr("qgs.data.photos.colmap.find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r'pip install "query-gaussians\[colmap\]"'):
         read(folder)
     assert formats_of(opened_path(folder)) == ["colmap"]
     write_nerfstudio(folder, replace(photos, intrinsics=(50.0, 50.0, 20.0, 15.0)))

@@ -3,6 +3,7 @@ import json
 import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ import torch
 from PIL import Image
 from upath import UPath
 
-from qgs.data import paths as archives
+from qgs.data import paths
 from qgs.data.dl3dv import Dl3dvSource, read_scene_list
 from qgs.data.images import CropResize
-from qgs.data.paths import ArchivePath
+from qgs.data.paths import Archive, ArchivePath
 
 LENS = {"camera_model": "OPENCV", "k1": -0.5, "k2": 0.01, "p1": 1e-3, "p2": -2e-3}
 
@@ -191,7 +192,6 @@ def test_test_scenes(tmp_path, caplog):
     source = opened(tmp_path, test_scenes=str(index))
     assert [scene.name for scene in source.scenes("train")] == ["s1", "s3"]
     assert [scene.name for scene in source.scenes("test")] == ["s2", "s0"]
-    assert source.absent == ["gone"]
     assert "1 of 3 test scenes are not there: gone" in caplog.text
     held_out = opened(tmp_path, holdout=3, max_scenes=2)
     assert [scene.held_out for scene in held_out.scenes("test")] == [(1,), (1,)]
@@ -240,13 +240,13 @@ def test_scenes_travel_to_other_processes_without_open_archives(tmp_path):
 
 def test_threads_share_a_bounded_number_of_open_archives(tmp_path, monkeypatch):
     several(tmp_path, 4)
-    pool = archives._Pool(2)
-    monkeypatch.setattr(archives, "_pool", pool)
+    opened_archives = lru_cache(2)(Archive)
+    monkeypatch.setattr(paths, "open_archive", opened_archives)
     scenes = opened(tmp_path).scenes("train")
     with ThreadPoolExecutor(4) as threads:
         red = list(threads.map(lambda k: scenes[k % 4].images([k % 3])[0, 0, 0, 0], range(24)))
     assert red == pytest.approx([10 * (k % 3) / 255 for k in range(24)])
-    assert len(pool._open) == 2
+    assert opened_archives.cache_info().currsize == 2
 
 
 def test_paths_inside_archives(tmp_path):

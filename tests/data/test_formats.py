@@ -21,8 +21,8 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data import PhotosSource, read_photos
-from qgs.data.lazy import warn_once
-from qgs.data.photos.scene import PhotoScene
+from qgs.data.photos.source import PhotoScene
+from qgs.data.scenes import warn_once
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 REAL = ("mary_rose", "office_walk", "desk")

@@ -14,9 +14,14 @@ from qgs.contracts import ViewsConfig
 from qgs.data import PhotosSource, read_photos
 from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
-from qgs.data.photos.frames import frame_faults, intrinsics_faults, pose_faults, size_faults
-from qgs.data.photos.scene import PhotoScene
-from qgs.data.photos.transforms import image_name, load_transforms, parse_transforms
+from qgs.data.photos.checks import (
+    frame_problems,
+    intrinsics_problems,
+    pose_problems,
+    size_problems,
+)
+from qgs.data.photos.nerfstudio import image_name, read_transforms
+from qgs.data.photos.source import PhotoScene
 from qgs.data.sampling import make_sample
 
 
@@ -143,8 +148,7 @@ def test_a_split_that_names_no_frame_is_told(folder):
 
 
 def parsed(folder: Path):
-    location = opened_path(folder)
-    return parse_transforms(load_transforms(location / "transforms.json"), location)
+    return read_transforms(opened_path(folder) / "transforms.json")
 
 
 def test_lenses(folder):
@@ -208,7 +212,7 @@ def test_parsing_tells_all_and_raises_nothing(folder):
     change(folder, 2, file_path=None)
     frames = parsed(folder)
     assert len(frames) == 6
-    reasons = [[fault.reason for fault in frame_faults(frame)] for frame in frames]
+    reasons = [[problem.reason for problem in frame_problems(frame)] for frame in frames]
     assert [reason.split(" ")[0] for reason in reasons[0]] == [
         "'transform_matrix'", "there", "the"
     ]  # fmt: skip
@@ -220,14 +224,14 @@ def test_parsing_tells_all_and_raises_nothing(folder):
 
 def test_judgements():
     mirrored, scaled = np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1])
-    assert "mirrors" in str(*pose_faults(mirrored))
-    assert "not rigid" in str(*pose_faults(scaled))
-    assert not list(pose_faults(np.eye(4)))
-    assert not list(intrinsics_faults((50, 50, 20, 15), (30, 40)))
-    assert "normalised" in str(*intrinsics_faults((1.2, 1.6, 0.5, 0.5), (30, 40)))
-    (off,) = intrinsics_faults((50, 50, 20, 35), (30, 40))
-    (wide,) = intrinsics_faults((2000, 2000, 20, 15), (30, 40))
+    assert "mirrors" in str(*pose_problems(mirrored))
+    assert "not rigid" in str(*pose_problems(scaled))
+    assert not list(pose_problems(np.eye(4)))
+    assert not list(intrinsics_problems((50, 50, 20, 15), (30, 40)))
+    assert "normalised" in str(*intrinsics_problems((1.2, 1.6, 0.5, 0.5), (30, 40)))
+    (off,) = intrinsics_problems((50, 50, 20, 35), (30, 40))
+    (wide,) = intrinsics_problems((2000, 2000, 20, 15), (30, 40))
     assert not off.fatal
     assert not wide.fatal
-    assert "swapped" in str(*size_faults((40, 30), (30, 40)))
-    assert not list(size_faults((15, 20), (30, 40)))
+    assert "swapped" in str(*size_problems((40, 30), (30, 40)))
+    assert not list(size_problems((15, 20), (30, 40)))

@@ -72,7 +72,7 @@ def test_missing_images_are_counted_and_named(tmp_path, caplog):
     folder(tmp_path)
     (tmp_path / "images" / "3.png").unlink()
     source = opened(tmp_path)
-    assert source.missing == [str(tmp_path / "images" / "3.png")]
+    assert source.scenes("train")[0].missing == [str(tmp_path / "images" / "3.png")]
     assert "1 of 10" in caplog.text
     assert "3.png" in caplog.text
     assert len(source.scenes("train")[0]) == 9
@@ -183,6 +183,6 @@ def test_real_photos(name, count):
     source = opened(path)
     scene = source.scenes("train")[0]
     assert len(scene) == count
-    assert source.missing == []
+    assert scene.missing == []
     assert scene.images([0]).shape == (1, 3, 24, 24)
     assert scene.cameras.intrinsics[:, 2:].sub(12).abs().max() < 2

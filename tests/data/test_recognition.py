@@ -1,7 +1,13 @@
+"""Which source opens a path: those of qgs and of plugins alike."""
+
 import pytest
+from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
 
-from qgs.data.recognition import recognised
+from qgs.composer.registry import Registry, builtin, not_installed
+from qgs.contracts import SceneSourceConfig
+from qgs.data import PhotosSource
+from qgs.data.recognition import open_for, recognised
 
 HASH = "0a" * 32
 HOLDINGS = {
@@ -19,8 +25,10 @@ HOLDINGS = {
     f"{HASH}/gaussian_splat/transforms.json": "qgs/dl3dv",
     "garden/nerfstudio/transforms.json": "qgs/dl3dv",
     "2K/garden/gaussian_splat/transforms.json": "qgs/dl3dv",
+    "garden.tape": "tapes/tape",
     "readme.txt": "qgs/photos",
 }
+SOURCES = Registry({"qgs": builtin(), "tapes": not_installed(plugin)}).components("data")
 
 
 @pytest.mark.parametrize("held", HOLDINGS)
@@ -30,11 +38,34 @@ def test_by_content(tmp_path, held, url):
     file = root / held
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(b"")
-    assert recognised(root) == HOLDINGS[held]
+    assert recognised(root, SOURCES) == HOLDINGS[held]
 
 
 def test_files_and_nothing(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"")
-    assert recognised(UPath(tmp_path / "a.zip")) == "qgs/dl3dv"
+    assert recognised(UPath(tmp_path / "a.zip"), SOURCES) == "qgs/dl3dv"
     with pytest.raises(FileNotFoundError, match="does not exist"):
-        recognised(UPath(tmp_path / "b"))
+        recognised(UPath(tmp_path / "b"), SOURCES)
+
+
+def test_a_plugin_takes_nothing_that_a_source_of_qgs_reads(tmp_path):
+    for name in ("transforms.json", "a.tape"):
+        (tmp_path / name).write_bytes(b"")
+    assert recognised(UPath(tmp_path), SOURCES) == "qgs/photos"
+
+
+def test_options_for_other_data_and_for_that_of_the_training(tmp_path):
+    write_tape(tmp_path / "a.tape")
+    black = PhotosSource.Config(path="elsewhere", background=(0.0, 0.0, 0.0), holdout=3)
+    source, known = open_for(str(tmp_path), (8, 8), black, SOURCES)
+    assert source.config == TapeSource.Config(path=str(tmp_path), image_size=(8, 8))
+    assert not known
+    trained = TapeSource.Config(path=str(tmp_path / ".." / tmp_path.name), image_size=(16, 16))
+    source, known = open_for(str(tmp_path), None, trained, SOURCES)
+    assert source.config == TapeSource.Config(path=str(tmp_path), image_size=(16, 16))
+    assert known
+    other = PhotosSource.config_for("there", (8, 8), black)
+    assert other == PhotosSource.Config(
+        path="there", image_size=(8, 8), background=(0.0, 0.0, 0.0), holdout=0
+    )
+    assert PhotosSource.config_for("there", (8, 8), SceneSourceConfig()).holdout == 0

@@ -15,7 +15,7 @@ from upath import UPath
 from qgs.contracts import Scene
 from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
 from qgs.data.images import to_tensor
-from qgs.data.photos.scene import EncodedScene
+from qgs.data.scenes import EncodedScene
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 pytestmark = pytest.mark.skipif(

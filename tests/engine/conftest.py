@@ -22,7 +22,7 @@ SMALL = (
     "evaluation.scenes=2",
     "training.steps=4",
     "training.seconds=null",
-    "training.warmup=2",
+    "optimizer.warmup=2",
 )
 
 

@@ -13,8 +13,7 @@ import torch
 from qgs.composer import resolve
 from qgs.data.sampling import Batch
 from qgs.data.stream import Share, training_batches
-from qgs.engine import train
-from qgs.engine import train as trainer
+from qgs.engine import train, training
 
 
 def spoiled(*arguments: Any, share: Share, **options: Any) -> Generator[Batch, None, None]:
@@ -34,7 +33,7 @@ def spoiled(*arguments: Any, share: Share, **options: Any) -> Generator[Batch, N
 def main(recipe: str, run: str) -> None:
     """Train, and print what this process knows of it."""
     torch.set_num_threads(1)
-    trainer.training_batches = spoiled
+    training.training_batches = spoiled
     result = train(resolve(Path(recipe)), run, device="cpu")
     total = sum(float(p.detach().double().abs().sum()) for p in result.model.parameters())
     print(f"{result.main} {result.steps} {total:.9f}")

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from qgs.composer import resolve
-from qgs.engine.bench import Spread, Workload, in_turn, peak_memory, workload_of
-from qgs.engine.bench.work import make_task, posed_photos
-from qgs.engine.bench.worker import resident_bytes
+from qgs.engine.bench.memory import peak_memory, resident_bytes
+from qgs.engine.bench.run import Spread, in_turn
+from qgs.engine.bench.work import Workload, make_task, posed_photos, workload_of
 from qgs.geometry.transforms import to_camera, to_pixels
 
 RECIPES = Path(__file__).parents[2] / "recipes"

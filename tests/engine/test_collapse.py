@@ -21,34 +21,34 @@ from qgs.engine.guard import (
     EMPTY_ALPHA,
     CollapseDetector,
     GoodWeights,
-    Vitals,
     broken_tensors,
-    measure,
     not_finite,
 )
+from qgs.engine.objective import measure
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 from qgs.io.checkpoint import load_extra
 
-ALIVE = Vitals(alpha=0.5, deviation=0.3, gradient=0.1)
+ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
+DEAD = dict.fromkeys(ALIVE, 0.0)
 QUIET = Console(quiet=True)
 
 
 @pytest.mark.parametrize(
     ("dead", "words"),
     [
-        (Vitals(1e-4, 0.3, 0.1), "empty"),
-        (Vitals(0.5, 0.3, 0.0), "vanished"),
-        (Vitals(0.5, 1e-4, 0.1), "equal the background"),
+        ({"alpha": 1e-4}, "empty"),
+        ({"gradient": 0.0}, "vanished"),
+        ({"deviation": 1e-4}, "equal the background"),
     ],
 )
-def test_a_window_of_dead_steps_is_a_collapse(dead: Vitals, words: str) -> None:
+def test_a_window_of_dead_steps_is_a_collapse(dead: dict[str, float], words: str) -> None:
     detector = CollapseDetector(10)
     detector.observe(ALIVE)
     for _ in range(9):
-        detector.observe(dead)
+        detector.observe(ALIVE | dead)
     assert not detector.collapsed
-    detector.observe(dead)
+    detector.observe(ALIVE | dead)
     assert detector.collapsed
     assert words in detector.symptom
 
@@ -57,7 +57,7 @@ def test_one_living_step_starts_the_count_again() -> None:
     detector = CollapseDetector(10)
     for _ in range(5):
         for _ in range(9):
-            detector.observe(Vitals(0.0, 0.0, 0.0))
+            detector.observe(DEAD)
         detector.observe(ALIVE)
     assert not detector.collapsed
 
@@ -65,7 +65,7 @@ def test_one_living_step_starts_the_count_again() -> None:
 def test_images_that_are_still_plain_at_the_start_are_no_collapse() -> None:
     detector = CollapseDetector(10)
     for _ in range(50):
-        detector.observe(Vitals(alpha=0.5, deviation=1e-4, gradient=0.1))
+        detector.observe(ALIVE | {"deviation": 1e-4})
     assert not detector.collapsed
 
 
@@ -82,11 +82,11 @@ def test_good_weights_are_the_older_of_two_copies() -> None:
 
 def test_what_is_not_finite_is_named() -> None:
     module = torch.nn.Linear(2, 2)
-    assert not_finite({"mse": 1.0}, module, 0.5) == ""
-    assert "mse is nan" in not_finite({"mse": float("nan")}, module, 0.5)
+    assert not_finite({"mse": 1.0, "gradient": 0.5}, module) == ""
+    assert "mse is nan" in not_finite({"mse": float("nan"), "gradient": 0.5}, module)
     module.weight.grad = torch.full((2, 2), torch.inf)
     module.bias.grad = torch.zeros(2)
-    message = not_finite({"mse": 1.0}, module, float("inf"))
+    message = not_finite({"mse": 1.0, "gradient": float("inf")}, module)
     assert message.endswith("from weight")
 
 
@@ -104,9 +104,9 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     recipe = tiny(
         "tokengs",
         "training.steps=300",
-        "training.warmup=150",
-        "training.learning_rate=0.5",
-        "training.initial_divisor=1e5",
+        "optimizer.warmup=150",
+        "optimizer.learning_rate=0.5",
+        "optimizer.initial_divisor=1e5",
         "training.save_every=25",
     )
     assert recipe.training.collapse_window == TrainingConfig().collapse_window
@@ -189,7 +189,7 @@ def test_one_dead_step_at_the_end_fails_no_run(
     class DyingAtTheEnd(TrainingProgress):
         def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
             if step == 3:
-                trainer.detector.observe(Vitals(0.0, 0.0, 0.0))
+                trainer.guard.detector.observe(DEAD)
             return False
 
     with closing(trainer):
@@ -207,5 +207,5 @@ def test_a_stray_splat_is_no_sign_of_life() -> None:
     assert deviation == pytest.approx(4 / 32**2)
     detector = CollapseDetector(10)
     detector.observe(ALIVE)
-    detector.observe(Vitals(alpha=0.5, deviation=float(deviation), gradient=0.1))
+    detector.observe(ALIVE | {"deviation": float(deviation)})
     assert "equal the background" in detector.symptom

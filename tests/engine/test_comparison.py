@@ -24,7 +24,5 @@ def test_locusgs_is_ahead_of_tokengs_and_of_the_baselines(tmp_path: Path) -> Non
     token, locus = evaluations["tokengs"], evaluations["locus"]
     assert locus.mean("psnr") > token.mean("psnr")
     assert token.mean("psnr") > token.mean("psnr", "mean_colour")
-    dispersion = [
-        e.summary()["dispersion_over_gaussians"]["median"]["mean"] for e in (token, locus)
-    ]
+    dispersion = [e.mean("dispersion_median") for e in (token, locus)]
     assert dispersion[1] < dispersion[0]

@@ -25,6 +25,8 @@ from qgs.engine.training import Trainer
 WORKER = Path(__file__).with_name("distributed.py")
 FSDP = {"ACCELERATE_USE_FSDP": "true"}
 """What `accelerate launch --use_fsdp` tells its processes."""
+PARTS = 'optimizer.parts={"decoder.0.feed_forward": 0, "head": 0.5}'
+"""One sublayer stays as it is, and the head learns slower."""
 
 
 def train_in_two_processes(recipe: Recipe, run: Path, **environment: str) -> list[list[str]]:
@@ -52,7 +54,7 @@ def losses(run: Path) -> list[float]:
 def test_two_processes_have_the_loss_curve_of_one(
     tiny: Callable[..., Recipe], tmp_path: Path, accumulate: int
 ) -> None:
-    options = ("training.save_every=2", f"training.accumulate={accumulate}")
+    options = ("training.save_every=2", f"training.accumulate={accumulate}", PARTS)
     alone = tiny("locus", "training.batch_size=2", *options)
     train(alone, tmp_path / "alone", console=Console(quiet=True), device="cpu")
     said = train_in_two_processes(
@@ -71,7 +73,7 @@ def test_two_processes_have_the_loss_curve_of_one(
 def test_shards_continue_what_one_process_began(
     tiny: Callable[..., Recipe], tmp_path: Path, accumulate: int
 ) -> None:
-    options = ("training.save_every=2", "training.ema=0.9")
+    options = ("training.save_every=2", "training.ema=0.9", PARTS)
     alone = tiny("locus", "training.batch_size=4", *options)
     train(alone, tmp_path / "alone", console=Console(quiet=True), device="cpu")
     begin(alone, tmp_path / "shards")

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import yaml
+from safetensors.torch import load_file
 
 from qgs.composer import Recipe
-from qgs.engine.nonfinite import read_batch
 
 WORKER = Path(__file__).with_name("distributed_incident.py")
 
@@ -69,8 +69,8 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(
     first = {found["process"]: found["first"] for found in report["found"]}
     assert first[0] is None
     assert first[1]["tensor"] == "targets.images"
-    assert not read_batch(incident / "batch.safetensors").targets.images.isnan().any()
-    assert read_batch(incident / "batch-1.safetensors").targets.images.isnan().sum() == 1
+    seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
+    assert [int(images.isnan().sum()) for images in seen] == [0, 1]
     judged = [json.loads(line) for line in (run / "evaluations.jsonl").read_text().splitlines()]
     assert [(record["step"], record["weights"]) for record in judged] == [
         (step, weights) for step in (2, 4) for weights in ("raw", "ema")

@@ -18,15 +18,13 @@ from PIL import Image
 from qgs_rooms.source import RoomsSource
 from rich.console import Console
 
-import qgs.engine.evaluation as engine_evaluation
 from qgs.composer import Recipe
-from qgs.contracts import Scene
+from qgs.contracts import MetricInput, Scene
 from qgs.data.evaluation import evaluation_samples
 from qgs.engine import evaluate
-from qgs.engine.comparison import Comparisons
+from qgs.engine.comparison import compare
 from qgs.engine.results import METHODS, Evaluation, read_results
-from qgs.metrics import mean_colour, nearest_input, psnr, ssim, token_dispersion
-from qgs.metrics.lpips import LpipsUnavailableError
+from qgs.metrics import Lpips, Psnr, mean_colour, nearest_input, psnr, ssim, token_dispersion
 
 FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
 
@@ -80,7 +78,7 @@ def test_scores_hold_the_metrics_of_model_and_baselines(
             expected = float(metric(image, truth).mean())
             assert score.values[f"{method}_{name}"] == pytest.approx(expected, rel=1e-6)
     dispersion = float(token_dispersion(gaussians.means, 4).mean())
-    assert score.values["dispersion_mean"] == pytest.approx(dispersion, rel=1e-6)
+    assert score.values["model_dispersion_mean"] == pytest.approx(dispersion, rel=1e-6)
     assert score.values["gaussians_used"] == int((gaussians.opacities > 1 / 255).sum())
 
     evaluation.write(tmp_path)
@@ -92,7 +90,7 @@ def test_scores_hold_the_metrics_of_model_and_baselines(
     for method in METHODS:
         mean = sum(float(r[f"{method}_psnr"]) for r in rows) / len(rows)
         assert summary[method]["psnr"] == pytest.approx(mean)
-        assert summary[method]["lpips"] is None
+        assert (summary[method]["dispersion_mean"] is None) == (method != "model")
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
@@ -260,14 +258,14 @@ def test_failed_samples_fail_their_scene(
     tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = tiny("tokengs", "evaluation.samples=3")
-    score = engine_evaluation.psnr
+    score = Psnr.forward
     calls = []
 
-    def failing(images: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    def failing(self: Psnr, given: MetricInput) -> torch.Tensor:
         calls.append(1)
-        return score(images, truth) * (math.inf if len(calls) == 2 * len(METHODS) else 1)
+        return score(self, given) * (math.inf if len(calls) == 2 * len(METHODS) else 1)
 
-    monkeypatch.setattr(engine_evaluation, "psnr", failing)
+    monkeypatch.setattr(Psnr, "forward", failing)
     evaluation = evaluate(recipe.build_model(), recipe)
     assert [failure.scene for failure in evaluation.missing] == ["test/000000"]
     assert [len(score.views) for score in evaluation.scores] == [3]
@@ -286,62 +284,53 @@ def test_an_empty_batch_is_refused(tiny: Callable[..., Recipe]) -> None:
         evaluate(recipe.build_model(), recipe, batch=0)
 
 
-def test_the_table_shows_all_three_and_why_a_column_is_empty(
-    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+def test_the_table_shows_all_methods_and_why_a_column_is_empty(
+    tiny: Callable[..., Recipe], tmp_path: Path
 ) -> None:
-    recipe = tiny("tokengs", "evaluation.metrics=[lpips]")
-
-    def unavailable(weights: str | None) -> None:
-        raise LpipsUnavailableError("there are no VGG-16 weights here")
-
-    monkeypatch.setattr(engine_evaluation, "load_lpips", unavailable)
-    text = shown(evaluate(recipe.build_model(), recipe))
-    for word in ("model", "nearest input", "mean colour", "PSNR", "SSIM", "dispersion"):
+    recipe = tiny("tokengs", f"metrics.lpips={{type: qgs/lpips, weights: {tmp_path / 'none.pth'}}}")
+    evaluation = evaluate(recipe.build_model(), recipe)
+    text = " ".join(shown(evaluation).split())
+    for word in ("model", "nearest input", "mean colour", "PSNR ↑", "SSIM ↑", "LPIPS ↓"):
         assert word in text
-    assert "LPIPS is empty: there are no VGG-16 weights here" in text
+    assert f"LPIPS is empty: {Lpips(Lpips.Config(weights='none.pth')).unavailable}" in text
+    assert evaluation.mean("lpips") is None
 
 
 def test_the_form_of_ssim_is_named_where_it_is_not_the_default(
     tiny: Callable[..., Recipe], tmp_path: Path
 ) -> None:
-    plain, sample = tiny("tokengs"), tiny("tokengs", "evaluation.ssim_covariance=sample")
+    plain, sample = tiny("tokengs"), tiny("tokengs", "metrics.ssim.covariance=sample")
     model = plain.build_model()
     evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
-    first, second = (e.mean_value("mean_colour_ssim") for e in evaluations)
+    first, second = (e.mean("ssim", "mean_colour") for e in evaluations)
     assert 0 < abs(first - second) < 1e-3
     assert "covariance" not in shown(evaluations[0])
-    assert "SSIM (sample covariance) ↑" in shown(evaluations[1])
+    assert "SSIM (sample covariance)" in shown(evaluations[1])
     for name, evaluation in zip("ab", evaluations, strict=True):
         evaluation.write(tmp_path / name)
     stored = [read_results(tmp_path / name) for name in "ab"]
-    with pytest.raises(ValueError, match="which differ in ssim_covariance:"):
-        Comparisons.of(stored)
-    text = Comparisons.of(stored, across_protocols=True).markdown()
-    assert text.count("SSIM with sample covariance") == 1
+    with pytest.raises(ValueError, match="which differ in metrics:"):
+        compare(stored)
+    text = compare(stored, across_protocols=True).markdown()
+    assert text.count(f"SSIM in {stored[0].name} is SSIM (sample covariance) in") == 1
 
 
 def test_lpips_fills_its_column_where_it_can(
     tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe = tiny("tokengs", "evaluation.metrics=[lpips]", "evaluation.lpips_weights=mine.pth")
+    recipe = tiny("tokengs", "metrics.lpips={type: qgs/lpips, weights: mine.pth}")
     asked = []
-
-    class StandIn(torch.nn.Module):
-        def forward(self, images: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-            return (images - truth).abs().mean((-3, -2, -1))
-
-    def load(weights: str | None) -> StandIn:
-        asked.append(weights)
-        return StandIn()
-
-    monkeypatch.setattr(engine_evaluation, "load_lpips", load)
+    monkeypatch.setattr(Lpips, "_load", lambda self, weights: asked.append(weights) or "")
+    monkeypatch.setattr(
+        Lpips, "distance", lambda self, images, truth: (images - truth).abs().mean((-3, -2, -1))
+    )
     evaluation = evaluate(recipe.build_model(), recipe)
     assert asked == ["mine.pth"]
     sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
     copied = nearest_input(sample.inputs, sample.targets.cameras)
     expected = float((copied - sample.targets.images).abs().mean())
     assert evaluation.scores[0].values["nearest_input_lpips"] == pytest.approx(expected, rel=1e-5)
-    assert evaluation.summary()["empty"] == {}
+    assert evaluation.summary()["incomplete"] == {}
     assert "is empty" not in shown(evaluation)
 
 

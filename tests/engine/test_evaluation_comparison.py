@@ -9,17 +9,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from qgs.engine.comparison import Comparisons, paired_interval
+from qgs.contracts import Column
+from qgs.engine.comparison import compare, paired_interval
 from qgs.engine.results import StoredResults, read_results
 
 HASHES = {"rooms": "a" * 64, "halls": "b" * 64}
+COLUMNS = {"psnr": Column("PSNR", "higher", 2), "lpips": Column("LPIPS", "lower")}
 
 
 def results(name: str, protocol: str = "rooms", **psnr: float) -> StoredResults:
     scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
     content = {"format": 1, "views": protocol}
     frames = dict.fromkeys(scenes, ("0 3", "1 2"))
-    return StoredResults(name, protocol, HASHES[protocol], content, scenes, frames, len(scenes))
+    return StoredResults(
+        name, protocol, HASHES[protocol], content, COLUMNS, scenes, frames, len(scenes)
+    )
 
 
 def test_the_interval_is_that_of_scipy() -> None:
@@ -49,14 +53,15 @@ def test_the_interval_is_the_same_each_time_and_none_for_one_scene() -> None:
 def test_scenes_pair_by_name_and_lower_is_better_for_lpips() -> None:
     first = results("first", a=10.0, b=12.0, c=11.0, only=50.0)
     second = results("second", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
-    (pair,) = Comparisons.of([first, second]).pairs
+    (pair,) = compare([first, second]).pairs
     psnr, lpips = pair.differences
     assert (psnr.first, psnr.second, psnr.scenes) == (11.0, 10.0, 3)
     assert psnr.difference == pytest.approx(1.0)
     assert (psnr.wins, psnr.losses) == (2, 0)
     assert (lpips.wins, lpips.losses) == (0, 2)
-    assert (list(pair.only_first), list(pair.only_second)) == (["only"], ["other", "another"])
-    text = Comparisons.of([first, second]).markdown()
+    record = pair.record()
+    assert (record["only_first"], record["only_second"]) == (["only"], ["other", "another"])
+    text = compare([first, second]).markdown()
     assert "1 scenes only in first, left out: only" in text
     assert "2 scenes only in second, left out: other, another" in text
 
@@ -65,8 +70,8 @@ def test_the_first_is_compared_with_each_of_the_others() -> None:
     three = [
         results(name, a=value, b=value) for name, value in (("x", 3.0), ("y", 2.0), ("z", 5.0))
     ]
-    pairs = Comparisons.of(three).pairs
-    assert [(p.first, p.second, p.differences[0].difference) for p in pairs] == [
+    pairs = compare(three).pairs
+    assert [(p.first.name, p.second.name, p.differences[0].difference) for p in pairs] == [
         ("x", "y", 1.0),
         ("x", "z", -2.0),
     ]
@@ -74,13 +79,13 @@ def test_the_first_is_compared_with_each_of_the_others() -> None:
 
 def test_what_cannot_be_compared_is_refused() -> None:
     with pytest.raises(ValueError, match="two or more different results"):
-        Comparisons.of([results("x", a=1.0), results("x", a=1.0)])
+        compare([results("x", a=1.0), results("x", a=1.0)])
     with pytest.raises(ValueError, match="x and y have no scene in common"):
-        Comparisons.of([results("x", a=1.0), results("y", b=1.0)])
+        compare([results("x", a=1.0), results("y", b=1.0)])
     rooms, halls = results("x", a=1.0), results("y", "halls", a=2.0)
     with pytest.raises(ValueError, match=r"x was judged by rooms .*y by halls .*differ in views:"):
-        Comparisons.of([rooms, halls])
-    (pair,) = Comparisons.of([rooms, halls], across_protocols=True).pairs
+        compare([rooms, halls])
+    (pair,) = compare([rooms, halls], across_protocols=True).pairs
     assert not pair.same_protocol
     assert pair.differences[0].low is None
 
@@ -89,8 +94,8 @@ def test_scenes_judged_on_other_frames_are_refused_although_protocols_agree() ->
     first, second = results("x", a=1.0, b=2.0), results("y", a=1.0, b=2.0)
     moved = replace(second, frames={**second.frames, "b": ("0 4", "1 2")})
     with pytest.raises(ValueError, match=r"judged 1 scenes on different frames, .* agree: b"):
-        Comparisons.of([first, moved])
-    text = Comparisons.of([first, moved], across_protocols=True).markdown()
+        compare([first, moved])
+    text = compare([first, moved], across_protocols=True).markdown()
     assert "1 scenes judged on different frames: b" in text
 
 
@@ -98,18 +103,18 @@ def test_incomplete_results_say_so_in_one_line_with_the_count() -> None:
     first, second = (
         replace(results(name, a=1.0, b=2.0), wanted=3, missing=["c"], null=["d"]) for name in "xy"
     )
-    text = Comparisons.of([first, second]).markdown()
+    text = compare([first, second]).markdown()
     assert "x against y, 2 of 3 scenes (missing: c)" in text
     for name in "xy":
         assert f"{name} is incomplete: no score of c" in text
     assert "null entries of the index, not judged (1): d" in text
-    complete = Comparisons.of([results("x", a=1.0), results("y", a=2.0)]).markdown()
+    complete = compare([results("x", a=1.0), results("y", a=2.0)]).markdown()
     assert "x against y, 1 scene**" in complete
 
 
 def test_tables_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     pair = [results("x", a=10.0, b=22.5), results("y", a=12.0, b=21.0)]
-    Comparisons.of(pair).show(Console(width=80))
+    compare(pair).show(Console(width=80))
     out = capsys.readouterr().out
     assert "[-2.000, +1.500]" in out
     assert "1 : 1" in out

@@ -18,7 +18,7 @@ from qgs.contracts import Queries
 from qgs.engine import train
 from qgs.engine.checkpoint import initialise
 from qgs.io.checkpoint import CheckpointError, save
-from qgs.io.published import to_published
+from qgs.io.published import exact_names_of
 from qgs.io.transfer import import_weights
 from qgs.model import QueryGaussianModel
 
@@ -207,7 +207,7 @@ def test_imported_weights_grow_too(tmp_path: Path) -> None:
     small = {"width": 16, "heads": 2, "queries": {"count": 6}, "decoder": {"depth": 1},
              "supervision": {"layers": [1]}}  # fmt: skip
     recipe = resolve({"recipe": 1, "model": small})
-    weights = to_published(recipe.build_model().state_dict(), recipe)
+    weights = exact_names_of(recipe).to_published(recipe.build_model().state_dict())
     save_file(weights, tmp_path / "w.safetensors")
     import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
     grown = resolve(
@@ -220,7 +220,7 @@ def test_imported_weights_grow_too(tmp_path: Path) -> None:
 
 def test_training_starts_from_a_run(tiny: Tiny, tmp_path: Path) -> None:
     base = train(tiny("locus"), tmp_path / "base", device="cpu")
-    still = ("training.learning_rate=1e-9", "training.weight_decay=0.0")
+    still = ("optimizer.learning_rate=1e-9", "optimizer.weight_decay=0.0")
     grown = tiny("locus", "model.queries.count=32", f"init_from={tmp_path / 'base'}", *still)
     console = Console(file=StringIO(), width=300)
     result = train(grown, tmp_path / "grown", device="cpu", console=console)

@@ -5,19 +5,26 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 from torch import Tensor
 
 import qgs
 from qgs.composer import Recipe
+from qgs.contracts import TrainingConfig
 from qgs.data.stream import training_batches
+from qgs.engine.checkpoint import Saver
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.nonfinite import KEPT, Finding, Incidents, Watch, read_batch
-from qgs.engine.objective import Gradients, Objective
+from qgs.engine.folder import RunFolder
+from qgs.engine.guard import MAX_SAVED, Finding, Guard, Watch
+from qgs.engine.objective import Objective
+from qgs.engine.training import compute_gradients
+from qgs.types import named_tensors
 
 NAN, INF = float("nan"), float("inf")
 
@@ -30,7 +37,9 @@ class Step:
         self.model = recipe.build_model().train()
         losses = recipe.build_losses()
         self.objective = Objective(self.model, losses, recipe.training.render_views)
-        self.gradients = Gradients(self.accelerator, self.objective, recipe.training)
+        self.gradients = partial(
+            compute_gradients, self.accelerator, self.objective, recipe.training
+        )
         stream = training_batches(recipe.build_data(), recipe.views, 2, seed=0)
         self.batches = [next(stream), next(stream)]
         stream.close()
@@ -38,7 +47,7 @@ class Step:
     def first(self) -> Finding | None:
         watch = Watch()
         with watch.on(self.objective):
-            self.gradients.compute(self.batches)
+            self.gradients(self.batches)
         return watch.first
 
 
@@ -157,28 +166,32 @@ def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(step.model, "render", poisoned)
     found = step.first()
     assert found
-    assert found.tensor == "gradient of layer 2.quats"
+    assert found.tensor == "gradient of layer 2.gaussians.quats"
 
 
-def incidents_of(step: Step, folder: Path) -> Incidents:
-    return Incidents(step.accelerator, step.objective, step.gradients, folder)
+def guard_of(step: Step, folder: Path) -> Guard:
+    saver = Saver(step.accelerator, RunFolder(folder), step.model)
+    return Guard(step.accelerator, step.objective, saver, TrainingConfig(), step.gradients)
 
 
 def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
     step.batches[1].targets.images[0, 0, 0, 0, 0] = NAN
-    told = str(incidents_of(step, tmp_path).look_into(7, step.batches, "loss term mse is nan"))
+    told, in_data = guard_of(step, tmp_path).look_into(7, step.batches, "loss term mse is nan")
+    assert in_data
     place = tmp_path / "incidents" / "step-7"
     names = {"batch.safetensors", "weights.safetensors", "report.json"}
     assert {path.name for path in place.iterdir()} == names
-    batch, bad = read_batch(place / "batch.safetensors"), step.batches[1]
-    assert batch.scenes == step.batches[0].scenes + bad.scenes
-    assert batch.target_frames[2:] == bad.target_frames
-    for side in ("inputs", "targets"):
-        saved, own = getattr(batch, side).select(slice(None)), getattr(bad, side)
-        torch.testing.assert_close(saved.images[2:], own.images, equal_nan=True)
-        assert torch.equal(saved.cameras.c2w[2:], own.cameras.c2w)
-        assert torch.equal(saved.cameras.intrinsics[2:], own.cameras.intrinsics)
-        assert saved.cameras.size == own.cameras.size
+    bad = step.batches[1]
+    with safe_open(place / "batch.safetensors", "pt") as file:
+        shown = {name: json.loads(text) for name, text in file.metadata().items()}
+        assert tuple(shown["scenes"]) == step.batches[0].scenes + bad.scenes
+        assert shown["target_frames"][2:] == list(map(list, bad.target_frames))
+        own = dict(named_tensors({"inputs": bad.inputs, "targets": bad.targets}))
+        assert set(file.keys()) == own.keys()
+        for name, tensor in own.items():
+            torch.testing.assert_close(
+                file.get_tensor(name)[2:], tensor, rtol=0, atol=0, equal_nan=True
+            )
     weights = qgs.load(place / "weights.safetensors").state_dict()
     assert all(torch.equal(t, weights[name]) for name, t in step.model.state_dict().items())
     report = json.loads((place / "report.json").read_text())
@@ -191,22 +204,20 @@ def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_repeated_is_told_so(step: Step, tmp_path: Path) -> None:
-    incident = incidents_of(step, tmp_path).look_into(3, step.batches, "loss is nan")
-    assert "repeating the step gave finite numbers" in str(incident)
-    assert not incident.in_data
+    told, in_data = guard_of(step, tmp_path).look_into(3, step.batches, "loss is nan")
+    assert "repeating the step gave finite numbers" in told
+    assert not in_data
 
 
-def test_the_number_of_saved_incidents_is_bounded(
-    step: Step, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(step.gradients, "compute", lambda batches: {})
-    incidents = incidents_of(step, tmp_path)
-    told = [incidents.look_into(n, step.batches[:1], "loss is nan") for n in range(KEPT + 2)]
-    assert len(list((tmp_path / "incidents").iterdir())) == KEPT
-    assert "not saved" in str(told[-1])
-    assert incidents.in_a_row == incidents.total == KEPT + 2
-    incidents.passed()
-    assert (incidents.in_a_row, incidents.total) == (0, KEPT + 2)
-    again = incidents_of(step, tmp_path)
-    again.load_state(incidents.state())
-    assert again.total == KEPT + 2
+def test_the_number_of_saved_incidents_is_bounded(step: Step, tmp_path: Path) -> None:
+    step.gradients = lambda batches: {}
+    guard, count = guard_of(step, tmp_path), MAX_SAVED + 2
+    told = [guard.look_into(n, step.batches[:1], "loss is nan") for n in range(count)]
+    assert len(list((tmp_path / "incidents").iterdir())) == MAX_SAVED
+    assert "not saved" in told[-1][0]
+    assert guard.skipped == guard.incidents == count
+    guard.passed({"alpha": 0.5, "deviation": 0.3, "gradient": 0.1})
+    assert (guard.skipped, guard.incidents) == (0, count)
+    again = guard_of(step, tmp_path)
+    again.load_state(guard.state())
+    assert (again.skipped, again.incidents) == (0, count)

@@ -33,7 +33,7 @@ def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Callable[..., Re
     assert {name: float(term) for name, term in outcome.terms.items()} == pytest.approx(expected)
     assert float(outcome.total.detach()) == pytest.approx(sum(expected.values()))
     torch.testing.assert_close(
-        outcome.signs.psnr, psnr(rendering.rgb, batch.targets.images).mean().detach()
+        outcome.signs["psnr"], psnr(rendering.rgb, batch.targets.images).mean().detach()
     )
 
 

@@ -1,21 +1,25 @@
-"""Which parameters decay."""
+"""Which parameters decay, learn slower or stay; an optimiser of a plugin."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from rich.console import Console
 from torch import nn
 
-from qgs.composer import Recipe
-from qgs.contracts import TrainingConfig
-from qgs.engine.optimizer import make_optimizer, parameter_groups
+from qgs.composer import Recipe, resolve
+from qgs.engine import train
+from qgs.engine.checkpoint import read_state
+from qgs.engine.optimizer import make_optimizer, parameter_groups, rate_factors
 
 
 def undecayed_names(module: nn.Module) -> set[str]:
-    _, undecayed = parameter_groups(module)
-    chosen = {id(p) for p in undecayed}
+    groups = parameter_groups(module, rate_factors(module, {}))
+    chosen = {id(p) for group in groups if not group["decays"] for p in group["params"]}
     return {name for name, p in module.named_parameters() if id(p) in chosen}
 
 
@@ -35,9 +39,10 @@ def test_queries_anchors_and_gammas_decay(tiny: Callable[..., Recipe]) -> None:
 
 
 def test_every_trained_parameter_is_in_one_group(tiny: Callable[..., Recipe]) -> None:
-    model = tiny("locus").build_model()
+    recipe = tiny("locus", "optimizer.weight_decay=0.1")
+    model = recipe.build_model()
     model.queries.features.requires_grad_(False)
-    optimizer = make_optimizer(model, TrainingConfig(weight_decay=0.1))
+    optimizer = make_optimizer(model, recipe.build_optimizer())
     trained = [id(p) for p in model.parameters() if p.requires_grad]
     grouped = [id(p) for group in optimizer.param_groups for p in group["params"]]
     assert sorted(grouped) == sorted(trained)
@@ -46,9 +51,9 @@ def test_every_trained_parameter_is_in_one_group(tiny: Callable[..., Recipe]) ->
 
 
 def test_decay_shrinks_only_what_decays(tiny: Callable[..., Recipe]) -> None:
-    model = tiny("tokengs").build_model()
-    config = TrainingConfig(weight_decay=0.5, learning_rate=0.1)
-    optimizer = make_optimizer(model, config)
+    recipe = tiny("tokengs", "optimizer.weight_decay=0.5", "optimizer.learning_rate=0.1")
+    model = recipe.build_model()
+    optimizer = make_optimizer(model, recipe.build_optimizer())
     before = {name: p.detach().clone() for name, p in model.named_parameters()}
     for parameter in model.parameters():
         parameter.grad = torch.zeros_like(parameter)
@@ -57,3 +62,133 @@ def test_decay_shrinks_only_what_decays(tiny: Callable[..., Recipe]) -> None:
     for name, parameter in model.named_parameters():
         factor = 1.0 if name in kept else 1 - 0.1 * 0.5
         torch.testing.assert_close(parameter.detach(), before[name] * factor)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "expected"),
+    [
+        ("encoder", r"encoder\..*"),
+        ("encoder.*", r"encoder\..*"),
+        ("model.queries", r"queries\..*"),
+        ("queries.features", r"queries\.features"),
+        ("decoder.*.cross_attention", r"decoder\.\d\.cross_attention\..*"),
+        ("decoder.[01]", r"decoder\.[01]\..*"),
+        ("decoder.*.*_scale.gamma", r"decoder\.\d\.\w+_scale\.gamma"),
+    ],
+)
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_pattern_names_a_part_and_all_below_it(
+    tiny: Callable[..., Recipe], pattern: str, expected: str, wrapped: bool
+) -> None:
+    model = tiny("locus").build_model("meta")
+    factors = rate_factors(nn.ModuleDict({"model": model}) if wrapped else model, {pattern: 0.5})
+    found = {name.removeprefix("model.") for name, factor in factors.items() if factor == 0.5}
+    wanted = {name for name, _ in model.named_parameters() if re.fullmatch(expected, name)}
+    assert found == wanted != set()
+
+
+def test_the_last_pattern_that_matches_counts(tiny: Callable[..., Recipe]) -> None:
+    factors = rate_factors(
+        tiny("locus").build_model("meta"), {"*": 0.5, "head": 1, "head.linear.bias": 2}
+    )
+    names = ("queries.features", "head.linear.weight", "head.linear.bias")
+    assert [factors[name] for name in names] == [0.5, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "fix"),
+    [
+        ("encodr", r"did you mean `encoder`\?"),
+        ("decoder.9.self_attention", r"did you mean `decoder\.\d\.self_attention`\?"),
+        ("decoder.*.self_atention", r"did you mean `decoder\.\*\.self_attention`\?"),
+        ("*.*.*.*.*.*.*", "its parts: encoder, queries, decoder, refinements, head"),
+        ("xy", "its parts: encoder, queries, decoder, refinements, head"),
+    ],
+)
+def test_a_pattern_that_matches_nothing_ends_the_start(
+    tiny: Callable[..., Recipe], tmp_path: Path, pattern: str, fix: str
+) -> None:
+    recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
+    with pytest.raises(ValueError, match=rf"optimizer\.parts: .*`{re.escape(pattern)}`.*{fix}"):
+        train(recipe, tmp_path / "run", console=Console(quiet=True))
+    assert not (tmp_path / "run").exists()
+
+
+def test_everything_frozen_is_refused(tiny: Callable[..., Recipe]) -> None:
+    recipe = tiny("tokengs", 'optimizer.parts={"*": 0}')
+    with pytest.raises(ValueError, match="nothing to train"):
+        make_optimizer(recipe.build_model("meta"), recipe.build_optimizer())
+
+
+def test_a_factor_scales_the_step(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+    """The first step of AdamW without decay is the learning rate, whatever the gradient."""
+    options = ("training.steps=1", "optimizer.warmup=0", "optimizer.weight_decay=0.0")
+    recipe = tiny("tokengs", *options, 'optimizer.parts={"head": 0.25, "queries": 2.0}')
+    before = recipe.build_model().state_dict()
+    after = train(recipe, tmp_path, console=Console(quiet=True), device="cpu").model.state_dict()
+    rate = recipe.build_optimizer().learning_rate(0, 0.0)
+    for name, factor in {"head.linear.bias": 0.25, "queries.features": 2.0}.items():
+        largest = float((after[name] - before[name]).abs().max())
+        assert largest == pytest.approx(rate * factor, rel=1e-2)
+
+
+def test_frozen_parts_stay_and_are_not_remembered(
+    tiny: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    options = ("training.ema=0.5", "training.save_every=2", "optimizer.weight_decay=0.5")
+    recipe = tiny("locus", *options, 'optimizer.parts={"encoder": 0, "decoder.*.feed_forward": 0}')
+    before = recipe.build_model().state_dict()
+    model = train(recipe, tmp_path, console=Console(quiet=True), device="cpu").model
+    for name, parameter in model.named_parameters():
+        frozen = name.startswith("encoder.") or ".feed_forward." in name
+        assert torch.equal(parameter, before[name]) == frozen, name
+        assert (parameter.grad is None) == frozen, name
+    moments = read_state(tmp_path / "state.safetensors").parts["moments"]
+    assert moments
+    assert not [key for key in moments if "model.encoder." in key or ".feed_forward." in key]
+
+
+PLAIN = """
+from pydantic import Field
+from torch.optim import SGD
+from qgs.contracts import Optimizer, OptimizerConfig, Plugin
+
+class Plain(Optimizer):
+    \"\"\"Gradient descent with momentum at one rate.\"\"\"
+    name = "sgd"
+    class Config(OptimizerConfig):
+        \"\"\"Its only option.\"\"\"
+        rate: float = Field(default=0.01, gt=0)
+        \"\"\"The learning rate.\"\"\"
+    def build(self, groups):
+        return SGD(groups, lr=self.config.rate, momentum=0.9)
+    def learning_rate(self, step, seconds):
+        return self.config.rate
+
+plugin = Plugin("plain", 1, (Plain,))
+"""
+
+
+def test_a_plugin_adds_an_optimiser_by_one_class(
+    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "plain-1.dist-info"
+    info.mkdir()
+    (tmp_path / "plain_optimizer.py").write_text(PLAIN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plain\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[qgs.plugins]\nplain = plain_optimizer:plugin\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    tree = {**tiny("tokengs", "training.save_every=2").tree, "plugins": ["rooms", "plain"]}
+    tree["optimizer"] = {"type": "plain/sgd", "rate": 0.02, "parts": {"encoder": 0, "head": 0.5}}
+    recipe = resolve(tree)
+    assert recipe.tree["optimizer"] == tree["optimizer"]
+    quiet = Console(quiet=True)
+    through = train(recipe, tmp_path / "through", console=quiet, device="cpu")
+    assert [record["lr"] for record in through.folder.history()] == [0.02] * 4
+    train(resolve(tree, ["training.steps=2"]), tmp_path / "run", console=quiet, device="cpu")
+    again = train(recipe, tmp_path / "run", console=quiet, device="cpu", resume=True)
+    assert again.resumed_at == 2
+    ours, theirs = again.model.state_dict(), through.model.state_dict()
+    assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
+    moments = read_state(again.folder.state).parts["moments"]
+    assert {key.rsplit("/")[-1] for key in moments} == {"momentum_buffer"}

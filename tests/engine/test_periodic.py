@@ -60,13 +60,13 @@ def test_weights_and_their_average_are_judged_side_by_side(recipe: Recipe, tmp_p
         (step, weights) for step in (5, 10) for weights in ("raw", "ema")
     ]
     raw, ema = records[-2:]
-    assert raw["psnr"] == evaluate(model, recipe).summary()["model"]["psnr"]
+    assert raw["scores"]["psnr"] == evaluate(model, recipe).summary()["model"]["psnr"]
     with average.applied():
-        assert ema["psnr"] == evaluate(model, recipe).summary()["model"]["psnr"]
-    assert raw["psnr"] != ema["psnr"]
+        assert ema["scores"]["psnr"] == evaluate(model, recipe).summary()["model"]["psnr"]
+    assert raw["scores"]["psnr"] != ema["scores"]["psnr"]
     assert raw["scenes"] == raw["scenes_in_protocol"] == 3
-    assert told.numbers["evaluation/raw/psnr"] == raw["psnr"]
-    assert told.numbers["evaluation/ema/ssim"] == ema["ssim"]
+    assert told.numbers["evaluation/raw/psnr"] == raw["scores"]["psnr"]
+    assert told.numbers["evaluation/ema/ssim"] == ema["scores"]["ssim"]
     assert told.pictures[0][::2] == ("evaluation", 5)
 
 

@@ -5,13 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 
+from qgs.components import OneCycleAdamW
 from qgs.contracts import TrainingConfig
-from qgs.engine.optimizer import OneCycle
+
+
+def adamw(steps: int, warmup: int, seconds: float | None = None) -> OneCycleAdamW:
+    training = TrainingConfig(steps=steps, seconds=seconds)
+    return OneCycleAdamW(OneCycleAdamW.Config(warmup=warmup, learning_rate=4e-4), training)
 
 
 @pytest.mark.parametrize(("steps", "warmup"), [(40, 10), (100, 2), (7, 3), (500, 400)])
 def test_steps_alone_follow_torch(steps: int, warmup: int) -> None:
-    config = TrainingConfig(steps=steps, warmup=warmup, learning_rate=4e-4)
+    schedule = adamw(steps, warmup)
+    config = schedule.options
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
     reference = torch.optim.lr_scheduler.OneCycleLR(
         optimizer,
@@ -21,17 +27,18 @@ def test_steps_alone_follow_torch(steps: int, warmup: int) -> None:
         div_factor=config.initial_divisor,
         final_div_factor=config.final_divisor,
     )
-    schedule = OneCycle(config)
     for step in range(steps):
-        assert schedule.rate(step, 0.0) == pytest.approx(reference.get_last_lr()[0], rel=1e-9)
+        assert schedule.learning_rate(step, 0.0) == pytest.approx(
+            reference.get_last_lr()[0], rel=1e-9
+        )
         optimizer.step()
         if step < steps - 1:
             reference.step()
 
 
 def test_a_time_budget_takes_over_when_it_runs_out_first() -> None:
-    schedule = OneCycle(TrainingConfig(steps=10_000, warmup=10, seconds=20.0))
-    rates = [schedule.rate(step, step * 0.1) for step in range(201)]
+    schedule = adamw(10_000, 10, seconds=20.0)
+    rates = [schedule.learning_rate(step, step * 0.1) for step in range(201)]
     assert max(rates) == pytest.approx(schedule.peak)
     assert rates.index(max(rates)) == 9
     assert rates[9:] == sorted(rates[9:], reverse=True)
@@ -39,8 +46,8 @@ def test_a_time_budget_takes_over_when_it_runs_out_first() -> None:
 
 
 def test_a_short_time_budget_cuts_the_warm_up() -> None:
-    schedule = OneCycle(TrainingConfig(steps=10_000, warmup=2000, seconds=10.0))
-    rates = [schedule.rate(step, step * 0.05) for step in range(201)]
+    schedule = adamw(10_000, 2000, seconds=10.0)
+    rates = [schedule.learning_rate(step, step * 0.05) for step in range(201)]
     assert max(rates) == pytest.approx(schedule.peak)
     assert rates.index(max(rates)) == 20, "a tenth of the time"
     assert rates[:21] == sorted(rates[:21])
@@ -49,20 +56,22 @@ def test_a_short_time_budget_cuts_the_warm_up() -> None:
 
 
 def test_a_warm_up_that_never_ends_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"training\.warmup is 10, but training\.steps is 10"):
-        OneCycle(TrainingConfig(steps=10, warmup=10))
-    OneCycle(TrainingConfig(steps=10, warmup=10, seconds=5.0))
+    with pytest.raises(ValueError, match=r"optimizer\.warmup is 10, but training\.steps is 10"):
+        adamw(10, 10)
+    adamw(10, 10, seconds=5.0)
 
 
 def test_steps_take_over_when_time_is_plenty() -> None:
-    timed = OneCycle(TrainingConfig(steps=50, warmup=10, seconds=1e6))
-    plain = OneCycle(TrainingConfig(steps=50, warmup=10))
+    timed = adamw(50, 10, seconds=1e6)
+    plain = adamw(50, 10)
     for step in range(50):
-        assert timed.rate(step, step * 0.1) == pytest.approx(plain.rate(step, 0.0), rel=1e-3)
+        assert timed.learning_rate(step, step * 0.1) == pytest.approx(
+            plain.learning_rate(step, 0.0), rel=1e-3
+        )
 
 
 @pytest.mark.parametrize("warmup", [0, 1])
 def test_without_warm_up_the_peak_comes_first(warmup: int) -> None:
-    schedule = OneCycle(TrainingConfig(steps=10, warmup=warmup))
-    assert schedule.rate(0, 0.0) == pytest.approx(schedule.peak)
-    assert schedule.rate(9, 0.0) == pytest.approx(schedule.last)
+    schedule = adamw(10, warmup)
+    assert schedule.learning_rate(0, 0.0) == pytest.approx(schedule.peak)
+    assert schedule.learning_rate(9, 0.0) == pytest.approx(schedule.last)

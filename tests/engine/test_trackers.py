@@ -24,7 +24,7 @@ def picture() -> np.ndarray:
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"pip install qgs\[wandb\]"):
+    with pytest.raises(MissingExtraError, match=r'pip install "query-gaussians\[wandb\]"'):
         Trackers(("wandb",))
     Trackers(()).log({"loss": 1.0}, 1)
 

@@ -20,7 +20,6 @@ from qgs.engine import RunFolder, train
 from qgs.engine import distributed as interrupt
 from qgs.engine.distributed import stop_requests
 from qgs.engine.folder import checkpoint_of
-from qgs.engine.optimizer import OneCycle
 from qgs.io.checkpoint import load_extra
 
 QUIET = Console(quiet=True)
@@ -29,7 +28,7 @@ QUIET = Console(quiet=True)
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 def test_training_lowers_the_loss(tiny: Callable[..., Recipe], tmp_path: Path, name: str) -> None:
     recipe = tiny(
-        name, "training.steps=40", "training.warmup=4", "data.scenes=1", "views.mirror=0.0"
+        name, "training.steps=40", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0"
     )
     result = train(recipe, tmp_path / "run", console=QUIET)
     losses = [record["loss"] for record in result.folder.history()]
@@ -76,7 +75,7 @@ def test_accumulated_batches_are_one_larger_batch(
             f"training.batch_size={batch_size}",
             f"training.accumulate={accumulate}",
             "training.steps=1",
-            "training.warmup=0",
+            "optimizer.warmup=0",
         )
         run = train(recipe, tmp_path / str(accumulate), console=QUIET)
         first.append(run.folder.history()[0])
@@ -97,9 +96,9 @@ def test_a_time_budget_ends_the_run(tiny: Callable[..., Recipe], tmp_path: Path)
     assert 1 < result.steps < 100_000
     history = result.folder.history()
     assert history[0]["seconds"] == 0
-    schedule = OneCycle(recipe.training)
+    schedule = recipe.build_optimizer()
     clock = [0.0, *(record["seconds"] for record in history)]
-    expected = [schedule.rate(step, clock[step]) for step in range(len(history))]
+    expected = [schedule.learning_rate(step, clock[step]) for step in range(len(history))]
     assert [record["lr"] for record in history] == pytest.approx(expected)
 
 
@@ -132,7 +131,7 @@ def test_a_folder_in_use_is_refused_untouched(tiny: Callable[..., Recipe], tmp_p
         train(tiny("tokengs"), tmp_path, console=QUIET)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(FileExistsError, match="is a file"):
-        RunFolder(tmp_path / "notes.txt").refuse_used()
+        RunFolder(tmp_path / "notes.txt").refuse_other(resume=False)
 
 
 def test_a_start_that_fails_leaves_no_folder(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
@@ -140,8 +139,8 @@ def test_a_start_that_fails_leaves_no_folder(tiny: Callable[..., Recipe], tmp_pa
     photos = {"type": "qgs/photos", "path": str(tmp_path / "nowhere"), "image_size": [32, 32]}
     with pytest.raises(FileNotFoundError, match="nowhere"):
         train(resolve({**tiny("tokengs").tree, "data": photos}), out, console=QUIET)
-    with pytest.raises(ValueError, match=r"training\.warmup"):
-        train(tiny("tokengs", "training.warmup=4"), out, console=QUIET)
+    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
+        train(tiny("tokengs", "optimizer.warmup=4"), out, console=QUIET)
     with pytest.raises(ValueError, match=r"views\.gap"):
         train(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out, console=QUIET)
     assert not out.exists()

@@ -20,7 +20,8 @@ from qgs.data.sampling import Batch
 from qgs.data.stream import SampleStream
 from qgs.engine import NonFiniteError, TrainingResult, train
 from qgs.engine import tracking as trackers
-from qgs.engine.nonfinite import PATIENCE, read_batch
+from qgs.engine.checkpoint import read_state
+from qgs.engine.guard import MAX_SKIPPED
 
 QUIET = Console(quiet=True)
 
@@ -117,13 +118,13 @@ def test_a_bad_step_ends_the_run_before_the_optimiser(
         run(tiny("tokengs"), folder)
     incident = folder / "incidents" / "step-3"
     assert str(incident) in str(error.value)
-    batch = read_batch(incident / "batch.safetensors")
-    assert f"scene {batch.scenes[0]!r}" in str(error.value)
-    assert str(list(batch.target_frames[0])) in str(error.value)
     assert [record["step"] for record in lines(folder / "history.jsonl")] == [1, 2]
     saved = qgs.load(incident / "weights.safetensors").state_dict()
     assert all(tensor.isfinite().all() for tensor in saved.values())
     report = json.loads((incident / "report.json").read_text())
+    shown = report["found"][0]["batches"][0]
+    assert f"scene {shown['scenes'][0]!r}" in str(error.value)
+    assert str(shown["target_frames"][0]) in str(error.value)
     assert report["step"] == 3
     assert "mse is nan" in report["symptom"]
 
@@ -158,13 +159,15 @@ def test_a_bad_step_is_skipped_on_demand(
     assert result.steps == 4
     told = [r.message for r in caplog.records if "is skipped" in r.message]
     assert [message.split(" is skipped")[0] for message in told] == ["step 2", "step 4"]
-    records = lines(result.folder.path / "history.jsonl")
+    folder = result.folder.path
+    records = lines(folder / "history.jsonl")
     assert [record["step"] for record in records] == [1, 2, 3, 4]
     assert ["loss" in record for record in records] == [True, False, True, False]
     assert [record.get("skipped", False) for record in records] == [False, True, False, True]
     assert len(curves_of(result.folder).loss) == 2
-    incidents = {path.name for path in (result.folder.path / "incidents").iterdir()}
-    assert incidents == {"step-2", "step-4"}
+    assert {p.name for p in (folder / "incidents").iterdir()} == {"step-2", "step-4"}
+    counted = read_state(folder / "state.safetensors").parts["guard"]
+    assert (counted["incidents"], counted["skipped"]) == (2, 1), "a good step lies between the two"
     for file in (result.folder.checkpoint, result.folder.checkpoint_ema):
         assert all(tensor.isfinite().all() for tensor in qgs.load(file).state_dict().values())
 
@@ -193,17 +196,17 @@ def test_skipping_comes_to_an_end(
 ) -> None:
     bad_batches(*range(1, 100))
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
-    with pytest.raises(NonFiniteError, match=f"{PATIENCE} steps in a row were skipped"):
+    with pytest.raises(NonFiniteError, match=f"{MAX_SKIPPED} steps in a row were skipped"):
         run(recipe, tmp_path / "run")
     steps = [record["step"] for record in lines(tmp_path / "run" / "history.jsonl")]
-    assert steps == list(range(1, PATIENCE + 2))
+    assert steps == list(range(1, MAX_SKIPPED + 2))
 
 
 def test_a_missing_tracker_is_told_before_anything_is_made(
     tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"qgs\[tensorboard\]"):
+    with pytest.raises(MissingExtraError, match=r"query-gaussians\[tensorboard\]"):
         run(tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

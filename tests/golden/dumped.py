@@ -17,7 +17,7 @@ from torch import Tensor
 from qgs.composer import resolve
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.io.checkpoint import unique_tensors
-from qgs.io.published import to_published
+from qgs.io.published import exact_names_of
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
@@ -55,7 +55,7 @@ def write(path: Path, config: dict[str, Any], sizes: Sizes) -> None:
         model = perturbed(recipe.build_model().eval(), sizes.saturation)
         views = random_views(sizes, config["options"]["img_size"])
     weights = {name: tensor.clone() for name, tensor in unique_tensors(model).items()}
-    published = to_published(weights, recipe)
+    published = exact_names_of(recipe).to_published(weights)
     computed = model_tensors(model.double(), views.to(torch.float64))
     tensors = {f"weights.{name}": tensor for name, tensor in published.items()}
     tensors |= {name: tensor.float() for name, tensor in computed.items()}

@@ -89,8 +89,8 @@ def test_a_plugin_depends_on_qgs_and_on_what_qgs_depends_on() -> None:
         {re.split(r"[^\w-]", entry)[0] for entry in all_dependencies(project)}
         for project in (PROJECT, PLUGIN)
     )
-    assert theirs == {"qgs", "pydantic", "torch", "pytest"}
-    assert theirs <= {"qgs", *ours}
+    assert theirs == {"query-gaussians", "pydantic", "torch", "pytest"}
+    assert theirs <= {"query-gaussians", *ours}
 
 
 def all_dependencies(project: dict) -> list[str]:

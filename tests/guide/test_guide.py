@@ -129,19 +129,18 @@ def test_recipes_of_the_five_ideas(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def _configs() -> dict[str, type[ComponentConfig]]:
     registry = load_registry(guide_reference.PLUGINS)
-    sections = {title: config for title, config, _ in guide_reference.SECTIONS}
     components = {
         f"{slot} {name}": component.Config
         for slot in SLOTS
         for name, component in registry.components(slot).items()
     }
-    return {**sections, **components}
+    return {**guide_reference.SECTIONS, **components}
 
 
 @pytest.mark.parametrize("name", _configs())
 def test_reference_explains_every_option(name: str) -> None:
     config = _configs()[name]
-    assert set(config.model_fields) == set(guide_reference.option_meanings(config))
+    assert not [name for name, field in config.model_fields.items() if not field.description]
     rows = guide_reference.option_table(config).splitlines()[2:]
     shown = {yaml_cell(row, 0): yaml_cell(row, 2) for row in rows}
     assert set(shown) == set(config.model_fields)

@@ -32,6 +32,11 @@ RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
 SMALL = ["model.width=16", "model.heads=2", "model.queries.count=8"]
 
 
+def locus_alone() -> QueryGaussianModel:
+    tree = resolve(RECIPES / "locus.yaml", SMALL).tree
+    return qgs.compose({**tree, "data": None, "plugins": ["locus"]})
+
+
 @pytest.fixture(scope="module", params=["tokengs", "locus"])
 def model(request: pytest.FixtureRequest) -> QueryGaussianModel:
     torch.manual_seed(0)
@@ -88,7 +93,7 @@ def test_recipe_and_versions_travel_along(model: QueryGaussianModel, saved: Path
 
 
 def test_the_distributions_of_plugins_travel_along(tmp_path: Path) -> None:
-    save(qgs.compose(RECIPES / "locus.yaml", SMALL), tmp_path / "a.safetensors")
+    save(locus_alone(), tmp_path / "a.safetensors")
     metadata = metadata_of(tmp_path / "a.safetensors")
     assert json.loads(metadata["qgs.distributions"]) == {
         "qgs": "query-gaussians",
@@ -100,7 +105,7 @@ def test_the_distributions_of_plugins_travel_along(tmp_path: Path) -> None:
 def old_locus(tmp_path: Path) -> Path:
     """A checkpoint of LocusGS that says it was made with query-gaussians-locus 0.0.7."""
     path = tmp_path / "old.safetensors"
-    save(qgs.compose(RECIPES / "locus.yaml", SMALL), path)
+    save(locus_alone(), path)
     versions = json.loads(metadata_of(path)["qgs.plugins"]) | {"locus": "0.0.7"}
     rewrite(path, **{"qgs.plugins": json.dumps(versions)})
     return path
@@ -132,7 +137,7 @@ def test_a_missing_plugin_is_told_by_file_and_distribution(
         read(orphan)
     release = made_with.format("0.0.7")
     first, *rest = str(caught.value).splitlines()
-    assert f"{orphan} was made with qgs {qgs.__version__}, {release}, and" in first
+    assert f"{orphan} was made with query-gaussians {qgs.__version__}, {release}, and" in first
     assert first.endswith(f"install {release}:")
     assert any("no installed distribution offers a plugin `locus`" in line for line in rest)
 

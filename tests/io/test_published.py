@@ -15,11 +15,8 @@ from qgs.composer import Recipe, resolve
 from qgs.io.differences import shapes_of
 from qgs.io.published import (
     PublishedError,
-    exact_layout_of,
-    from_published,
-    layout_of,
-    names_in,
-    to_published,
+    exact_names_of,
+    names_of,
 )
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -49,8 +46,8 @@ def small(tree: dict[str, Any], *overrides: str) -> Recipe:
 def test_names_survive_both_ways(published: Published) -> None:
     weights = published("tokengs_a")
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
-    ours = from_published(weights, recipe)
-    back = to_published(ours, recipe)
+    ours = names_of(recipe).from_published(weights)
+    back = exact_names_of(recipe).to_published(ours)
     assert back.keys() == weights.keys()
     assert all(back[name] is weights[name] for name in weights)
 
@@ -58,16 +55,16 @@ def test_names_survive_both_ways(published: Published) -> None:
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("ablations/*.yaml")), ids=lambda p: p.stem)
 def test_every_ablation_has_a_published_name_for_each_parameter(recipe: Path) -> None:
     resolved = resolve(recipe)
-    names = names_in(resolved, exact_layout_of(resolved))
+    names = exact_names_of(resolved)
     assert not names.unnamed
     assert names.published.keys() == names.shapes.keys()
-    assert not names.mismatches({t: names.shapes[o] for o, t in names.published.items()})
+    assert not names.mismatches(names.published_shapes())
     assert not set(names.unused) & set(names.published.values())
 
 
 def test_the_published_size_counts_its_unused_parameters() -> None:
     recipe = resolve(RECIPES / "locus/dl3dv_4096_4views.yaml")
-    names = names_in(recipe, layout_of(recipe))
+    names = names_of(recipe)
     width, head, layers = 1024, 64, 12
     sizes = {"_pos_norm": head, "anchor_norm": width, "plucker_norm": width, "tau_sample": 1}
     unused = sum(size for n in names.unused for part, size in sizes.items() if part in n)
@@ -81,7 +78,7 @@ def test_every_difference_is_listed_at_once(published: Published) -> None:
     weights["activation_head.deconv.bias"] = torch.zeros(3)
     weights["stranger"] = torch.zeros(1)
     with pytest.raises(PublishedError) as caught:
-        from_published(weights, recipe)
+        names_of(recipe).from_published(weights)
     for words in (
         "4 differences",
         "missing: gs_tokens",
@@ -97,7 +94,7 @@ def test_a_tokengs_recipe_accepts_no_key_of_an_anchor(published: Published) -> N
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
     stray = ("gs_anchor_xyz_raw", "enc_dec_backbone.decoder_blocks.0.gs_cross_attn.tau_sample")
     with pytest.raises(PublishedError, match="2 differences") as caught:
-        from_published(weights | {name: torch.zeros(1) for name in stray}, recipe)
+        names_of(recipe).from_published(weights | {name: torch.zeros(1) for name in stray})
     assert all(f"unexpected: {name}" in str(caught.value) for name in stray)
 
 
@@ -134,7 +131,7 @@ def test_models_that_no_layout_holds_are_refused(
     tree: dict[str, Any], overrides: list[str], words: list[str]
 ) -> None:
     with pytest.raises(PublishedError) as caught:
-        exact_layout_of(small(tree, *overrides))
+        exact_names_of(small(tree, *overrides))
     for part in words:
         assert part in str(caught.value)
 
@@ -144,6 +141,7 @@ def test_tiny_models_leave_and_come_back(name: str) -> None:
     recipe = resolve(RECIPES / f"tiny/{name}.yaml", ["model.head.norm=false", *SMALL[:3]])
     model = recipe.build_model()
     weights = dict(model.state_dict())
-    back = from_published(to_published(weights, recipe), recipe)
+    names = exact_names_of(recipe)
+    back = names.from_published(names.to_published(weights))
     assert back.keys() == weights.keys()
     assert all(back[key] is weights[key] for key in weights)

@@ -51,7 +51,7 @@ def test_import_export_import_is_bit_equal(
     done = export_weights(checkpoint, tmp_path / "back.safetensors")
     back, original = load_file(tmp_path / "back.safetensors"), published(name)
     assert done.settings == ()
-    assert set(done.absent) == original.keys() - back.keys()
+    assert set(done.unused) == original.keys() - back.keys()
     assert_same(back, {key: original[key] for key in back})
     recipe = resolve(checkpoint.with_suffix(".yaml"))
     import_weights(tmp_path / "back.safetensors", recipe, tmp_path / "again.safetensors")
@@ -76,9 +76,9 @@ def test_what_is_dropped_is_what_the_file_has(published: Published, tmp_path: Pa
     save_file({k: v for k, v in weights.items() if k not in unused}, tmp_path / "w.safetensors")
     done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "o.safetensors")
     assert len(unused) == 4
-    assert len(done.dropped) == 18 - 4
-    assert set(done.dropped) < weights.keys()
-    assert done.used + len(done.dropped) + len(unused) == len(weights)
+    assert len(done.unused) == 18 - 4
+    assert set(done.unused) < weights.keys()
+    assert done.count + len(done.unused) + len(unused) == len(weights)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
@@ -297,7 +297,7 @@ def test_one_prefix_of_all_names_is_taken_off(
     save_file(weights, tmp_path / "w.safetensors")
     done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
     assert done.notes == (f"took {prefix!r} off all {len(weights)} names",)
-    assert done.used == 109
+    assert done.count == 109
 
 
 def test_the_recipe_that_fits_names_types_first_and_its_losses(

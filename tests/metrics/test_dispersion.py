@@ -1,4 +1,4 @@
-"""Token dispersion."""
+"""What is measured on Gaussians alone."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from qgs.metrics import spread, token_dispersion
-from qgs.metrics.dispersion import median
+from qgs.contracts import MetricInput
+from qgs.engine.results import spread
+from qgs.metrics import OPACITY_USED, Dispersion, gaussians_used, token_dispersion
+from qgs.types import Cameras, Gaussians, Views
+
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "colors": (3,)}
+ONES = torch.ones(1, 1, 4)
 
 
 def test_distances_to_the_centroid_of_each_token() -> None:
@@ -33,16 +38,23 @@ def test_a_count_that_tokens_do_not_share_is_refused() -> None:
 
 
 @pytest.mark.parametrize("count", [5, 8])
-def test_spread_and_median_equal_numpy(count: int) -> None:
-    values = torch.rand(count, generator=torch.Generator().manual_seed(count))
-    found = spread(values)
-    plain = values.double().numpy()
-    assert found.mean == pytest.approx(plain.mean())
-    assert found.variance == pytest.approx(plain.var())
-    assert found.median == pytest.approx(np.median(plain))
-    assert float(median(values)) == pytest.approx(np.median(plain))
+def test_the_spread_over_scenes_equals_numpy(count: int) -> None:
+    values = torch.rand(count, generator=torch.Generator().manual_seed(count)).double().numpy()
+    expected = {"mean": values.mean(), "variance": values.var(), "median": np.median(values)}
+    assert spread(values.tolist()) == pytest.approx(expected)
 
 
-def test_spread_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="no scene"):
-        spread(torch.empty(0))
+@pytest.mark.parametrize("per_query", [5, 8])
+def test_the_metric_has_mean_and_median_over_gaussians(per_query: int) -> None:
+    gaussians = Gaussians(**{n: torch.rand(1, 3 * per_query, *s) for n, s in SHAPES.items()})
+    truth = Views(torch.zeros(1, 1, 3, 2, 2), Cameras(torch.eye(4)[None, None], ONES, (2, 2)))
+    given = MetricInput(truth.images, truth, gaussians, per_query)
+    found = Dispersion(Dispersion.Config())(given)
+    distances = token_dispersion(gaussians.means, per_query).numpy()
+    assert float(found["mean"].mean()) == pytest.approx(distances.mean())
+    assert float(found["median"]) == pytest.approx(np.median(distances))
+
+
+def test_only_gaussians_that_a_renderer_can_draw_are_used() -> None:
+    opacities = torch.tensor([[0.0, OPACITY_USED / 2, 0.5, 1.0], [0.0, 0.0, 0.0, 0.01]])
+    assert gaussians_used(opacities).tolist() == [2, 1]

@@ -6,8 +6,8 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from qgs.contracts.settings import SsimCovariance
 from qgs.metrics import psnr, ssim
+from qgs.metrics.images import SsimCovariance
 
 
 def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -17,9 +17,18 @@ def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, 
     return truth + noise * torch.randn(truth.shape, generator=generator), truth
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.2, 1.0])
-def test_ssim_equals_scikit_image(noise: float) -> None:
-    images, truth = pair(noise)
+@pytest.mark.parametrize("covariance", ["population", "sample"])
+@pytest.mark.parametrize(
+    ("size", "noise", "atol"),
+    [
+        *[((24, 37), noise, 1e-5) for noise in (0.02, 0.2, 1.0)],
+        *[(size, 0.1, 1e-6) for size in ((11, 11), (11, 40), (13, 17), (64, 33))],
+    ],
+)
+def test_ssim_equals_scikit_image(
+    size: tuple[int, int], noise: float, atol: float, covariance: SsimCovariance
+) -> None:
+    images, truth = pair(noise, size)
     expected = [
         structural_similarity(
             a.clamp(0, 1).double().numpy(),
@@ -28,13 +37,12 @@ def test_ssim_equals_scikit_image(noise: float) -> None:
             data_range=1.0,
             gaussian_weights=True,
             sigma=1.5,
-            use_sample_covariance=False,
+            use_sample_covariance=covariance == "sample",
         )
         for a, b in zip(images, truth, strict=True)
     ]
-    torch.testing.assert_close(
-        ssim(images, truth).double(), torch.tensor(expected), rtol=0, atol=1e-5
-    )
+    found = ssim(images, truth, covariance).double()
+    torch.testing.assert_close(found, torch.tensor(expected), rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("noise", [0.02, 1.0])
@@ -63,28 +71,6 @@ def test_identical_images() -> None:
 def test_images_smaller_than_the_window_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 11 pixels a side, got 10x20"):
         ssim(*pair(0.1, (10, 20)))
-
-
-@pytest.mark.parametrize("covariance", ["population", "sample"])
-@pytest.mark.parametrize("size", [(11, 11), (11, 40), (13, 17), (64, 33)])
-def test_ssim_equals_scikit_image_at_odd_sizes(
-    size: tuple[int, int], covariance: SsimCovariance
-) -> None:
-    images, truth = pair(0.1, size)
-    expected = [
-        structural_similarity(
-            a.clamp(0, 1).double().numpy(),
-            b.double().numpy(),
-            channel_axis=0,
-            data_range=1.0,
-            gaussian_weights=True,
-            use_sample_covariance=covariance == "sample",
-        )
-        for a, b in zip(images, truth, strict=True)
-    ]
-    torch.testing.assert_close(
-        ssim(images, truth, covariance).double(), torch.tensor(expected), rtol=0, atol=1e-6
-    )
 
 
 def test_the_two_forms_of_ssim_differ() -> None:

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from qgs.metrics.lpips import LpipsUnavailableError, load_lpips
+from qgs.metrics import Lpips
 
 CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0)
 """VGG-16's convolutions; 0 is a pooling."""
@@ -55,6 +55,10 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Tensor
     return linear
 
 
+def lpips_of(weights: object = None) -> Lpips:
+    return Lpips(Lpips.Config(weights=weights and str(weights)))
+
+
 def images(*shape: int) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(2)
     return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
@@ -86,15 +90,16 @@ def test_lpips_is_the_published_formula(
 ) -> None:
     file = tmp_path / f"vgg.{form}"
     save_file(weights, file) if form == "safetensors" else torch.save(weights, file)
-    lpips = load_lpips(str(file))
+    lpips = lpips_of(file)
+    assert not lpips.unavailable
     image, truth = images(2, 2, 3, 33, 40)
-    values = lpips(image, truth)
+    values = lpips.distance(image, truth)
     assert values.shape == (2, 2)
     with torch.no_grad():
         expected = by_the_formula(weights, package, image[1, 0], truth[1, 0])
     assert float(values[1, 0]) == pytest.approx(expected, rel=1e-5)
-    assert torch.equal(lpips(truth, truth), torch.zeros(2, 2))
-    assert torch.equal(lpips(image[:1, :1], truth[:1, :1])[0, 0], values[0, 0])
+    assert torch.equal(lpips.distance(truth, truth), torch.zeros(2, 2))
+    assert torch.equal(lpips.distance(image[:1, :1], truth[:1, :1])[0, 0], values[0, 0])
     assert not any(parameter.requires_grad for parameter in lpips.parameters())
 
 
@@ -114,7 +119,7 @@ def test_lpips_equals_the_package(
     image, truth = images(2, 3, 48, 37)
     with torch.no_grad():
         expected = theirs(image * 2 - 1, truth * 2 - 1).flatten()
-    ours = load_lpips(str(tmp_path / "vgg.safetensors"))(image, truth)
+    ours = lpips_of(tmp_path / "vgg.safetensors").distance(image, truth)
     torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-7)
 
 
@@ -122,7 +127,7 @@ def test_images_are_clipped_and_small_ones_refused(
     tmp_path: Path, weights: dict[str, Tensor], package: dict[str, Tensor]
 ) -> None:
     save_file(weights, tmp_path / "vgg.safetensors")
-    lpips = load_lpips(str(tmp_path / "vgg.safetensors"))
+    lpips = lpips_of(tmp_path / "vgg.safetensors").distance
     image, truth = images(1, 3, 16, 16)
     assert torch.equal(lpips(image * 3 - 1, truth), lpips((image * 3 - 1).clamp(0, 1), truth))
     with pytest.raises(ValueError, match="at least 16 pixels a side, got 15x16"):
@@ -131,8 +136,8 @@ def test_images_are_clipped_and_small_ones_refused(
 
 def test_without_the_package_the_reason_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("qgs.metrics.lpips.find_spec", lambda name: None)
-    with pytest.raises(LpipsUnavailableError, match=r"not installed: pip install 'qgs\[lpips\]'"):
-        load_lpips()
+    reason = 'not installed: pip install "query-gaussians[lpips]"'
+    assert lpips_of().unavailable.endswith(reason)
 
 
 @pytest.mark.usefixtures("package")
@@ -140,14 +145,12 @@ def test_without_weights_the_reason_says_what_to_download(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.raises(LpipsUnavailableError, match=r"no VGG-16 weights in the cache of torch.hub"):
-        load_lpips()
-    with pytest.raises(LpipsUnavailableError, match=r"no VGG-16 weights at mine\.pth"):
-        load_lpips("mine.pth")
+    assert "no VGG-16 weights in the cache of torch.hub: download" in lpips_of().unavailable
+    assert "no VGG-16 weights at mine.pth: download" in lpips_of("mine.pth").unavailable
 
 
 @pytest.mark.usefixtures("package")
 def test_other_weights_are_told(tmp_path: Path) -> None:
     save_file({"conv1.weight": torch.zeros(1)}, tmp_path / "resnet.safetensors")
-    with pytest.raises(LpipsUnavailableError, match=r"resnet\.safetensors or vgg\.pth does not"):
-        load_lpips(str(tmp_path / "resnet.safetensors"))
+    found = lpips_of(tmp_path / "resnet.safetensors").unavailable
+    assert found.startswith("resnet.safetensors or vgg.pth does not")

@@ -46,7 +46,7 @@ def test_it_passes_the_check_of_the_command_line(fresh: FreshEnvironment, plugin
 
 def test_a_recipe_trains_with_it(fresh: FreshEnvironment, plugin: Path) -> None:
     assert "outside/abstaining" in fresh.run("qgs compose recipe.yaml", plugin)
-    small = "--set training.steps=3 --set training.warmup=1 --set evaluation.scenes=1"
+    small = "--set training.steps=3 --set optimizer.warmup=1 --set evaluation.scenes=1"
     fresh.run(f"qgs train recipe.yaml --out run {small}", plugin)
     assert (plugin / "run/checkpoint.safetensors").is_file()
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 TRAINING = "qgs train recipe.yaml --out run"
-SHORTER = " --set training.steps=3 --set training.warmup=1 --set evaluation.scenes=1"
+SHORTER = " --set training.steps=3 --set optimizer.warmup=1 --set evaluation.scenes=1"
 
 
 def script_of(page: str) -> Iterator[str]:

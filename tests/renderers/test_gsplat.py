@@ -97,14 +97,20 @@ def test_intrinsics_that_want_a_gradient_are_refused(make_scene):
 
 def test_missing_gsplat_says_what_to_do(make_scene, monkeypatch):
     monkeypatch.setattr(gsplat_module, "find_spec", lambda name: None)
-    with pytest.raises(RuntimeError, match=r"pip install qgs\[gsplat\].*qgs/torch"):
+    with pytest.raises(RuntimeError, match=r'pip install "query-gaussians\[gsplat\]".*qgs/torch'):
         gsplat_module._check_supported(SimpleNamespace(means=_OnCuda()), make_scene()[1])
 
 
 def test_auto_goes_by_where_the_gaussians_are(make_scene, monkeypatch):
     gaussians, cameras = make_scene()
-    found = AutoRenderer(RendererConfig())(gaussians, cameras)
+    built = []
+    monkeypatch.setattr(
+        auto_module, "CpuRenderer", lambda config: built.append(CpuRenderer(config)) or built[-1]
+    )
+    auto = AutoRenderer(RendererConfig())
+    found = [auto(gaussians, cameras) for _ in range(2)][-1]
     assert torch.equal(found.rgb, CpuRenderer(RendererConfig())(gaussians, cameras).rgb)
+    assert len(built) == 1, "built once, not at every call"
 
     flat = torch.zeros(1, 1, 1, 2, 2)
     answer = Rendering(flat.expand(-1, -1, 3, -1, -1), flat, flat)

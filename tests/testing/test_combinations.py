@@ -12,9 +12,9 @@ from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import load_registry
 from qgs.contracts import Component, ComponentConfig, FieldSpec
 from qgs.testing import Case
-from qgs.testing.checks.composing import run_training_step
+from qgs.testing.checks.fields import run_training_step
+from qgs.testing.inputs import Sizes
 from qgs.testing.plugins import cases_of
-from qgs.testing.subjects import Sizes
 
 SLOTS = ("queries", "cross_attention", "self_attention", "refinement", "centers", "supervision")
 LAYER = SLOTS[1:4]

@@ -44,9 +44,9 @@ class GoldenFile:
         return size[0], size[1]
 
     def options(self, group: str, beside: Mapping[str, Any] | None = None) -> Mapping[str, Any]:
-        """The published options under `group`, with those `beside`; what is read is noted.
+        """The published options under `group` and `beside`; what is read from them is noted.
 
-        Raises GoldenFileError when the metadata has no such group, or something else there.
+        Raises GoldenFileError if the metadata has no such group of options.
         """
         if group not in self.config:
             raise GoldenFileError(f"the metadata has no `{group}`")
@@ -60,21 +60,18 @@ class GoldenFile:
         return ReleasedOptions(self.options(group))
 
     def unknown_options(self) -> list[str]:
-        """Options that nothing has read, and that are not known to decide nothing here."""
+        """Options that nothing has read and that are not in IDLE_OPTIONS."""
         groups = (value for name, value in self.config.items() if name.endswith("options"))
         names = {name for group in groups for name in group}
         return sorted(names - self.known - IDLE_OPTIONS)
 
     @property
     def is_of_losses(self) -> bool:
-        """Whether it holds loss terms; else the inside of a model."""
+        """Whether it holds loss terms, rather than tensors of a model."""
         return any(name.startswith(EXPECTED) for name in self.tensors)
 
     def input(self, name: str) -> Tensor:
-        """A tensor to compute from, in float32, which is not compared.
-
-        Raises GoldenFileError without it.
-        """
+        """A tensor to compute from, in float32; raises GoldenFileError without it."""
         if name not in self.tensors:
             raise GoldenFileError(f"the input `{name}` is missing")
         self.read.add(name)
@@ -91,7 +88,7 @@ class GoldenFile:
         return {name.removeprefix(WEIGHTS): self.input(name) for name in names}
 
     def expected(self) -> dict[str, Tensor]:
-        """Whatever is neither an input nor a weight: to be compared, every one."""
+        """The tensors to compare: all that were not read as inputs or weights."""
         return {name: value for name, value in self.tensors.items() if name not in self.read}
 
     def promised(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""Options of the releases that may decide nothing of what a golden file holds.
+"""Options of the releases that do not affect a golden file.
 
 They are about training, data, evaluation, initial values, or what other options turn off.
 """

@@ -1,4 +1,4 @@
-"""What the options of a LocusGS run say in a recipe (LocusGS release)."""
+"""The recipe for the options of a LocusGS run (LocusGS release)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UNSUPPORTED_BUT = {
     "cross_attn_handcraft": False,
     "unposed_input": False,
 }
-"""Parts of the release that stand outside of its published models and ablations."""
+"""Parts of the release that its published models and ablations do not use."""
 
 SELF_ATTENTION = {"content_only": "qgs/content", "learned_positional": "locus/anchor_aware"}
 CROSS_ATTENTION = {"content_only": "qgs/content", "geometric_positional": "locus/ray_biased"}

@@ -1,6 +1,6 @@
-"""Every tensor that a file of losses can hold, from the loss components that recipes name.
+"""Every tensor that a file of losses can hold, computed by our loss components.
 
-`refssim` stands for an SSIM with zero padding ("same"), which is also what trains here.
+`refssim` means SSIM with zero padding ("same"), as in training here.
 """
 
 from __future__ import annotations
@@ -20,14 +20,23 @@ from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
 from qgs.metrics import psnr
-from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
+from qgs.types import (
+    Cameras,
+    Gaussians,
+    LayerPrediction,
+    QueryState,
+    Rendering,
+    TensorContainer,
+    Views,
+    map_tensors,
+)
 
 RGB_TERM = {"tokengs": "loss_rgb", "locusgs": "loss_mse"}
 
 
 @dataclass(frozen=True)
-class LossInputs:
-    """What the losses of B scenes see. has_mask: (B,), whether a scene's mask is supervised."""
+class LossInputs(TensorContainer):
+    """Inputs of the losses, B scenes. has_mask: (B,), whether a scene's mask is supervised."""
 
     prediction: LayerPrediction
     rendering: Rendering
@@ -37,13 +46,7 @@ class LossInputs:
     def scenes(self) -> Iterator[LossInputs]:
         """Each scene as a batch of one."""
         for index in range(len(self.has_mask)):
-            one = slice(index, index + 1)
-            yield LossInputs(
-                _slice_prediction(self.prediction, one),
-                Rendering(*(tensor[one] for tensor in _images(self.rendering))),
-                Views(self.target.images[one], self.target.cameras[one], _masks(self.target)[one]),
-                self.has_mask[one],
-            )
+            yield map_tensors(lambda x, one=slice(index, index + 1): x[one], self)
 
     def value(self, loss: Loss) -> Tensor:
         """The only term of `loss`."""
@@ -52,10 +55,9 @@ class LossInputs:
 
 
 def read_inputs(golden: GoldenFile, images: bool) -> LossInputs:
-    """The inputs of a loss file; outside of its mask the truth is white, as in both releases.
+    """The inputs of a loss file; outside its mask the truth is white, as in both releases.
 
-    images: whether losses of images are among the expected tensors; else blanks do for what is not
-        in the file.
+    images: whether losses of images are expected; otherwise what the file lacks is blank.
     """
     points = golden.input("points")
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
@@ -80,7 +82,7 @@ def read_inputs(golden: GoldenFile, images: bool) -> LossInputs:
 
 
 def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Whatever the file may hold, under its names; of whole losses those that are in it."""
+    """All tensors that the file may hold, by name; whole losses only as far as they are in it."""
     wholes = [
         (release, ssim)
         for release in RGB_TERM
@@ -102,26 +104,11 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def _pixels(inputs: LossInputs, cam_view: Tensor | None) -> Tensor:
-    """Pixels of the points, unguarded: near z = 0 they hang on the last bit of the file's view."""
+    """Pixels of the points; near z = 0 they depend on the last bit of the file's view matrix."""
     cameras, points = inputs.target.cameras, inputs.prediction.gaussians.means
     seen = cameras.w2c.transpose(-1, -2) if cam_view is None else cam_view.to(points)
     camera_points = points[:, None] @ seen[..., :3, :3] + seen[..., 3:, :3]
     return to_pixels(camera_points, cameras.intrinsics)
-
-
-def _slice_prediction(prediction: LayerPrediction, one: slice) -> LayerPrediction:
-    state = prediction.state
-    fields = {name: field[one] for name, field in state.fields.items()}
-    return LayerPrediction(prediction.gaussians[one], QueryState(state.features[one], fields))
-
-
-def _images(rendering: Rendering) -> tuple[Tensor, Tensor, Tensor]:
-    return rendering.rgb, rendering.alpha, rendering.depth
-
-
-def _masks(views: Views) -> Tensor:
-    assert views.masks is not None
-    return views.masks
 
 
 def _thresholds(golden: GoldenFile) -> list[str]:
@@ -194,10 +181,7 @@ def _terms(release: str, options: ReleasedOptions, ssim: str) -> Iterator[tuple[
 
 
 def _ssim_weight(options: ReleasedOptions, ssim: str) -> float:
-    """A number, which `nossim` leaves out, or text with one for each kind.
-
-    Such as "0 (nossim) / 0.2 (refssim)".
-    """
+    """The option is a number (0 for `nossim`), or text such as "0 (nossim) / 0.2 (refssim)"."""
     text = options["lambda_ssim"]
     if not isinstance(text, str):
         return 0.0 if ssim == "nossim" else float(options.number("lambda_ssim"))

@@ -13,7 +13,7 @@ from published.recording import model_tensors
 from published.tokengs import tokengs_recipe
 from qgs.composer import resolve
 from qgs.contracts.weights import real_ratio
-from qgs.io.published import from_published
+from qgs.io.published import names_of
 from qgs.types import Cameras, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -25,14 +25,14 @@ DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
 def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
-    """Whatever the file may hold, computed by its model on its photos and cameras.
+    """All tensors that the file may hold, computed by its model on its photos and cameras.
 
     Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
-    for options that no recipe stands for.
+    for options that no recipe can express.
     """
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()
-    model.load_state_dict(from_published(golden.weights(), recipe), strict=True)
+    model.load_state_dict(names_of(recipe).from_published(golden.weights()), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
     return model_tensors(model, Views(golden.input("rgb"), cameras))
 

@@ -1,4 +1,4 @@
-"""Reading the options of a published training run, so that none is misread in silence."""
+"""The options of a published training run; one that is missing or unknown is an error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 class ReleasedOptionError(ValueError):
-    """An option of a published run is missing, or has a value that no recipe here stands for."""
+    """An option of a published run is missing, or no recipe can express its value."""
 
 
 class ReleasedOptions:
@@ -29,7 +29,7 @@ class ReleasedOptions:
         return name in self._options
 
     def meaning(self, name: str, meanings: Mapping[str, T]) -> T:
-        """What the value of `name` stands for; raises ReleasedOptionError for an unknown one."""
+        """`meanings` of the value of `name`; raises ReleasedOptionError for an unknown value."""
         value = self[name]
         if not isinstance(value, str) or value not in meanings:
             known = ", ".join(sorted(meanings))
@@ -65,10 +65,7 @@ class ReleasedOptions:
         return value
 
     def only(self, expected: Mapping[str, Any]) -> None:
-        """Raise ReleasedOptionError for an option with another value than the one supported.
-
-        Options that a run does not have are at the value that is expected of them.
-        """
+        """Raise ReleasedOptionError for an option that is there with another value."""
         for name, value in expected.items():
             given = self._options.get(name, value)
             if given != value:

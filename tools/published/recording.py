@@ -1,4 +1,4 @@
-"""Everything that a file of a model can hold, computed here under the file's names.
+"""All tensors that a file of a model can hold, computed here under the file's names.
 
 tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
 """
@@ -17,7 +17,7 @@ from qgs_locus.self_attention import AnchorAwareSelfAttention
 from torch import Tensor, nn
 
 from qgs.components import MultiViewViT
-from qgs.components.encoder import IMAGENET_MEAN, IMAGENET_STD
+from qgs.components.encoder import imagenet_normalised
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import DecoderLayer, QueryGaussianModel
 from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
@@ -26,7 +26,7 @@ from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
 @torch.no_grad()
 def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
     """Run `model` and return every tensor that a file can hold."""
-    found = ray_tensors(views.cameras) | {"images": _imagenet_normalised(views.images)}
+    found = ray_tensors(views.cameras) | {"images": imagenet_normalised(views.images)}
     with _recording(model, found):
         prediction = model(views, layers=range(1, model.depth + 1))
     found["gaussians"] = _packed(prediction.gaussians)
@@ -45,11 +45,6 @@ def ray_tensors(cameras: Cameras) -> dict[str, Tensor]:
     }
 
 
-def _imagenet_normalised(rgb: Tensor) -> Tensor:
-    mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
-    return (rgb - mean) / std
-
-
 def _packed(g: Gaussians) -> Tensor:
     return torch.cat([g.means, g.opacities[..., None], g.scales, g.quats, g.colors], -1)
 
@@ -63,7 +58,7 @@ def _recording(model: QueryGaussianModel, found: dict[str, Tensor]) -> Iterator[
 
 
 class _Recorder:
-    """Forward hooks that store what passes by. Layers run in order."""
+    """Forward hooks that store inputs and outputs of modules; layers run in order."""
 
     def __init__(self, model: QueryGaussianModel, found: dict[str, Tensor]) -> None:
         self.model = model

@@ -1,4 +1,4 @@
-"""What the options of a TokenGS run say in a recipe (TokenGS release)."""
+"""The recipe for the options of a TokenGS run (TokenGS release)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UNSUPPORTED_BUT = {
     "use_multiscale_encoder": False,
     "use_latent_bottleneck": False,
 }
-"""Parts of the release that stand outside of its published models."""
+"""Parts of the release that its published models do not use."""
 
 
 def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def backbone(options: ReleasedOptions) -> dict[str, Any]:
-    """What TokenGS and its descendants share: sizes, encoder, decoder depth, scale cap."""
+    """What TokenGS and LocusGS share: sizes, encoder, decoder depth, scale cap."""
     width = options.count("enc_embed_dim")
     options.only({**UNSUPPORTED_BUT, "token_dim": width})
     return {

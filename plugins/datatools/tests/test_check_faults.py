@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from planted import FLIP, HASH, told
 from qgs_datatools.check import Options, check
-from qgs_datatools.folders import chunk_folders
+from qgs_datatools.chunks import chunk_folders
 from textured_room import SIZE
 from upath import UPath
 
@@ -20,7 +20,7 @@ def test_untouched_sets_pass(good, name):
     assert report.findings == []
     assert report.notes == []
     for scene in report.scenes:
-        assert scene.geometry.verdict.agrees
+        assert scene.geometry.agrees
         assert scene.geometry.pixels < 0.6
         assert scene.listed == scene.decodable > 0
 
@@ -269,7 +269,7 @@ def test_keys_are_looked_up_and_not_searched(tmp_path, monkeypatch):
     (tmp_path / "index.json").touch()
     for name in list(keys)[1:]:
         (tmp_path / name).touch()
-    module = "qgs_datatools.folders"
+    module = "qgs_datatools.chunks"
     monkeypatch.setattr(f"{module}.load_chunk", lambda file: [{"key": keys[file.name]}])
     monkeypatch.setattr(
         f"{module}.read_chunk_index",

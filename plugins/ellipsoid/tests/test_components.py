@@ -9,9 +9,8 @@ import torch
 import torch.nn.functional as F
 from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_ellipsoid.decoding import AxisScaledCenters
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
-from qgs_ellipsoid.head import EllipsoidHead, radii_along
+from qgs_ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_ellipsoid.rotations import quat_product, turned
 from qgs_locus.fields import CENTER, RadiusOptions, support_radius

@@ -1,8 +1,5 @@
 import numpy as np
 import pytest
-
-pytest.importorskip("numba")
-
 from qgs_rooms.casting import cast_depths
 from qgs_rooms.intersections import hit
 from qgs_rooms.shapes import TEXTURE_FIELDS, Room, box, cylinder, sphere
@@ -41,8 +38,7 @@ def test_depth_is_z_along_the_camera():
     shapes = np.array([box(1.75, 0, 0.9, (0.5, 0.2, 0.2), 0).row()], np.float32)
     room = Room(shapes, np.zeros((6, TEXTURE_FIELDS)), (8.0, 40.0, 40.0), np.zeros((2, 4)))
     intrinsics = np.array([20.0, 20.0, 10.5, 10.5])
-    depth = np.empty((21, 21), np.float32)
-    cast_depths(depth, (0, 21), room, c2w, intrinsics)
+    (depth,) = cast_depths(room, c2w[None], intrinsics, (21, 21))
     assert depth[10, 10] == pytest.approx(1.5)
     assert depth[4, 3] == pytest.approx(4.0)
     assert depth[4, 17] == pytest.approx(4.0)

@@ -3,9 +3,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from pydantic import ValidationError
-
-pytest.importorskip("numba")
-
 from qgs_rooms.source import RoomsSource
 
 from qgs.data.sampling import mirrored_views

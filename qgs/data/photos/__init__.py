@@ -1,1 +1,72 @@
-"""Photos in folders: formats that hold poses beside them, and scenes made of them."""
+"""Photos in folders: the formats that list their cameras, and which of them a folder holds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from upath import UPath
+
+from qgs.data.photos.blender import Blender
+from qgs.data.photos.colmap import Colmap
+from qgs.data.photos.llff import Llff
+from qgs.data.photos.nerfstudio import Nerfstudio
+from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoReader
+from qgs.data.scenes import warn_once
+
+READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Blender, Colmap, Llff)
+"""All formats. Where a folder holds several listings, the first of this order is read."""
+
+if TYPE_CHECKING:
+    Format: TypeAlias = str
+else:  # the choices of the option `format`
+    Format = Literal["auto", *(reader.name for reader in READERS)]
+
+
+def formats_of(folder: UPath) -> list[str]:
+    """The formats whose listings `folder` holds, in the order in which they are preferred."""
+    return [reader.name for reader in READERS if reader.recognises(folder)]
+
+
+def read_listing(folder: UPath, format: Format = "auto", images: str | None = None) -> Listing:
+    """The photos that `folder` lists in `format`, or in the first of `READERS` that it holds.
+
+    images: folder of photos to read instead of the one that the listing means, such as images_4.
+    Which of several formats is read is logged. Raises FileNotFoundError for a folder that does not
+    exist or lists no photos, ValueError for a listing that cannot be read.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"photo folder {folder} (from {UPath.cwd()}) does not exist or is no folder: give the "
+            f"folder that holds {_listings()}"
+        )
+    held = [reader for reader in READERS if reader.recognises(folder)]
+    wanted = [reader for reader in held if format in ("auto", reader.name)]
+    if not wanted:
+        raise FileNotFoundError(_nothing(folder, format, held))
+    if len(wanted) > 1:
+        listings = ", ".join(f"{reader.name}: {reader.listing}" for reader in held)
+        warn_once(
+            f"{folder} holds photos in {len(held)} formats ({listings}) and is read as "
+            f"{held[0].name}; `format: {held[1].name}` reads the other"
+        )
+    return wanted[0].read(folder, images)
+
+
+def _listings() -> str:
+    return ", ".join(f"{reader.listing} ({reader.name})" for reader in READERS)
+
+
+def _nothing(folder: UPath, format: Format, held: list[type[PhotoReader]]) -> str:
+    if format != "auto":
+        listing = next(reader.listing for reader in READERS if reader.name == format)
+        names = ", ".join(reader.name for reader in held)
+        other = f"; it can be read as {names}" if held else ""
+        return f"{folder} has no {listing}, which {format} needs{other}"
+    inside = sorted(item.name for item in folder.iterdir())
+    images = sum(name.lower().endswith(IMAGE_SUFFIXES) for name in inside)
+    shown = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "") or "nothing"
+    return (
+        f"{folder} has no transforms.json nor another listing of cameras; it holds {shown} "
+        f"({images} images). Camera poses are needed: make them with COLMAP or with nerfstudio's "
+        f"`ns-process-data`, or give the folder that holds one of {_listings()}"
+    )

@@ -2,45 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
 
 from upath import UPath
 
-from qgs.data.photos.frames import PhotoFrame
-from qgs.data.photos.reading import Listing, parsed
+from qgs.data.photos.nerfstudio import read_transforms
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader
 
-LISTING = "transforms_train.json"
-_SPLITS: Mapping[str, Literal["train", "test"]] = {"train": "train", "val": "test", "test": "test"}
-
-
-def recognises(folder: UPath) -> bool:
-    """Whether `folder` holds this format."""
-    return any(_file(folder, part).is_file() for part in _SPLITS)
+_SPLITS = {"train": "train", "val": "test", "test": "test"}
 
 
-def read(folder: UPath, images: str | None) -> Listing:
-    """The frames of all files that exist, training first; those of the others are held out.
+class Blender(PhotoReader):
+    """A folder with a transforms file for each split. The alpha channel is the mask."""
 
-    The alpha channel is the mask. Raises ValueError for `images`.
-    """
-    if images is not None:
-        raise ValueError(
-            f"`images` is {images!r}, but the transforms files of {folder} name a folder for each "
-            "split: leave `images` out"
-        )
-    frames: list[PhotoFrame] = []
-    for part, split in _SPLITS.items():
-        if _file(folder, part).is_file():
-            frames += [replace(frame, split=split) for frame in _frames(folder, part)]
-    return Listing(folder, frames)
+    name = "blender"
+    listing = "transforms_train.json"
+    poses = "opengl"
 
+    @classmethod
+    def recognises(cls, folder: UPath) -> bool:
+        """See `PhotoReader`: any of the files is enough."""
+        return any((folder / f"transforms_{part}.json").is_file() for part in _SPLITS)
 
-def _file(folder: UPath, part: str) -> UPath:
-    return folder / f"transforms_{part}.json"
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """See `PhotoReader`: training frames first; those of the other files are held out.
 
-
-def _frames(folder: UPath, part: str) -> list[PhotoFrame]:
-    frames = parsed(_file(folder, part))
-    return [replace(frame, mask=frame.mask or frame.path) for frame in frames]
+        Raises ValueError for `images`.
+        """
+        if images is not None:
+            raise ValueError(
+                f"`images` is {images!r}, but the transforms files of {folder} name a folder for "
+                "each split: leave `images` out"
+            )
+        frames: list[PhotoFrame] = []
+        for part, split in _SPLITS.items():
+            file = folder / f"transforms_{part}.json"
+            if file.is_file():
+                frames += [
+                    replace(frame, split=split, mask=frame.mask or frame.path)
+                    for frame in read_transforms(file)
+                ]
+        return Listing(folder, frames)

@@ -1,26 +1,30 @@
-"""COLMAP: a sparse model, text or binary, beside a folder of photos."""
+"""COLMAP: a sparse model, text or binary, beside a folder of photos.
+
+Points, which are most of a model, are not read, and models may lie on any file system, which
+pycolmap's own readers do not offer; pycolmap says what the parameters of a camera model mean.
+"""
 
 from __future__ import annotations
 
 import math
+import struct
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 from upath import UPath
 
+from qgs.contracts.component import MissingExtraError
 from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
-from qgs.data.photos.colmap_model import files_of, load_model
-from qgs.data.photos.frames import Fault, Intrinsics, PhotoFrame
-from qgs.data.photos.reading import Listing, image_folder
+from qgs.data.photos.checks import FrameProblem
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
 
-if TYPE_CHECKING:
-    import pycolmap
-
-LISTING = "sparse/0/{cameras,images}.{bin,txt}"
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-_PINHOLE = ("SIMPLE_PINHOLE", "PINHOLE")
-_LENSES: dict[str, type[Lens]] = {
+_LENSES: dict[str, type[Lens] | None] = {
+    "SIMPLE_PINHOLE": None,
+    "PINHOLE": None,
     "SIMPLE_RADIAL": RadialTangential,
     "RADIAL": RadialTangential,
     "OPENCV": RadialTangential,
@@ -28,81 +32,168 @@ _LENSES: dict[str, type[Lens]] = {
     "SIMPLE_RADIAL_FISHEYE": Fisheye,
     "RADIAL_FISHEYE": Fisheye,
 }
-_FOCAL_AND_CENTRE = ("f", "fx", "fy", "cx", "cy")
+_BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
-def recognises(folder: UPath) -> bool:
-    """Whether `folder` holds this format."""
-    return _model(folder) is not None
-
-
-def _model(folder: UPath) -> UPath | None:
-    return next((folder / place for place in _PLACES if files_of(folder / place)), None)
-
-
-def read(folder: UPath, images: str | None) -> Listing:
+class Colmap(PhotoReader):
     """The posed images by name; a binary model before a text one, in the first of `_PLACES`.
 
-    Of a folder of photos and its scaled copies, the least reduced is read. Raises as `load_model`
-    and `image_folder`.
+    Of a folder of photos and its scaled copies, the least reduced is read.
     """
-    model = _model(folder)
-    assert model is not None
-    reconstruction, names = load_model(model)
-    photos = image_folder(folder, images)
-    frames = [
-        _frame(photos, names[number], image, reconstruction.cameras[image.camera_id])
-        for number, image in reconstruction.images.items()
-        if image.has_pose
-    ]
-    return Listing(model, sorted(frames, key=lambda frame: frame.name))
+
+    name = "colmap"
+    listing = "sparse/0/{cameras,images}.{bin,txt}"
+    poses = "opencv"
+
+    @classmethod
+    def recognises(cls, folder: UPath) -> bool:
+        """See `PhotoReader`."""
+        return any(_models(folder))
+
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """See `PhotoReader`. Raises MissingExtraError without pycolmap."""
+        model, suffix = next(_models(folder))
+        if find_spec("pycolmap") is None:
+            raise MissingExtraError(
+                f"reading the COLMAP model {model} needs pycolmap, which is not installed: run "
+                '`pip install "query-gaussians[colmap]"`'
+            )
+        read_cameras, read_images = _READ[suffix]
+        try:
+            cameras = {number: _camera(*rest) for number, *rest in read_cameras(model)}
+            posed = list(read_images(model))
+            unknown = {camera for *_, camera in posed} - cameras.keys()
+            if unknown:
+                raise ValueError(f"images are of cameras {sorted(unknown)}, which are not in it")
+        except ValueError as error:
+            raise ValueError(
+                f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
+                f"{error}; export it again, or copy it again"
+            ) from error
+        photos = image_folder(folder, images)
+        frames = [
+            PhotoFrame(
+                str(PurePosixPath(photos.name, name)), photos / name, _c2w(*pose), **cameras[camera]
+            )
+            for name, pose, camera in posed
+        ]
+        return Listing(model, sorted(frames, key=lambda frame: frame.name))
 
 
-def _frame(photos: UPath, name: str, image: pycolmap.Image, camera: pycolmap.Camera) -> PhotoFrame:
-    intrinsics, lens, faults = _camera(camera)
-    return PhotoFrame(
-        name=str(PurePosixPath(photos.name, name)),
-        path=photos / name,
-        c2w=_c2w(image.cam_from_world()),
-        intrinsics=intrinsics,
-        size=(camera.height, camera.width) if camera.height and camera.width else None,
-        lens=lens,
-        faults=faults,
-    )
+def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
+    """The models in `folder` and the suffix of their files, in the order of preference."""
+    for place in _PLACES:
+        for suffix in ("bin", "txt"):
+            files = (folder / place / f"{name}.{suffix}" for name in ("cameras", "images"))
+            if all(file.is_file() for file in files):
+                yield folder / place, suffix
 
 
-def _c2w(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
+Camera: TypeAlias = tuple[int, str, int, int, Sequence[float]]
+"""Number, name of the model, width, height, parameters."""
+Image: TypeAlias = tuple[str, list[float], int]
+"""Name, quaternion (w, x, y, z) with translation (x, y, z), number of the camera."""
+
+
+def _text_cameras(model: UPath) -> Iterator[Camera]:
+    for line in _lines(model / "cameras.txt"):
+        number, name, width, height, *parameters = line.split()
+        yield int(number), name, int(width), int(height), [*map(float, parameters)]
+
+
+def _text_images(model: UPath) -> Iterator[Image]:
+    for line in _lines(model / "images.txt", after=1):  # a line of points follows each image
+        number, *fields = line.split(maxsplit=9)
+        if len(fields) != 9 or not number.isdecimal():
+            raise ValueError(
+                f"images.txt has the line {line[:60]!r} where an image was expected: 9 numbers "
+                "and a name, then a line of points, which may be empty"
+            )
+        yield fields[8], [*map(float, fields[:7])], int(fields[7])
+
+
+def _lines(file: UPath, after: int = 0) -> Iterator[str]:
+    """The lines of a file less comments, empty ones, and so many `after` each of the others."""
+    with file.open("r", encoding="utf-8") as opened:
+        for line in map(str.strip, opened):
+            if line and not line.startswith("#"):
+                yield line
+                for _ in range(after):
+                    next(opened, None)
+
+
+def _binary_cameras(model: UPath) -> Iterator[Camera]:
+    import pycolmap
+
+    with (model / "cameras.bin").open("rb") as file:
+        for _ in range(_unpacked("<Q", file)[0]):
+            number, kind, width, height = _unpacked("<IiQQ", file)
+            name = pycolmap.CameraModelId(kind).name
+            yield number, name, width, height, _unpacked(f"<{len(_parameters(name))}d", file)
+
+
+def _binary_images(model: UPath) -> Iterator[Image]:
+    with (model / "images.bin").open("rb") as file:
+        end = file.seek(0, 2)
+        file.seek(0)
+        for _ in range(_unpacked("<Q", file)[0]):
+            _, *pose, camera = _unpacked("<I7dI", file)
+            name = b"".join(iter(lambda: _unpacked("<c", file)[0], b"\0")).decode("utf-8")
+            points = _BYTES_OF_A_POINT * _unpacked("<Q", file)[0]
+            if file.tell() + points > end:
+                raise ValueError("images.bin is cut off")
+            file.seek(points, 1)
+            yield name, pose, camera
+
+
+_READ = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_images)}
+
+
+def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
+    content = file.read(struct.calcsize(format))
+    if len(content) < struct.calcsize(format):
+        raise ValueError("a file is cut off")
+    return struct.unpack(format, content)
+
+
+def _parameters(model: str) -> list[str]:
+    """Names of the parameters of a camera model. Raises ValueError for one unknown to pycolmap."""
+    import pycolmap
+
+    kind = pycolmap.CameraModelId.__members__.get(model)
+    if kind is None:
+        raise ValueError(f"there is no camera model {model}")
+    return pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params_info.split(", ")
+
+
+def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
+    """Fields of a `PhotoFrame` that the camera took."""
+    values = dict(zip(_parameters(model), parameters, strict=True))
+    fields: dict[str, Any] = {"size": (height, width) if height and width else None}
+    if model not in _LENSES:
+        fix = f"undistort with `colmap image_undistorter`, or use one of {', '.join(_LENSES)}"
+        problem = FrameProblem("lens", f"the camera model {model} is not known", fix)
+        return {**fields, "intrinsics": (math.nan,) * 4, "problems": (problem,)}
+    focal = values.pop("f", math.nan)
+    fx, fy = values.pop("fx", focal), values.pop("fy", focal)
+    fields["intrinsics"] = (fx, fy, values.pop("cx"), values.pop("cy"))
+    lens = _LENSES[model]
+    if lens is not None:
+        fields["lens"] = bending(lens(**{"k1" if k == "k" else k: v for k, v in values.items()}))
+    return fields
+
+
+def _c2w(*cam_from_world: float) -> np.ndarray:
     """OpenCV camera-to-world; COLMAP gives world-to-camera, with a quaternion of any length."""
     import pycolmap
 
-    quaternion = np.array(cam_from_world.rotation.quat)
+    w, x, y, z, *translation = cam_from_world
+    quaternion = np.array([x, y, z, w])
     length = np.linalg.norm(quaternion)
-    c2w = np.eye(4)
     if not 0 < length < math.inf:
         return np.full((4, 4), np.nan)
+    c2w = np.eye(4)
     rotation = pycolmap.Rotation3d(quaternion / length).matrix().T
-    c2w[:3, :3] = rotation
-    c2w[:3, 3] = -rotation @ cam_from_world.translation
+    c2w[:3, :3], c2w[:3, 3] = rotation, -rotation @ translation
     return c2w
-
-
-def _camera(camera: pycolmap.Camera) -> tuple[Intrinsics, Lens | None, tuple[Fault, ...]]:
-    """Intrinsics and lens of a camera of COLMAP's models 0 to 5, 8 and 9."""
-    parameters = dict(zip(camera.params_info.split(", "), map(float, camera.params), strict=True))
-    model = camera.model_name
-    if model not in (*_PINHOLE, *_LENSES):
-        known = ", ".join((*_PINHOLE, *_LENSES))
-        fault = Fault(
-            f"the camera model {model} is not known",
-            f"undistort with `colmap image_undistorter`, or use one of {known}",
-        )
-        return (math.nan, math.nan, math.nan, math.nan), None, (fault,)
-    focal = parameters.get("f", math.nan)
-    fx, fy = parameters.get("fx", focal), parameters.get("fy", focal)
-    bends = {
-        "k1" if key == "k" else key: value
-        for key, value in parameters.items()
-        if key not in _FOCAL_AND_CENTRE
-    }
-    lens = None if model in _PINHOLE else bending(_LENSES[model](**bends))
-    return (fx, fy, parameters["cx"], parameters["cy"]), lens, ()

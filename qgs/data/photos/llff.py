@@ -3,56 +3,48 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 
 import numpy as np
 from upath import UPath
 
-from qgs.data.photos.frames import PhotoFrame
-from qgs.data.photos.reading import IMAGE_SUFFIXES, Listing, image_folder
-
-LISTING = "poses_bounds.npy"
-_FEW = 5
+from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoFrame, PhotoReader, image_folder
 
 
-def recognises(folder: UPath) -> bool:
-    """Whether `folder` holds this format."""
-    return (folder / LISTING).is_file()
-
-
-def read(folder: UPath, images: str | None) -> Listing:
+class Llff(PhotoReader):
     """The photos by name, each with its row: 15 numbers of a (3, 5) matrix, near and far.
 
     The matrix is a camera-to-world whose axes are (down, right, back), then height, width and focal
     length; the principal point is the middle. Near and far are not used.
-    Raises ValueError unless there are as many photos as rows.
     """
-    file = folder / LISTING
-    rows = _rows(file)
-    photos = image_folder(folder, images)
-    paths = sorted(
-        (
-            item
-            for item in photos.iterdir()
-            if item.name.lower().endswith(IMAGE_SUFFIXES) and not item.name.startswith(".")
-        ),
-        key=lambda item: item.name,
-    )
-    if len(paths) != len(rows):
-        raise ValueError(
-            f"{file} has {len(rows)} poses, but {photos} has {len(paths)} images: they belong "
-            f"together in the order of the names{_skipped(paths)}, so give all images and no others"
-        )
-    return Listing(file, [_frame(path, row) for path, row in zip(paths, rows, strict=True)])
+
+    name = "llff"
+    listing = "poses_bounds.npy"
+    poses = "llff"
+
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """See `PhotoReader`. Raises ValueError unless there are as many photos as rows."""
+        file, photos = folder / cls.listing, image_folder(folder, images)
+        rows = _rows(file)
+        shown = {item.name: item for item in photos.iterdir() if not item.name.startswith(".")}
+        names = sorted(name for name in shown if name.lower().endswith(IMAGE_SUFFIXES))
+        if len(names) != len(rows):
+            raise ValueError(
+                f"{file} has {len(rows)} poses, but {photos} has {len(names)} images: they belong "
+                f"together in the order of the names{_skipped(names)}, so give all images and no "
+                "others"
+            )
+        frames = [_frame(shown[name], row) for name, row in zip(names, rows, strict=True)]
+        return Listing(file, frames)
 
 
-def _skipped(paths: Sequence[UPath]) -> str:
+def _skipped(names: list[str]) -> str:
     """Which numbers the names skip, in words; empty where they count on or have no numbers."""
-    numbers = [int(found[0]) for path in paths if (found := re.search(r"\d+$", path.stem))]
-    if len(numbers) < max(2, len(paths)):
+    numbers = [int(found[1]) for name in names if (found := re.search(r"(\d+)\.\w+$", name))]
+    if len(numbers) < max(2, len(names)):
         return ""
     absent = sorted(set(range(min(numbers), max(numbers))) - set(numbers))
-    return f" (they skip {', '.join(map(str, absent))})" if 0 < len(absent) <= _FEW else ""
+    return f" (they skip {', '.join(map(str, absent))})" if 0 < len(absent) <= 5 else ""
 
 
 def _rows(file: UPath) -> np.ndarray:
@@ -72,8 +64,7 @@ def _rows(file: UPath) -> np.ndarray:
 
 
 def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
-    matrix = row[:15].reshape(3, 5)
-    down, right, back, centre, (height, width, focal) = matrix.T
+    down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     c2w = np.eye(4)
     c2w[:3] = np.stack([right, down, -back, centre], 1)
     whole = np.isfinite([height, width]).all() and min(height, width) >= 1

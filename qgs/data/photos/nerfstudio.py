@@ -1,44 +1,236 @@
-"""nerfstudio: a folder with `transforms.json`."""
+"""nerfstudio: `transforms.json`, whose schema Blender's and DL3DV's files share."""
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
+from typing import Any, TypeVar
 
+import numpy as np
+from PIL import Image
 from upath import UPath
 
-from qgs.data.photos.frames import PhotoFrame
-from qgs.data.photos.reading import Listing, existing, parsed, with_images
+from qgs.data.images import image_size
+from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
+from qgs.data.photos.checks import FrameProblem
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing, with_images
 
-LISTING = "transforms.json"
+Value = TypeVar("Value")
+
 _REDUCED = ("images_2", "images_4", "images_8")
+_PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE = "OPENCV_FISHEYE"
+_OTHER = ("k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
+_NO_POSE = np.full((4, 4), np.nan)
+_NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def recognises(folder: UPath) -> bool:
-    """Whether `folder` holds this format."""
-    return (folder / LISTING).is_file()
+class Nerfstudio(PhotoReader):
+    """A folder with `transforms.json`: masks ('mask_path'), depth ('depth_file_path') and splits.
 
-
-def read(folder: UPath, images: str | None) -> Listing:
-    """The frames in the file's order; masks ('mask_path'), depth ('depth_file_path') and splits.
-
-    Neighbours in the file should be neighbours in space, as exporters write them: inputs and
-    targets are drawn from spans of it. Where all the listed photos are missing and a reduced copy
-    of their folder (images_2, _4, _8) is there, that is read.
+    Where all the listed photos are missing and a reduced copy of their folder (images_2, _4, _8)
+    is there, that is read.
     """
-    file = folder / LISTING
-    frames = parsed(file)
-    if images is not None:
-        return Listing(file, with_images(frames, folder, images))
-    return Listing(file, _from_copy(frames, folder))
+
+    name = "nerfstudio"
+    listing = "transforms.json"
+    poses = "opengl"
+
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """See `PhotoReader`: the frames in the file's order."""
+        file = folder / cls.listing
+        frames = read_transforms(file)
+        if images is not None:
+            return Listing(file, with_images(frames, folder, images))
+        top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
+        if top == {("images",)} and not (folder / "images").is_dir():
+            for copy in _REDUCED:
+                if (folder / copy).is_dir():
+                    moved = with_images(frames, folder, copy)
+                    if existing(frame.path for frame in moved):
+                        return Listing(file, moved)
+        return Listing(file, frames)
 
 
-def _from_copy(frames: list[PhotoFrame], folder: UPath) -> list[PhotoFrame]:
-    top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
-    if top != {("images",)} or (folder / "images").is_dir():
-        return frames
-    for copy in _REDUCED:
-        if (folder / copy).is_dir():
-            moved = with_images(frames, folder, copy)
-            if existing(frame.path for frame in moved):
-                return moved
-    return frames
+def read_transforms(file: UPath) -> list[PhotoFrame]:
+    """The frames of a transforms file, in its order, with names relative to its folder.
+
+    A focal length given as an angle of view needs an image size: that of the first image, where the
+    file gives none. What is wrong with single frames is told in them. Raises ValueError for a file
+    that is no JSON or lists no frames, and for a split that names a file that no frame has.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} is not valid JSON: {error}; export it again") from error
+    entries = data.get("frames") if isinstance(data, Mapping) else None
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f"{file} lists no frames: expected a non-empty list under 'frames'")
+    folder = file.parent
+    frames = [_frame(folder, data, entry, None) for entry in entries]
+    try:
+        if any(frame.problems and not frame.size for frame in frames):
+            present = existing(frame.path for frame in frames)
+            first = next((frame.path for frame in frames if frame.path in present), None)
+            size = image_size(first) if first else None
+            frames = [_frame(folder, data, entry, size) for entry in entries]
+        return _with_splits(frames, data)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+class _UnreadableError(Exception):
+    """A value of a frame that cannot be read. Arguments: field of `PhotoFrame`, reason, fix."""
+
+
+def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None) -> PhotoFrame:
+    """size: (H, W) of the image where neither the frame nor the top of `data` gives 'h' and 'w'."""
+    path = entry.get("file_path") if isinstance(entry, Mapping) else None
+    if not isinstance(path, str) or not PurePosixPath(path).name:
+        fix = "add the image's name, or remove the frame"
+        problem = FrameProblem("path", "it has no 'file_path'", fix)
+        return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
+    values = {**data, **entry}
+    size = _size(values) or size
+    name = image_name(path)
+    problems: list[FrameProblem] = []
+
+    def read(value: Callable[[], Value], otherwise: Value) -> Value:
+        try:
+            return value()
+        except _UnreadableError as error:
+            problems.append(FrameProblem(*error.args))
+            return otherwise
+
+    mask, depth = (entry.get(key) for key in ("mask_path", "depth_file_path"))
+    return PhotoFrame(
+        name=name,
+        path=folder / name,
+        c2w=read(lambda: _pose(entry), _NO_POSE),
+        intrinsics=read(lambda: _intrinsics(values, size), _NO_INTRINSICS),
+        size=size,
+        lens=read(lambda: _lens(values), None),
+        mask=folder / mask if isinstance(mask, str) and mask else None,
+        depth=folder / depth if isinstance(depth, str) and depth else None,
+        problems=tuple(problems),
+    )
+
+
+def image_name(file_path: str) -> str:
+    """`file_path` in one spelling; one without an image's suffix, as in Blender's sets, is PNG."""
+    name = PurePosixPath(file_path.replace("\\", "/"))
+    suffix = name.suffix.lower()
+    known = suffix[1:].isalpha() or suffix in Image.registered_extensions()
+    return str(name if known else name.with_name(f"{name.name}.png"))
+
+
+def _pose(entry: Mapping[str, Any]) -> np.ndarray:
+    """OpenGL to OpenCV: the camera's y and z axes change sign."""
+    try:
+        c2w = np.array(entry.get("transform_matrix"), dtype=np.float64)
+    except (TypeError, ValueError):
+        c2w = np.zeros(0)
+    if c2w.shape == (3, 4):
+        c2w = np.vstack([c2w, [0, 0, 0, 1]])
+    if c2w.shape != (4, 4):
+        reason = "'transform_matrix' must be 4 x 4 numbers"
+        raise _UnreadableError("c2w", reason, "export the pose again")
+    return c2w @ _OPENGL_TO_OPENCV
+
+
+def _number(values: Mapping[str, Any], key: str) -> float | None:
+    """A number, NaN included; None where it is absent, null or something else."""
+    value = values.get(key)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _size(values: Mapping[str, Any]) -> Size | None:
+    sides = [_number(values, key) for key in ("h", "w")]
+    height, width = (side if side and math.isfinite(side) else 0 for side in sides)
+    return (round(height), round(width)) if height >= 1 and width >= 1 else None
+
+
+def _intrinsics(values: Mapping[str, Any], size: Size | None) -> Intrinsics:
+    def focal(key: str, angle_key: str, axis: int) -> float | None:
+        """In pixels, as given or from the angle of view."""
+        angle = _number(values, angle_key)
+        if angle is None or size is None or not 0 < angle < math.pi:
+            return _number(values, key) or None
+        return _number(values, key) or size[axis] / 2 / math.tan(angle / 2)
+
+    fx = focal("fl_x", "camera_angle_x", 1)
+    fy = focal("fl_y", "camera_angle_y", 0) or fx
+    if fx is None or fy is None:
+        raise _UnreadableError(
+            "intrinsics",
+            "there is no focal length",
+            "expected 'fl_x' (pixels), or 'camera_angle_x' (radians) with 'w' and 'h', in the "
+            "frame or at the top of the file",
+        )
+    cx, cy = _number(values, "cx"), _number(values, "cy")
+    if size is None and (cx is None or cy is None):
+        reason = "neither 'cx' and 'cy' nor 'w' and 'h' are given"
+        raise _UnreadableError("intrinsics", reason, "add either pair")
+    height, width = size or (0, 0)
+    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _lens(values: Mapping[str, Any]) -> Lens | None:
+    model = values.get("camera_model", "PINHOLE")
+    fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
+    if model not in _PINHOLE and not fisheye:
+        known = ", ".join(sorted((*_PINHOLE, _FISHEYE)))
+        fix = f"undistort the photos first, or export one of {known}"
+        raise _UnreadableError("lens", f"the camera model {model!r} is not known", fix)
+    for key in _OTHER if fisheye else (*_OTHER, "k4"):
+        if _coefficient(values, key):
+            reason = f"{key!r} is set, which belongs to another camera model"
+            fix = "undistort the photos first, or export without it"
+            raise _UnreadableError("lens", reason, fix)
+    if fisheye:
+        return Fisheye(*(_coefficient(values, key) for key in ("k1", "k2", "k3", "k4")))
+    keys = ("k1", "k2", "p1", "p2", "k3")
+    return bending(RadialTangential(*(_coefficient(values, key) for key in keys)))
+
+
+def _coefficient(values: Mapping[str, Any], key: str) -> float:
+    """A distortion coefficient; 0 where it is absent or null."""
+    if values.get(key) is None:
+        return 0.0
+    number = _number(values, key)
+    if number is None or not math.isfinite(number):
+        reason = f"the distortion {key!r} must be a finite number, got {values[key]!r}"
+        raise _UnreadableError("lens", reason, "correct it")
+    return number
+
+
+def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
+    """`frames` with the split that nerfstudio's 'train_filenames' and its like give them.
+
+    Validation photos are test photos too. With one kind of list, the other frames are of the other
+    kind; with both, frames that no list names are unused.
+    """
+    known = {frame.name for frame in frames}
+    splits: dict[str, set[str]] = {"train": set(), "test": set()}
+    for part, split in (("train", "train"), ("test", "test"), ("val", "test")):
+        key = f"{part}_filenames"
+        given = data.get(key) or []
+        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+            raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
+        names = set(map(image_name, given))
+        for name in sorted(names - known):
+            raise ValueError(
+                f"{key!r} names {name}, which no frame has: add the frame, or remove the name"
+            )
+        splits[split] |= names
+    train, test = splits["train"], splits["test"]
+    rest = ("unused" if test else "test") if train else ("train" if test else None)
+    return [
+        replace(f, split="train" if f.name in train else "test" if f.name in test else rest)
+        for f in frames
+    ]

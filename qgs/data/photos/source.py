@@ -2,47 +2,203 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+import torch
+from PIL import Image
 from pydantic import Field
+from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.lazy import BoundedCache, LazyScenes, warn_once
+from qgs.contracts import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.data.images import (
+    CropResize,
+    alpha_mask,
+    image_size,
+    open_depth,
+    open_mask,
+    open_rgb,
+    to_tensor,
+)
+from qgs.data.lenses import Mode, Size, undistorted
 from qgs.data.paths import opened_path
-from qgs.data.photos.formats import Format, formats_of, read_listing
-from qgs.data.photos.frames import PhotoFrame, require_sound
-from qgs.data.photos.reading import Listing, existing
-from qgs.data.photos.scene import Development, PhotoScene, pixel_cache
+from qgs.data.photos import Format, formats_of, read_listing
+from qgs.data.photos.checks import require_sound, size_problems
+from qgs.data.photos.reader import PhotoFrame, existing
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, warn_once
 from qgs.types import Cameras, Views
 
 _OPEN_SCENES = 64
 
 
 class PhotosConfig(SceneSource.Config):
-    """Options of `qgs/photos`.
-
-    path: folder of one scene, or of folders of scenes, or with such folders in train and test; an
-    absolute path, one relative to the working directory, or an fsspec URL. format: how cameras are
-    listed; auto takes the first that a folder holds of nerfstudio (transforms.json), blender
-    (transforms_train.json), colmap (a sparse model) and llff (poses_bounds.npy). images: folder of
-    photos to read instead of the listed one, such as images_4. holdout: every n-th frame is kept
-    for evaluation, from frame n // 2 on; 0 for none; a listing's own split goes first. max_frames:
-    only the first frames of a listing, 0 for all. background: RGB behind transparent pixels.
-    depth_unit: world units per number of a depth map (nerfstudio: 0.001, for millimetres).
-    """
+    """Options of `qgs/photos`."""
 
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     path: str
+    """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
+    relative to the working directory, or an fsspec URL."""
     format: Format = "auto"
+    """How cameras are listed; auto takes the first of the formats that a folder holds."""
     images: str | None = None
+    """Folder of photos to read instead of the listed one, such as images_4."""
     holdout: int = Field(default=8, ge=0)
+    """Every n-th frame is kept for evaluation, from frame n // 2 on; 0 for none. A listing's own
+    split goes first."""
     max_frames: int = Field(default=0, ge=0)
+    """Only the first frames of a listing; 0 for all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
     depth_unit: float = Field(default=1e-3, gt=0)
+    """World units per number of a depth map; nerfstudio writes millimetres (0.001)."""
+
+
+class PhotoScene(EncodedScene):
+    """The photos of one listing, in its order. World: that of the listing's poses.
+
+    cache: of decoded images, shared by the scenes of a source. Raises as `present_frames`.
+    """
+
+    def __init__(
+        self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
+    ) -> None:
+        self.name, self._config, self._cache = name, config, cache
+        frames, self.missing = present_frames(folder, config.format, config.images)
+        self._frames = frames = frames[: config.max_frames or None]
+        every = config.holdout
+        self.held_out = tuple(range(every // 2, len(frames), every)) if every else ()
+        if any(frame.split for frame in frames):
+            self.held_out = tuple(i for i, frame in enumerate(frames) if frame.split == "test")
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @cached_property
+    def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """See `Scene`; float64. Raises ValueError where a photo and its listed size disagree.
+
+        The header of one photo stands for those of its folder that are listed with the same size.
+        """
+        known: dict[object, Size] = {}
+        intrinsics: list[Tensor] = []
+        for frame in self._frames:
+            alike = (frame.path.parent, frame.size) if frame.size else frame.path
+            if alike not in known:
+                known[alike] = _checked(image_size(frame.path), frame, frame.path)
+            size = known[alike]
+            listed = torch.tensor(frame.at_size(size), dtype=torch.float64)
+            intrinsics.append(CropResize(size, self._config.image_size).intrinsics(listed))
+        c2w = torch.from_numpy(np.stack([frame.c2w for frame in self._frames]))
+        return Cameras(c2w, torch.stack(intrinsics), self._config.image_size)
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`. Raises ValueError for a file that cannot be decoded."""
+        return to_tensor(self._stacked(self._image, frames))
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; 1 everywhere for a photo without a mask in a scene that has some."""
+        if all(frame.mask is None for frame in self._frames):
+            return None
+        masks = self._stacked(self._mask, frames)
+        return torch.from_numpy(masks)[:, None].float().div_(255)
+
+    def depths(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; 0 where a map says nothing. None unless all `frames` have a map."""
+        if any(self._frames[i].depth is None for i in frames):
+            return None
+        return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
+
+    def frame_name(self, frame: int) -> str:
+        """See `Scene`: the image file, relative to the scene's folder."""
+        return self._frames[frame].name
+
+    def encoded(self, frame: int) -> EncodedFrame:
+        """See `EncodedScene`."""
+        listed = self._frames[frame]
+        size = _checked(image_size(listed.path), listed, listed.path)
+        mask = None
+        if listed.mask is not None:
+            buffer = io.BytesIO()
+            Image.fromarray(_whole_mask(listed)).save(buffer, "png")
+            mask = buffer.getvalue()
+        return EncodedFrame(
+            listed.name, listed.path.read_bytes(), listed.c2w, listed.at_size(size), size,
+            listed.lens, mask, self._config.background,
+        )  # fmt: skip
+
+    def _stacked(
+        self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
+    ) -> np.ndarray:
+        """(F, H, W, ...) of what `read` makes of the frames, or made before."""
+        keys = ((self.name, read.__name__, i) for i in frames)
+        return np.stack([self._cache.get(k, lambda k=k: read(self._frames[k[2]])) for k in keys])
+
+    def _image(self, frame: PhotoFrame) -> np.ndarray:
+        pixels = np.array(open_rgb(frame.path, self._config.background))
+        return self._delivered(pixels, frame, frame.path)
+
+    def _mask(self, frame: PhotoFrame) -> np.ndarray:
+        if frame.mask is None:
+            return np.full(self._config.image_size, 255, np.uint8)
+        return self._delivered(_whole_mask(frame), frame, frame.mask)
+
+    def _depth(self, frame: PhotoFrame) -> np.ndarray:
+        assert frame.depth is not None
+        depth = open_depth(frame.depth, self._config.depth_unit)
+        return self._delivered(depth, frame, frame.depth, "nearest")
+
+    def _delivered(
+        self, pixels: np.ndarray, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
+    ) -> np.ndarray:
+        """The content of `file` without distortion, at the delivered size."""
+        size = _checked(pixels.shape[:2], frame, file)
+        pixels = undistorted(pixels, frame.at_size(size), frame.lens, mode)
+        kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
+        return CropResize(size, self._config.image_size).image(Image.fromarray(pixels), kernel)
+
+
+def _whole_mask(frame: PhotoFrame) -> np.ndarray:
+    assert frame.mask is not None
+    return alpha_mask(frame.path) if frame.mask == frame.path else open_mask(frame.mask)
+
+
+def _checked(size: tuple[int, ...], frame: PhotoFrame, file: UPath) -> Size:
+    """(H, W) of `file`, which is one of the frame, if it goes with what is listed."""
+    height, width = size
+    for problem in size_problems((height, width), frame.size):
+        raise ValueError(f"{file}: {problem}")
+    return height, width
+
+
+class PhotoScenes(LazyScenes):
+    """Scenes by name, opened when asked for; the last ones stay open."""
+
+    def __init__(
+        self, folders: Mapping[str, UPath], config: PhotosConfig, cache_bytes: int = 512 * 2**20
+    ) -> None:
+        self._folders, self._config = dict(folders), config
+        self._opened: BoundedCache[PhotoScene] = BoundedCache(_OPEN_SCENES)
+        self._images: BoundedCache[np.ndarray] = BoundedCache(cache_bytes, attrgetter("nbytes"))
+        self.names = list(folders)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def scene(self, place: int) -> PhotoScene:
+        """See `LazyScenes`."""
+        name = self.names[place]
+        return self._opened.get(name, lambda: self.open(name, self._folders[name]))
+
+    def open(self, name: str, folder: UPath) -> PhotoScene:
+        """The scene in `folder`. Raises as `present_frames`."""
+        return PhotoScene(name, folder, self._config, self._images)
 
 
 class PhotosSource(SceneSource):
@@ -63,11 +219,29 @@ class PhotosSource(SceneSource):
         if self._scenes["test"] is single and len(single) == 1:
             _ = single[0].cameras
 
-    @property
-    def missing(self) -> list[str]:
-        """Photos that a listing names and that do not exist, of the scenes opened so far."""
-        scenes = dict.fromkeys(self._scenes.values())
-        return [path for opened in scenes for paths in opened.missing.values() for path in paths]
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """A listing of cameras in the folder, in one inside, or in one inside train or test."""
+        folders = (path, path / "train", path / "test")
+        return any(
+            formats_of(folder) or any(formats_of(item) for item in folder.iterdir())
+            for folder in folders
+            if folder.is_dir()
+        )
+
+    @classmethod
+    def trains_on(cls, root: UPath, path: UPath) -> bool:
+        """See `SceneSource`: also a scene in a folder of scenes, or in its train."""
+        inside = path in (root / path.name, root / "train" / path.name)
+        return path == root or (inside and bool(formats_of(path)))
+
+    @classmethod
+    def config_for(
+        cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
+    ) -> SceneSourceConfig:
+        """See `SceneSource`; no frame is held out."""
+        config = super().config_for(path, image_size, trained)
+        return config.model_copy(update={"holdout": 0})
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`."""
@@ -76,46 +250,6 @@ class PhotosSource(SceneSource):
     def names(self, split: Split) -> Sequence[str]:
         """See `SceneSource`."""
         return self._scenes[split].names
-
-
-class PhotoScenes(LazyScenes):
-    """Scenes by folder, opened when asked for; the last ones stay open.
-
-    missing: by folder that was opened, the listed photos that do not exist.
-    """
-
-    def __init__(self, folders: Mapping[str, UPath], config: PhotosConfig) -> None:
-        self._folders, self._config = list(folders.items()), config
-        self._opened: BoundedCache[PhotoScene] = BoundedCache(_OPEN_SCENES, _one)
-        self._pixels = pixel_cache()
-        self.missing: dict[str, list[str]] = {}
-
-    def __len__(self) -> int:
-        return len(self._folders)
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the scenes; none is opened."""
-        return [name for name, _ in self._folders]
-
-    def scene(self, place: int) -> PhotoScene:
-        """See `LazyScenes`."""
-        name, folder = self._folders[place]
-        return self._opened.get(name, lambda: self._open(name, folder))
-
-    def _open(self, name: str, folder: UPath) -> PhotoScene:
-        config = self._config
-        frames, self.missing[name] = present_frames(folder, config.format, config.images)
-        frames = frames[: config.max_frames or None]
-        development = Development(config.image_size, config.background, config.depth_unit)
-        held_out = held_out_frames(frames, config.holdout)
-        scene = PhotoScene(name, frames, development, held_out, self._pixels)
-        scene.missing = self.missing[name]
-        return scene
-
-
-def _one(scene: PhotoScene) -> int:
-    return 1
 
 
 def _scenes(config: PhotosConfig, root: UPath) -> Mapping[Split, PhotoScenes]:
@@ -137,11 +271,8 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
     if not root.is_dir():
         return {}
     inside = sorted((item for item in root.iterdir() if item.is_dir()), key=lambda item: item.name)
-    held = {folder.name: formats_of(folder) for folder in inside}
-    wanted = [
-        folder for folder in inside
-        if (config.format in held[folder.name] if config.format != "auto" else held[folder.name])
-    ]  # fmt: skip
+    held = {folder: formats_of(folder) for folder in inside}
+    wanted = [f for f in inside if held[f] and config.format in ("auto", *held[f])]
     left = [folder.name for folder in inside if folder not in wanted]
     if wanted and left:
         warn_once(
@@ -156,13 +287,6 @@ def folder_name(folder: UPath) -> str:
     return folder.resolve().name or "photos"
 
 
-def held_out_frames(frames: Sequence[PhotoFrame], holdout: int) -> tuple[int, ...]:
-    """The frames that a listing's split keeps from training; else every `holdout`-th one."""
-    if any(frame.split for frame in frames):
-        return tuple(i for i, frame in enumerate(frames) if frame.split == "test")
-    return tuple(range(holdout // 2, len(frames), holdout)) if holdout else ()
-
-
 def present_frames(
     folder: UPath, format: Format = "auto", images: str | None = None
 ) -> tuple[list[PhotoFrame], list[str]]:
@@ -174,7 +298,12 @@ def present_frames(
     """
     listing = read_listing(folder, format, images)
     require_sound(listing.file, listing.frames)
-    frames = _used(listing)
+    frames = [frame for frame in listing.frames if frame.split != "unused"]
+    if len(frames) < len(listing.frames):
+        warn_once(
+            f"{len(listing.frames) - len(frames)} of {len(listing.frames)} frames of "
+            f"{listing.file} are in none of its splits and are left out"
+        )
     there = existing(frame.path for frame in frames)
     present = [frame for frame in frames if frame.path in there]
     missing = [str(frame.path) for frame in frames if frame.path not in there]
@@ -187,29 +316,14 @@ def present_frames(
         warn_once(
             f"{len(missing)} of {len(frames)} images of {folder} are missing: {', '.join(missing)}"
         )
-    _require_masks(listing.file, present)
-    return present, missing
-
-
-def _used(listing: Listing) -> list[PhotoFrame]:
-    used = [frame for frame in listing.frames if frame.split != "unused"]
-    if len(used) < len(listing.frames):
-        warn_once(
-            f"{len(listing.frames) - len(used)} of {len(listing.frames)} frames of {listing.file} "
-            "are in none of its splits and are left out"
-        )
-    return used
-
-
-def _require_masks(file: UPath, frames: Sequence[PhotoFrame]) -> None:
-    masks = [frame.mask for frame in frames if frame.mask is not None]
-    there = existing(masks)
-    missing = [mask for mask in masks if mask not in there]
-    if missing:
+    masks = [frame.mask for frame in present if frame.mask is not None]
+    absent = sorted(set(map(str, masks)) - set(map(str, existing(masks))))
+    if absent:
         raise FileNotFoundError(
-            f"{file} names {len(masks)} masks, of which {len(missing)} do not exist, the first "
-            f"being {missing[0]}: add them, or remove their 'mask_path'"
+            f"{listing.file} names {len(masks)} masks, of which {len(absent)} do not exist, the "
+            f"first being {absent[0]}: add them, or remove their 'mask_path'"
         )
+    return present, missing
 
 
 def read_photos(
@@ -223,8 +337,8 @@ def read_photos(
     Raises FileNotFoundError and ValueError as `PhotosSource`, IndexError for frames out of range.
     """
     folder = opened_path(path)
-    listed = present_frames(folder, format)[0]
-    scene = PhotoScene(folder_name(folder), listed, Development(image_size))
+    config = PhotosConfig(path=str(path), image_size=image_size, format=format)
+    scene = PhotoScenes({folder_name(folder): folder}, config).scene(0)
     chosen = list(range(len(scene))) if frames is None else list(frames)
     outside = [frame for frame in chosen if not 0 <= frame < len(scene)]
     if outside:

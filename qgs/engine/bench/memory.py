@@ -1,4 +1,4 @@
-"""Peak memory of one operation, in a process that does nothing else."""
+"""Peak memory of one operation, in a process that does nothing else: this module, run by itself."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ import json
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
-from qgs.composer import Recipe
-from qgs.engine.bench.work import Operation, Workload
+import torch
+
+from qgs.composer import Recipe, resolve
+from qgs.engine.bench.work import Operation, Workload, make_task
 
 
 @dataclass(frozen=True)
@@ -22,32 +26,75 @@ class Peak:
 
 
 def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
-    """Build the model in a fresh process, run `operation` there, and tell the peak.
+    """Build the model in a fresh process, run `operation` there, and return the peak.
 
     Raises ChildProcessError, with what the process said last, when it failed or was killed.
     """
-    order = {
-        "tree": dict(recipe.tree),
-        "operation": operation,
-        "workload": asdict(workload),
-        "threads": threads,
-    }
-    command = [sys.executable, "-m", "qgs.engine.bench.worker"]
+    order = {"tree": dict(recipe.tree), "operation": operation, "threads": threads}
+    order["workload"] = asdict(workload)
+    command = [sys.executable, "-m", "qgs.engine.bench.memory"]
     done = subprocess.run(command, input=json.dumps(order), capture_output=True, text=True)
-    if done.returncode:
-        raise ChildProcessError(_failure(operation, done.returncode, done.stderr))
-    return Peak(**json.loads(done.stdout))
-
-
-def _failure(operation: Operation, code: int, said: str) -> str:
-    if code == -9:
-        return (
-            f"the process that measured the memory of the {operation} was killed (SIGKILL), most "
-            "likely because the machine has too little: choose fewer or smaller views, or a "
-            "smaller batch or model"
+    if not done.returncode:
+        return Peak(**json.loads(done.stdout))
+    what = f"the process that measured the memory of the {operation}"
+    if done.returncode == -9:
+        raise ChildProcessError(
+            f"{what} was killed (SIGKILL), most likely because the machine has too little: choose "
+            "fewer or smaller views, or a smaller batch or model"
         )
-    last = said.strip().splitlines()[-1:] or ["nothing"]
-    return (
-        f"the process that measured the memory of the {operation} ended with {code}: {last[0]}; "
-        "without --memory the error has its traceback"
+    last = done.stderr.strip().splitlines()[-1:] or ["nothing"]
+    raise ChildProcessError(
+        f"{what} ended with {done.returncode}: {last[0]}; without --memory the error has its "
+        "traceback"
     )
+
+
+def measure(
+    tree: dict[str, Any], operation: Operation, workload: dict[str, Any], threads: int
+) -> Peak:
+    """The peak of this process; see `peak_memory`.
+
+    Of training it is the second step's: the first one makes the optimiser's moments, and compiles
+    kernels, which takes memory that no later step needs.
+    """
+    torch.set_num_threads(threads)
+    work = Workload(**{**workload, "size": tuple(workload["size"])})
+    recipe = resolve(tree)
+    on_gpu = work.device == "cuda"
+    idle = 0 if on_gpu else resident_bytes("VmRSS")
+    task = make_task(operation, recipe, recipe.build_model(work.device), work)
+    if operation == "step":
+        task()
+        _forget_peak(on_gpu)
+    task()
+    return Peak(torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM"), idle)
+
+
+def resident_bytes(field: str) -> int:
+    """Bytes resident now (VmRSS) or at most so far (VmHWM) of this process.
+
+    Linux has both in /proc. Elsewhere ru_maxrss stands for both; on Linux it would count the parent
+    of a spawned process.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        lines = status.read_text().splitlines()
+        (kibibytes,) = (line.split()[1] for line in lines if line.startswith(f"{field}:"))
+        return int(kibibytes) * 1024
+    import resource  # Windows has none
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _forget_peak(on_gpu: bool) -> None:
+    """Start a new peak; on systems without Linux's /proc the old one stays."""
+    switch = Path("/proc/self/clear_refs")
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
+    elif switch.exists():
+        switch.write_text("5")
+
+
+if __name__ == "__main__":
+    json.dump(asdict(measure(**json.load(sys.stdin))), sys.stdout)

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.composer import Recipe
 from qgs.contracts import SceneSourceConfig
 from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Gaussians, Views
 
 Precision: TypeAlias = Literal["float32", "bf16"]
 
@@ -36,8 +36,7 @@ class Workload:
 
     def autocast(self) -> torch.autocast:
         """The context in which the model runs."""
-        enabled = self.precision == "bf16"
-        return torch.autocast(self.device, torch.bfloat16, enabled=enabled)
+        return torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16")
 
     def inputs(self) -> Views:
         """Random photos (batch, views), the same each time."""
@@ -82,27 +81,14 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
     """
     generator = torch.Generator().manual_seed(seed)
     images = torch.rand(batch, count, 3, *size, generator=generator)
-    c2w = torch.stack([_on_arc(math.radians(10 * index)) for index in range(count)])
-    focal = float(max(size))
-    height, width = size
-    intrinsics = torch.tensor([focal, focal, width / 2, height / 2])
-    cameras = Cameras(
-        c2w.expand(batch, -1, -1, -1).contiguous(), intrinsics.expand(batch, count, 4), size
-    )
-    return Views(images, cameras)
-
-
-def _on_arc(angle: float) -> Tensor:
-    """Camera-to-world matrix (4, 4), `angle` radians along the arc in the x-z plane."""
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return torch.tensor(
-        [
-            [cosine, 0.0, sine, -sine],
-            [0.0, 1.0, 0.0, 0.0],
-            [-sine, 0.0, cosine, 1.0 - cosine],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    c2w = torch.eye(4).repeat(batch, count, 1, 1)
+    for index in range(count):
+        sine, cosine = math.sin(math.radians(10 * index)), math.cos(math.radians(10 * index))
+        turn = [[cosine, 0, sine, -sine], [0, 1, 0, 0], [-sine, 0, cosine, 1 - cosine]]
+        c2w[:, index, :3] = torch.tensor(turn)
+    (height, width), focal = size, float(max(size))
+    intrinsics = torch.tensor([focal, focal, width / 2, height / 2]).expand(batch, count, 4)
+    return Views(images, Cameras(c2w, intrinsics, size))
 
 
 Task: TypeAlias = Callable[[], object]
@@ -116,42 +102,30 @@ def make_task(
 
     forward: photos to the Gaussians of the last layer, no gradients. render: those Gaussians from
     the cameras of the targets, no gradients. step: forward, every supervised layer rendered,
-    losses, backward, clipped gradients, AdamW.
+    losses, backward, clipped gradients, an optimiser step.
     """
+    inputs, targets = workload.inputs(), workload.supervision()
     if operation == "step":
-        return _step(recipe, model.train(), workload)
+        return _step(recipe, model.train(), inputs, targets, workload)
     model.eval()
-    return _forward(model, workload) if operation == "forward" else _render(model, workload)
-
-
-def _forward(model: QueryGaussianModel, workload: Workload) -> Task:
-    views = workload.inputs()
 
     @torch.inference_mode()
-    def forward() -> None:
+    def forward() -> Gaussians:
         with workload.autocast():
-            model(views)
+            return model(inputs).gaussians
 
-    return forward
-
-
-def _render(model: QueryGaussianModel, workload: Workload) -> Task:
-    cameras = workload.supervision().cameras
-    with torch.inference_mode(), workload.autocast():
-        gaussians = model(workload.inputs()).gaussians
-
-    @torch.inference_mode()
-    def render() -> None:
-        model.render(gaussians, cameras)
-
-    return render
+    if operation == "forward":
+        return forward
+    gaussians = forward()
+    return torch.inference_mode()(lambda: model.render(gaussians, targets.cameras))
 
 
-def _step(recipe: Recipe, model: QueryGaussianModel, workload: Workload) -> Task:
+def _step(
+    recipe: Recipe, model: QueryGaussianModel, inputs: Views, targets: Views, workload: Workload
+) -> Task:
     losses, render_views = recipe.build_losses(), recipe.training.render_views
     objective = Objective(model, losses, render_views).to(workload.device)
-    optimizer = make_optimizer(objective, recipe.training)
-    inputs, targets = workload.inputs(), workload.supervision()
+    optimizer = make_optimizer(objective, recipe.build_optimizer())
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)

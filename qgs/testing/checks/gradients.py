@@ -1,4 +1,4 @@
-"""Everything that is learned can be learned."""
+"""Gradients reach what is read, are right, and stay finite, as outputs do, for extreme inputs."""
 
 from __future__ import annotations
 
@@ -6,66 +6,121 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError, gradcheck
 from torch.func import functional_call
 
-from qgs.testing.case import Case
-from qgs.testing.chance import drawn_from
-from qgs.testing.faults import expect
-from qgs.testing.memory import is_torchs_own
-from qgs.testing.modes import each_mode
-from qgs.testing.registry import MODULES, PARAMETRIC, check
-from qgs.testing.subjects import Inputs, Sizes, inputs_of
-from qgs.testing.trees import cast, floating, mapped, scalar, tracked
+from qgs.testing.case import Case, expect
+from qgs.testing.inputs import (
+    QUERY_INPUTS,
+    Inputs,
+    Sizes,
+    inputs_of,
+    is_place,
+    required_fields,
+    tracked_inputs,
+)
+from qgs.testing.modules import each_mode, seeded
+from qgs.testing.registry import MODULES, check
+from qgs.testing.trees import cast, floating, gradients, mapped, not_finite, scalar
 
-SMALL = Sizes(batch=1, queries=3, views=2, gaussians=2)
+DRAWS = 8
+"""Inputs that are tried: a ReLU of the component may be closed for one of them."""
+
+READ = {
+    "cross_attention": ("state.features",),
+    "self_attention": ("state.features",),
+    "feed_forward": ("features",),
+    "refinement": (),
+    "head": ("state.features",),
+    "centers": ("offsets",),
+    "renderer": (
+        *("gaussians.means", "gaussians.scales", "gaussians.quats"),
+        *("gaussians.opacities", "gaussians.colors"),
+    ),
+    "losses": (),
+}
+"""Inputs that a component of each slot reads, whatever its options."""
+
+ITEMS = {"offsets": 2, "state": 1, "features": 1, "gaussians": 1}
+"""Number of dimensions behind that of the scenes that count queries and their Gaussians."""
+
+FEW = Sizes(batch=1, queries=3, views=2, gaussians=2)
+
+LARGE = 1e4
 
 
-CHANCES = 12
-"""Optimiser steps for what chance leaves out of some of them."""
+@check(READ)
+def check_gradients_reach_inputs(case: Case) -> None:
+    """What a component reads gets a gradient: the inputs of its slot and the fields it requires.
+    One stopped on purpose, as of reference points, is told as an expected failure of this check and
+    of `gradients_match_differences`.
 
-NOISE = 1e-10
-"""Gradients that are rounding errors in float64, in units of the largest one."""
-
-
-@check(PARAMETRIC)
-@drawn_from(0)
-def check_parameters_learn(case: Case) -> None:
-    """Every trainable parameter gets a finite, non-zero gradient within two optimiser steps.
-
-    More than a rounding error, that is, beside those of the other parameters and of the inputs; but
-    for biases of torch's own layers: that of attention's keys is taken away by the softmax.
-    Where training draws numbers, as to leave a layer out, within twelve.
+    Every query and every Gaussian of an input gets one. A component that requires nothing and gives
+    zeros alone is an ablation, and passes.
     """
-    module = case.build().double().train()
-    parameters = {n: p for n, p in module.named_parameters() if p.requires_grad}
-    if not parameters:
-        return
-    optimizer = torch.optim.SGD(parameters.values(), lr=0.01)
-    learned, offsets = set[str](), _biases_of_layers(module)
-    for step in range(CHANCES):
-        state = torch.get_rng_state()
-        optimizer.zero_grad()
-        inputs = tracked(cast(inputs_of(case, seed=step), torch.float64))
-        total = scalar(module(*inputs.values()))
-        if total.requires_grad:
-            total.backward()
-        noise = NOISE * _steepest([*parameters.values(), *floating(inputs).values()])
-        for name, parameter in parameters.items():
-            slope = parameter.grad
-            finite = slope is None or bool(slope.isfinite().all())
-            expect(finite, f"the gradient of `{name}` is not finite in step {step + 1}")
-            least = 0.0 if name in offsets else noise
-            if slope is not None and slope.abs().max() > least:
-                learned.add(name)
-        torch.nn.utils.clip_grad_norm_(parameters.values(), 1.0)
-        optimizer.step()
-        certain = torch.equal(state, torch.get_rng_state())
-        if step and (certain or len(learned) == len(parameters)):
-            break
-    dead = [name for name in parameters if name not in learned]
-    expect(not dead, f"no gradient reaches {', '.join(dead)}")
+    module, read = case.lively(), [*_read(case)]
+    provided = {f"fields.{name}" for name in case.component.provides(case.config)}
+    reached: dict[str, Tensor] = {}
+    zeros = not case.component.requires(case.config)
+    for inputs in _draws(case):
+        outputs = floating(module(*inputs.values()))
+        if case.slot == "refinement":
+            outputs = {name: outputs[name] for name in provided}
+        zeros = zeros and _are_zero(outputs)
+        for name, gradient in gradients(scalar(outputs), inputs).items():
+            items = _items_with(name, gradient != 0)
+            reached[name] = reached.get(name, items) | items
+        missing = [name for name in read if name not in reached or not reached[name].any()]
+        partly = [name for name in read if name not in missing and not reached[name].all()]
+        if not missing and not partly:
+            return
+    told = ", ".join(sorted(missing))
+    if not missing:
+        indices = (~reached[partly[0]]).nonzero().squeeze(-1).tolist()
+        told = f"{', '.join(map(str, indices))} of {partly[0]}"
+    expect(zeros, f"no gradient reaches {told}")
+
+
+def _read(case: Case) -> Iterable[str]:
+    """Dotted names of the floating-point inputs that a component reads."""
+    yield from READ[case.slot]
+    state = "prediction.state" if case.slot == "losses" else "state"
+    fields = required_fields(case)
+    for name, spec in case.component.requires(case.config).items():
+        if spec.dtype.is_floating_point:
+            yield f"{state}.fields.{name}" if name in fields else name
+
+
+def _draws(case: Case) -> Iterable[Inputs]:
+    return (tracked_inputs(case, inputs_of(case, seed=seed)) for seed in range(DRAWS))
+
+
+def _are_zero(outputs: Any) -> bool:
+    return not any(x.any() for x in floating(outputs).values())
+
+
+def _items_with(name: str, holds: Tensor) -> Tensor:
+    """For which queries or Gaussians of an input, in any scene, something `holds`."""
+    kept = next((dims for part, dims in ITEMS.items() if f".{part}." in f".{name}."), 0)
+    return holds.any(0).reshape(*holds.shape[1 : 1 + kept], -1).any(-1)
+
+
+@check({"losses"})
+def check_terms_have_gradients(case: Case) -> None:
+    """Every term has a gradient in the prediction or in the rendering: else it trains nothing.
+
+    A loss that requires nothing and is zero for all that it is given, as one of weight 0, passes.
+    """
+    module = case.lively()
+    zeros, idle = not case.component.requires(case.config), None
+    for inputs in _draws(case):
+        terms = module(*inputs.values())
+        zeros = zeros and _are_zero(terms)
+        learned = {name: value for name, value in inputs.items() if name != "target"}
+        flat = {n for n, x in terms.items() if _are_zero(gradients(x, learned))}
+        idle = flat if idle is None else idle & flat
+    expect(zeros or not idle, f"no gradient comes from the term {', '.join(sorted(idle or ()))}")
 
 
 @check(MODULES - {"renderer"})
@@ -76,59 +131,112 @@ def check_gradients_match_differences(case: Case) -> None:
     """
     small = case.with_dims(width=8, heads=2) if case.has_parameters else case
     module = small.lively().double()
-    inputs = cast(inputs_of(small, SMALL), torch.float64)
-    for mode in each_mode(module):
-        _expect_gradients(module, inputs, mode)
-
-
-def _expect_gradients(module: Any, inputs: Inputs, mode: str) -> None:
-    given = {n: x for n, x in floating(inputs).items() if _is_smooth(n)}
-    parameters = {f"parameter {n}": p.detach() for n, p in module.named_parameters()}
-    names = [*given, *parameters]
-    points = [x.detach().clone().requires_grad_() for x in (*given.values(), *parameters.values())]
+    inputs = cast(inputs_of(small, FEW), torch.float64)
+    # Poses must stay rigid, and masks are 0 or 1.
+    fixed = {"cameras", "masks"}
+    smooth = {n: x for n, x in floating(inputs).items() if not fixed & {*n.split(".")}}
+    parameters = {f"parameter {n}": p for n, p in module.named_parameters()}
+    points = {n: x.detach().clone().requires_grad_() for n, x in (smooth | parameters).items()}
 
     def value(*tensors: Tensor) -> Tensor:
-        at = dict(zip(names, tensors, strict=True))
-        changed = mapped(inputs, lambda name, tensor: at.get(name, tensor))
-        own = {n.removeprefix("parameter "): x for n, x in at.items() if n.startswith("parameter ")}
-        with drawn_from(0):
+        at = dict(zip(points, tensors, strict=True))
+        changed = mapped(inputs, lambda name, x: at.get(name, x))
+        own = {n.removeprefix("parameter "): x for n, x in at.items() if n in parameters}
+        with seeded(0):
             return scalar(functional_call(module, own, tuple(changed.values())))
 
-    if not value(*points).requires_grad:
-        _expect_constant(value, points, mode)
+    for mode in each_mode(module):
+        if not value(*points.values()).requires_grad:
+            continue  # what it should have gradients in is the subject of other checks
+        try:
+            gradcheck(value, [*points.values()], eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
+        except GradcheckError as error:
+            expect(False, f"in {mode}: {' '.join(str(error).split())}"[:400])
+
+
+@check(MODULES - {"queries"})
+def check_zeros_stay_finite(case: Case) -> None:
+    """Inputs of zeros give finite outputs and finite gradients."""
+    _expect_finite(case, "zeros", _changed(case, lambda _, x: torch.zeros_like(x)))
+
+
+@check(MODULES - {"encoder", "queries"})
+def check_large_numbers_stay_finite(case: Case) -> None:
+    """Inputs of some 1e4 give finite outputs and finite gradients."""
+
+    def enlarged(name: str, x: Tensor) -> Tensor:
+        return x if name.endswith(("images", "rgb", "alpha", "opacities")) else LARGE * x
+
+    _expect_finite(case, "inputs times 1e4", _changed(case, enlarged))
+
+
+@check(MODULES - {"encoder", "queries"})
+def check_coincident_queries_stay_finite(case: Case) -> None:
+    """Queries, anchors or Gaussians in one place give finite outputs and finite gradients."""
+
+    def together(name: str, x: Tensor) -> Tensor:
+        per_query = name.startswith((*QUERY_INPUTS, "gaussians", "prediction"))
+        return x[:, :1].expand_as(x).clone() if per_query else x
+
+    _expect_finite(case, "coincident queries", _changed(case, together))
+
+
+@check({"cross_attention", "self_attention", "refinement", "head", "centers", "renderer", "losses"})
+def check_points_behind_cameras_stay_finite(case: Case) -> None:
+    """Points behind every camera, or in a camera's centre, give finite outputs and gradients.
+
+    Of components that are given points: Gaussians, or fields of points that they require.
+    """
+    places = {name for name, spec in required_fields(case).items() if is_place(spec)}
+    if not places and case.slot not in ("renderer", "losses"):
         return
-    try:
-        gradcheck(value, points, eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
-    except GradcheckError as error:
-        expect(False, f"in {mode}: {' '.join(str(error).split())}"[:400])
+    for z, where in ((-2.0, "behind every camera"), (0.0, "in the centre of a camera")):
+
+        def moved(name: str, x: Tensor, z: float = z) -> Tensor:
+            if name.endswith("gaussians.means") or name.partition("fields.")[2] in places:
+                return torch.cat([x[..., :2] * (z != 0), torch.full_like(x[..., 2:], z)], -1)
+            return x
+
+        _expect_finite(case, f"points {where}", _changed(case, moved))
 
 
-def _biases_of_layers(module: nn.Module) -> set[str]:
-    """Names of the biases in layers of torch itself."""
-    owners = dict(module.named_modules())
-    return {
-        name
-        for name, _ in module.named_parameters()
-        if name.endswith(".bias") and is_torchs_own(owners[name.removesuffix(".bias")])
-    }
+@check({"encoder", "cross_attention", "renderer", "losses"})
+def check_duplicated_view_stays_finite(case: Case) -> None:
+    """A view that is given twice gives finite outputs and finite gradients."""
+
+    def twice(name: str, x: Tensor) -> Tensor:
+        if name.startswith("memory."):
+            axis = 2 if name in ("memory.keys", "memory.values") else 1
+            first = x.narrow(axis, 0, x.shape[axis] // 2)
+            return torch.cat([first, first], axis)
+        if name.startswith(("state", "gaussians", "prediction")) or not x.shape[1]:
+            return x
+        return x[:, :1].expand_as(x).clone()
+
+    _expect_finite(case, "a duplicated view", mapped(inputs_of(case), twice))
 
 
-def _steepest(tensors: Iterable[Tensor]) -> float:
-    """The largest number in the gradients of `tensors`."""
-    slopes = [x.grad for x in tensors if x.grad is not None and x.numel()]
-    return max((slope.abs().max().item() for slope in slopes), default=0.0)
+def _changed(case: Case, change: Callable[[str, Tensor], Tensor]) -> Inputs:
+    """Inputs with other numbers, except for cameras and what is made of them."""
+
+    def changed(name: str, x: Tensor) -> Tensor:
+        fixed = {"cameras", "patch_rays"} & {*name.split(".")} or not x.is_floating_point()
+        return x if fixed else change(name, x)
+
+    return mapped(inputs_of(case), changed)
 
 
-def _expect_constant(value: Callable[..., Tensor], points: list[Tensor], mode: str) -> None:
-    """What has no gradient at all must not change either."""
-    generator = torch.Generator().manual_seed(0)
-    moved = [x + 1e-3 * torch.randn(x.shape, generator=generator).to(x) for x in points]
-    change = (value(*moved) - value(*points)).abs().item()
-    expect(
-        change == 0, f"in {mode} it changes with its inputs, by {change:.2g}, but has no gradient"
-    )
-
-
-def _is_smooth(name: str) -> bool:
-    """Whether finite differences of an input mean something: poses must stay rigid."""
-    return ".cameras." not in f".{name}." and "masks" not in name
+def _expect_finite(case: Case, what: str, inputs: Inputs) -> None:
+    module = case.lively()
+    for mode in each_mode(module):
+        given, where = tracked_inputs(case, inputs), f"in {mode}, with {what}"
+        with seeded(0):
+            outputs = module(*given.values())
+            broken = not_finite(outputs)
+            expect(not broken, f"{where}, {', '.join(broken)} is not finite")
+            total = scalar(outputs)
+            if total.requires_grad:
+                total.backward()
+        named = [*floating(given).items(), *module.named_parameters()]
+        broken = not_finite({n: x.grad for n, x in named if x.grad is not None})
+        expect(not broken, f"{where}, the gradient of {', '.join(broken)} is not finite")

@@ -1,33 +1,21 @@
-"""Geometry keeps float32 under autocast, float64 stays float64, and devices do not matter."""
+"""Geometry keeps float32 under autocast, learned layers stay close, float64 stays float64."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from qgs.contracts import CrossAttention, SelfAttention
-from qgs.testing.case import Case
-from qgs.testing.chance import drawn_from
-from qgs.testing.faults import CannotCheck, expect
-from qgs.testing.learned import HalvedProducts, LearnedLayers, ReplayedLayers
-from qgs.testing.modes import each_mode
-from qgs.testing.registry import MODULES, PARAMETRIC, check
-from qgs.testing.subjects import Inputs, inputs_of
-from qgs.testing.trees import (
-    cast,
-    described,
-    distance,
-    floating,
-    leaves,
-    mapped,
-    not_finite,
-    tracked,
-)
+from qgs.geometry.precision import at_least_float32
+from qgs.testing.case import CannotCheck, Case, expect
+from qgs.testing.inputs import Inputs, inputs_of
+from qgs.testing.modules import each_mode, seeded
+from qgs.testing.registry import MODULES, check
+from qgs.testing.trees import cast, described, difference, floating, leaves, mapped, not_finite
+from qgs.types import map_tensors, named_tensors
 
 EXPLAINED = "explain.geometry"
 """What geometry adds to attention logits; -inf where it keeps a query from looking."""
@@ -45,14 +33,10 @@ GEOMETRY = {
 }
 """Outputs that are geometry, or measures of it, by the beginning of their names."""
 
-HALVED = (
-    "features",
-    "state.features",
-    "memory.keys",
-    "memory.values",
-    "memory.features",
-    "offsets",
-)
+HALVED = {
+    *("features", "state.features", "offsets"),
+    *("memory.keys", "memory.values", "memory.features"),
+}
 """Inputs that arrive in bfloat16 under autocast."""
 
 RTOL, ATOL = 1e-5, 1e-6
@@ -60,6 +44,19 @@ RTOL, ATOL = 1e-5, 1e-6
 
 CLOSE = 0.1
 """How far bfloat16 may take an output from its float32 value, in units of its spread."""
+
+LAYERS = {
+    *("linear", "bilinear", "conv1d", "conv2d", "conv3d", "layer_norm", "rms_norm", "group_norm"),
+    *("gru", "lstm", "gru_cell", "lstm_cell", "rnn_tanh_cell", "rnn_relu_cell"),
+    *("multi_head_attention_forward", "scaled_dot_product_attention"),
+}
+"""Functions of torch that are layers of a network, if anything in them is learned."""
+
+PRODUCTS = {
+    *("matmul", "__matmul__", "__rmatmul__"),
+    *("mm", "mv", "bmm", "addmm", "baddbmm", "einsum"),
+}
+"""Functions of torch that are layers or geometry, such as a rotation of points."""
 
 
 @check(MODULES)
@@ -75,17 +72,13 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
     if case.slot == "queries":
         module.requires_grad_(False)  # its parameters are no layers: they are the geometry
     for mode in each_mode(module):
-        _expect_geometry_in_float32(case, module, mode)
+        _expect_geometry_in_float32(case, module, f"in {mode} under autocast")
 
 
-def _expect_geometry_in_float32(case: Case, module: Any, mode: str) -> None:
-    inputs, where = _halved(inputs_of(case)), f"in {mode} under autocast"
-    with (
-        drawn_from(0),
-        torch.autocast(case.device, dtype=torch.bfloat16),
-        LearnedLayers() as layers,
-        HalvedProducts() as halved,
-    ):
+def _expect_geometry_in_float32(case: Case, module: Any, where: str) -> None:
+    inputs = _halved(inputs_of(case))
+    autocast = torch.autocast(case.device, dtype=torch.bfloat16)
+    with seeded(0), autocast, LearnedLayers() as layers:
         outputs = _with_explanation(module, inputs)
     broken = [name for name in not_finite(outputs) if name != EXPLAINED]
     expect(not broken, f"{where} {', '.join(broken)} is not finite")
@@ -93,16 +86,39 @@ def _expect_geometry_in_float32(case: Case, module: Any, mode: str) -> None:
     for name, tensor in seen.items():
         kept = tensor.dtype == torch.float32
         expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
-    with drawn_from(0), ReplayedLayers(layers.outputs) as replayed:
+    with seeded(0), LearnedLayers(layers.outputs) as replayed:
         exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
     placed = {name: x for name, x in seen.items() if name not in _learned_fields(case)}
-    found = distance({name: exact[name] for name in placed}, placed, RTOL, ATOL)
+    found = difference({name: exact[name] for name in placed}, placed, RTOL, ATOL)
     if found and replayed.differs:
         raise CannotCheck("in float32 it calls other layers than under autocast")
     expect(not found, f"{where}, against float32, {found}")
     if isinstance(module, CrossAttention | SelfAttention):
-        told = ", ".join(sorted(halved.names))
-        expect(not told, f"{where} the product of float32 geometry by {told} is in bfloat16")
+        names = ", ".join(sorted(layers.halved))
+        expect(not names, f"{where} the product of float32 geometry by {names} is in bfloat16")
+
+
+def _halved(inputs: Inputs) -> Inputs:
+    """Features in bfloat16, which require gradients; geometry requires none."""
+    return mapped(inputs, lambda name, x: x.bfloat16().requires_grad_() if name in HALVED else x)
+
+
+def _with_explanation(module: Any, inputs: Inputs) -> dict[str, Any]:
+    """The outputs, and what geometry adds to the logits of an attention that explains itself."""
+    outputs = leaves(module(*inputs.values()))
+    if isinstance(module, CrossAttention | SelfAttention):
+        explain: Any = module.explain
+        weights = explain(*inputs.values(), torch.arange(inputs["state"].features.shape[1]))
+        if weights is not None and weights.geometry is not None:
+            outputs[EXPLAINED] = weights.geometry
+    return outputs
+
+
+def _learned_fields(case: Case) -> set[str]:
+    """Provided fields that stand in no frame and carry on none that was read."""
+    required = case.component.requires(case.config)
+    provided = case.component.provides(case.config).items()
+    return {f"fields.{n}" for n, spec in provided if spec.frame == "none" and n not in required}
 
 
 @check(MODULES)
@@ -124,64 +140,48 @@ def check_float64_stays_float64(case: Case) -> None:
     """A float64 component with float64 inputs gives float64 outputs, in training too."""
     module = case.lively().double()
     for mode in each_mode(module):
-        with drawn_from(0):
+        with seeded(0):
             outputs = module(*cast(inputs_of(case), torch.float64).values())
         for name, tensor in floating(outputs).items():
             kept = tensor.dtype == torch.float64
             expect(kept, f"in {mode} `{name}` is {described(tensor)} for float64 inputs")
 
 
-@check(PARAMETRIC)
-def check_moves_to_a_device(case: Case) -> None:
-    """Moved to another device (CUDA, else meta), a component computes there, without the CPU."""
-    device = "cuda" if torch.cuda.is_available() else "meta"
-    module = case.lively().to(device)
-    inputs = tracked(mapped(inputs_of(case), lambda _, x: x.to(device)))
-    with _autocast_knows_meta():
-        outputs = floating(module(*inputs.values()))
-    for name, tensor in outputs.items():
-        moved = tensor.device.type == device
-        expect(moved, f"`{name}` is on {tensor.device}, the component on {device}")
-    slopes = [x.sum() for x in outputs.values() if x.requires_grad]
-    if slopes:
-        torch.autograd.backward(slopes)
+class LearnedLayers(TorchFunctionMode):
+    """Keeps what learned layers give, in their order, in `outputs`; or gives `replayed` instead.
+
+    A product counts as a learned layer if all its factors require gradients: parameters, features,
+    and what is made of them. halved: names of the products of float32 tensors, none of them
+    learned, that autocast took to bfloat16. differs: whether other layers were called than those
+    that gave `replayed`; from the first such one on, layers give what they compute.
+    """
+
+    def __init__(self, replayed: Iterable[tuple[str, Any]] | None = None) -> None:
+        super().__init__()
+        self.outputs: list[tuple[str, Any]] = []
+        self.halved: set[str] = set()
+        self.differs = False
+        self._replayed = None if replayed is None else iter(replayed)
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call `func`; keep what it gives if it is a learned layer, or give what is replayed."""
+        given = func(*args, **(kwargs or {}))
+        name = getattr(func, "__name__", "")
+        factors = [x for _, x in named_tensors([args, kwargs or {}])]
+        learned = [x.requires_grad for x in factors]
+        if not ((name in LAYERS and any(learned)) or (name in PRODUCTS and all(learned))):
+            halved = name in PRODUCTS and given.dtype == torch.bfloat16 and not any(learned)
+            if halved and all(x.dtype == torch.float32 for x in factors):
+                self.halved.add(name)
+            return given
+        if self._replayed is None:
+            self.outputs.append((name, map_tensors(torch.clone, given)))
+        elif not self.differs:
+            recorded, before = next(self._replayed, ("", None))
+            self.differs = recorded != name or _shapes(before) != _shapes(given)
+            return given if self.differs else map_tensors(at_least_float32, before)
+        return given
 
 
-@contextmanager
-def _autocast_knows_meta() -> Iterator[None]:
-    """`torch.autocast(x.device.type, enabled=False)` is sound code, which torch refuses on meta."""
-    start = torch.autocast.__init__
-
-    def begin(self: Any, device_type: str, *args: Any, **kwargs: Any) -> None:
-        start(self, "cpu" if device_type == "meta" else device_type, *args, **kwargs)
-
-    with patch.object(torch.autocast, "__init__", begin):
-        yield
-
-
-def _halved(inputs: Inputs) -> Inputs:
-    """Features in bfloat16, which ask for gradients; geometry asks for none."""
-
-    def visit(name: str, x: Tensor) -> Tensor:
-        return x.to(torch.bfloat16).requires_grad_() if name in HALVED else x
-
-    return mapped(inputs, visit)
-
-
-def _with_explanation(module: Any, inputs: Inputs) -> dict[str, Any]:
-    """The outputs, and what geometry adds to the logits of an attention that tells it."""
-    outputs = leaves(module(*inputs.values()))
-    if isinstance(module, CrossAttention | SelfAttention):
-        queries = torch.arange(inputs["state"].features.shape[1])
-        explain: Any = module.explain
-        weights = explain(*inputs.values(), queries)
-        if weights is not None and weights.geometry is not None:
-            outputs[EXPLAINED] = weights.geometry
-    return outputs
-
-
-def _learned_fields(case: Case) -> set[str]:
-    """Provided fields that stand in no frame and carry on none that was read."""
-    required = case.component.requires(case.config)
-    provided = case.component.provides(case.config).items()
-    return {f"fields.{n}" for n, spec in provided if spec.frame == "none" and n not in required}
+def _shapes(value: Any) -> list[torch.Size]:
+    return [tensor.shape for _, tensor in named_tensors(value)]

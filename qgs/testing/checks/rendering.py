@@ -1,13 +1,13 @@
-"""Renderings of a smooth scene: depth, and gradients in Gaussians, poses and intrinsics.
+"""Renderers: the background, depth, and gradients in Gaussians, poses and intrinsics.
 
-The scene is one without jumps, so that differences mean something: every Gaussian contributes to
-every pixel, far above `alpha_min`, none blocks what is behind it, and none changes its place in
-the order of depths.
+Finite differences are taken in a scene without jumps: every Gaussian contributes to every pixel,
+far above `alpha_min`, none blocks what is behind it, and none changes its place in the order of
+depths.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -15,14 +15,11 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Renderer
-from qgs.testing.case import Case
-from qgs.testing.faults import expect
+from qgs.testing.case import Case, expect
+from qgs.testing.inputs import Inputs, Sizes, inputs_of, tracked_inputs
 from qgs.testing.registry import check
-from qgs.testing.subjects import Inputs, Sizes, inputs_of
-from qgs.testing.trees import floating, mapped, tracked
-
-Move = Callable[[float], Tensor]
-"""A tensor, moved by so many times a step."""
+from qgs.testing.trees import gradients, leaves, mapped, not_finite, scalar, tracked
+from qgs.types import map_tensors
 
 ALONG_GRADIENT = 0.03
 """Length of the step of all numbers of a tensor along their gradient."""
@@ -40,11 +37,42 @@ CAMERA_TENSORS = ("c2w", "intrinsics")
 
 
 @check({"renderer"})
+def check_no_gaussians_give_the_background(case: Case) -> None:
+    """Without Gaussians the image is the background, finite, with finite gradients."""
+    module, inputs = case.lively(), tracked_inputs(case, inputs_of(case))
+    empty = tracked(map_tensors(lambda x: x[:, :0], inputs["gaussians"]))
+    colour = torch.tensor([0.1, 0.6, 0.9]).to(inputs["cameras"].c2w)
+    out = module(empty, inputs["cameras"], colour)
+    background = colour[:, None, None].expand_as(out.rgb)
+    expect(torch.allclose(out.rgb, background, atol=1e-6), "the image is not the background")
+    expect(not (out.alpha.any() or out.depth.any()), "alpha or depth is not zero")
+    expect(not not_finite(out), "the rendering is not finite")
+    total = scalar(out)
+    if total.requires_grad:
+        total.backward()
+    given = {**leaves(empty), **leaves(inputs["cameras"])}
+    broken = not_finite({n: x.grad for n, x in given.items() if x.grad is not None})
+    expect(not broken, f"the gradient of {', '.join(broken)} is not finite")
+
+
+@check({"renderer"})
+def check_rendering_is_over_the_background(case: Case) -> None:
+    """alpha is in [0, 1], and where it is below 1 the background shows by what is missing."""
+    module, inputs = case.lively(), inputs_of(case)
+    black, white = (torch.full((3,), v).to(inputs["cameras"].c2w) for v in (0.0, 1.0))
+    dark, light = (module(*inputs.values(), background=colour) for colour in (black, white))
+    low, high = dark.alpha.min().item(), dark.alpha.max().item()
+    expect(low >= 0 and high <= 1 + 1e-5, f"alpha is {low:.4g} to {high:.4g}")
+    off = (light.rgb - dark.rgb - (1 - dark.alpha)).abs().max().item()
+    expect(off < 1e-4, f"the background shows by up to {off:.3g} more or less than 1 - alpha")
+
+
+@check({"renderer"})
 def check_depth_is_expected(case: Case) -> None:
     """Depth is the camera-frame z of what is hit, weighted by how much each hit contributes."""
     module, inputs = case.lively(), _inputs(case, seed=0, views=2)
     gaussians, cameras = inputs["gaussians"], inputs["cameras"]
-    pair, near, far = (mapped(gaussians, lambda _, x, k=k: x[:, k]) for k in ([0, -1], [0], [-1]))
+    pair, near, far = (map_tensors(lambda x, k=k: x[:, k], gaussians) for k in ([0, -1], [0], [-1]))
     out = module(pair, cameras)
     front, behind = module(near, cameras).alpha, module(far, cameras).alpha
     behind = (1 - front) * behind
@@ -58,15 +86,11 @@ def check_depth_is_expected(case: Case) -> None:
 @check({"renderer"})
 def check_render_gradients_match_differences(case: Case) -> None:
     """The gradient of an image in the Gaussians agrees with finite differences."""
-    module = case.lively()
-    for seed, moves in ((0, _along_gradient), (1, _channel_by_channel)):
-        inputs = _inputs(case, seed)
-        given = {n: x for n, x in floating(tracked(inputs)).items() if n.startswith("gaussians")}
-        total = _brightness(module(*mapped(inputs, lambda n, x, g=given: g.get(n, x)).values()))
-        slopes = torch.autograd.grad(total, list(given.values()))
-        for (name, x), slope in zip(given.items(), slopes, strict=True):
-            for move, told in moves(x, slope):
-                _expect_change(module, inputs, name, move, told)
+    module, inputs = case.lively(), _inputs(case, seed=0)
+    given = tracked(inputs["gaussians"])
+    total = _brightness(module(**{**inputs, "gaussians": given}))
+    for name, gradient in gradients(total, {"gaussians": given}).items():
+        _expect_changes(module, inputs, name, gradient)
 
 
 @check({"renderer"})
@@ -76,27 +100,22 @@ def check_camera_gradients_match_differences(case: Case) -> None:
     A tensor of the cameras that `camera_gradients` does not name may raise ValueError when it
     requires a gradient.
     """
-    declared = _declared(case)
+    assert issubclass(case.component, Renderer)
+    declared = case.component.camera_gradients
     unknown = sorted(set(declared) - set(CAMERA_TENSORS))
     expect(not unknown, f"`camera_gradients` names {', '.join(unknown)}, no tensor of the cameras")
     module, inputs = case.lively(), _inputs(case, seed=1)
-    for name, moves in zip(CAMERA_TENSORS, (_pose_moves, _lens_moves), strict=True):
+    for name in CAMERA_TENSORS:
+        full = f"cameras.{name}"
+        alone = mapped(inputs, lambda n, x, own=full: x.clone().requires_grad_(n == own))
         try:
-            slope = _slope(module, inputs, f"cameras.{name}")
+            found = gradients(_brightness(module(*alone.values())), alone)
         except ValueError as error:
-            told = f"`camera_gradients` names {name}, but what requires one is refused: {error}"
-            expect(name not in declared, told)
+            seen = f"`camera_gradients` names {name}, but what requires one is refused: {error}"
+            expect(name not in declared, seen)
             continue
-        expect(slope is not None, f"`{name}` requires a gradient, is not refused, and gets none")
-        assert slope is not None
-        for move, change in moves(getattr(inputs["cameras"], name), slope):
-            _expect_change(module, inputs, f"cameras.{name}", move, change)
-
-
-def _declared(case: Case) -> tuple[str, ...]:
-    component = case.component
-    assert issubclass(component, Renderer)
-    return component.camera_gradients
+        expect(full in found, f"`{name}` requires a gradient, is not refused, and gets none")
+        _expect_changes(module, inputs, full, found[full])
 
 
 def _inputs(case: Case, seed: int, views: int = 1) -> Inputs:
@@ -117,72 +136,43 @@ def _inputs(case: Case, seed: int, views: int = 1) -> Inputs:
     return {**inputs, "gaussians": broad}
 
 
-def _slope(module: Any, inputs: Inputs, name: str) -> Tensor | None:
-    """The gradient in one input that alone requires one."""
-    alone = mapped(inputs, lambda n, x: x.detach().clone().requires_grad_(n == name))
-    total = _brightness(module(*alone.values()))
-    if not total.requires_grad:
-        return None
-    return torch.autograd.grad(total, floating(alone)[name], allow_unused=True)[0]
+def _expect_changes(module: Any, inputs: Inputs, name: str, gradient: Tensor) -> None:
+    """Moved there and back, one input changes the image as its `gradient` says."""
+    for there, back, expected in _moves(name, leaves(inputs)[name], gradient):
+        first, second = (
+            _brightness(module(*mapped(inputs, lambda n, x, m=x: m if n == name else x).values()))
+            for x in (there, back)
+        )
+        measured = ((first - second) / 2).item()
+        close = abs(measured - expected) <= 1e-6 + 0.03 * abs(expected)
+        seen = f"changes the image by {measured:.4g}, by its gradient {expected:.4g}"
+        expect(close, f"a step of `{name}` {seen}")
 
 
-def _along_gradient(x: Tensor, slope: Tensor) -> Iterator[tuple[Move, float]]:
-    step = ALONG_GRADIENT * slope / slope.norm().clamp_min(1e-12)
-    yield (lambda s: x + s * step), (slope * step).sum().item()
+def _moves(name: str, x: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Tensor, float]]:
+    """A tensor moved there, and back, and by how much the image changes by its `gradient`.
 
-
-def _channel_by_channel(x: Tensor, slope: Tensor) -> Iterator[tuple[Move, float]]:
-    """A move of all Gaussians (1, G, ...) in each number of theirs."""
-    for one in _unit_vectors(x[0, 0]):
-        yield (lambda s, d=CHANNEL * one: x + s * d), CHANNEL * (slope * one).sum().item()
-
-
-def _pose_moves(c2w: Tensor, slope: Tensor) -> Iterator[tuple[Move, float]]:
-    """The cameras moved along, and turned about, each of their own axes."""
-    for generator in (*_shifts(), *_turns()):
-        motion = POSE * generator.to(c2w)
-        move = lambda s, m=motion: c2w @ torch.linalg.matrix_exp(s * m)  # noqa: E731
-        yield move, ((c2w @ motion) * slope).sum().item()
-
-
-def _lens_moves(intrinsics: Tensor, slope: Tensor) -> Iterator[tuple[Move, float]]:
-    """Each focal length and each coordinate of the principal point."""
-    for one in _unit_vectors(intrinsics[0, 0]):
-        yield (lambda s, d=LENS * one: intrinsics + s * d), LENS * (slope * one).sum().item()
-
-
-def _unit_vectors(like: Tensor) -> Iterator[Tensor]:
-    yield from torch.eye(like.numel()).to(like).reshape(-1, *like.shape)
-
-
-def _shifts() -> Iterator[Tensor]:
-    """Generators (4, 4) of translations."""
-    for axis in range(3):
-        generator = torch.zeros(4, 4)
-        generator[axis, 3] = 1
-        yield generator
-
-
-def _turns() -> Iterator[Tensor]:
-    """Generators (4, 4) of rotations."""
-    for axis in range(3):
-        generator = torch.zeros(4, 4)
-        one, other = (axis + 1) % 3, (axis + 2) % 3
-        generator[other, one], generator[one, other] = 1, -1
-        yield generator
-
-
-def _expect_change(module: Any, inputs: Inputs, name: str, move: Move, told: float) -> None:
-    """Moved there and back, one input changes the image as its gradient tells."""
-
-    def shifted(sign: int) -> Tensor:
-        at = mapped(inputs, lambda n, x: (move(sign) if n == name else x).detach())
-        return _brightness(module(*at.values()))
-
-    measured = ((shifted(1) - shifted(-1)) / 2).item()
-    close = abs(measured - told) <= 1e-6 + 0.03 * abs(told)
-    seen = f"a step of `{name}` changes the image by {measured:.4g}, by its gradient {told:.4g}"
-    expect(close, seen)
+    Gaussians along the gradient and channel by channel, cameras along and about each of their axes,
+    focal lengths and principal points one by one.
+    """
+    if name == "cameras.c2w":
+        for index in range(6):
+            motion = torch.zeros(4, 4).to(x)
+            axis, one, other = index % 3, (index + 1) % 3, (index + 2) % 3
+            if index < 3:
+                motion[axis, 3] = POSE
+            else:
+                motion[other, one], motion[one, other] = POSE, -POSE
+            there, back = (x @ torch.linalg.matrix_exp(sign * motion) for sign in (1, -1))
+            yield there, back, ((x @ motion) * gradient).sum().item()
+        return
+    channels = torch.eye(x[0, 0].numel()).to(x).reshape(-1, *x[0, 0].shape)
+    steps = [LENS * channel for channel in channels]
+    if name.startswith("gaussians"):
+        steps = [CHANNEL * channel for channel in channels]
+        steps.append(ALONG_GRADIENT * gradient / gradient.norm().clamp_min(1e-12))
+    for step in steps:
+        yield x + step, x - step, (gradient * step).sum().item()
 
 
 def _brightness(rendering: Any) -> Tensor:

@@ -1,34 +1,39 @@
-"""What only the components of one slot promise."""
+"""What components of one slot alone promise; for renderers, see `rendering`."""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from qgs.contracts import Loss
-from qgs.testing.case import Case
-from qgs.testing.chance import drawn_from
-from qgs.testing.faults import CannotCheck, expect
-from qgs.testing.modes import each_mode
+from qgs.contracts import AttentionWeights, Loss
+from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.testing.case import CannotCheck, Case, expect
+from qgs.testing.inputs import Inputs, Sizes, inputs_of
+from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import check
-from qgs.testing.subjects import inputs_of, tracked_inputs
-from qgs.testing.trees import (
-    described,
-    difference,
-    distance,
-    leaves,
-    mapped,
-    not_finite,
-    scalar,
-    tracked,
-)
-from qgs.types import GaussianAttributes
+from qgs.testing.trees import described, difference, mapped
+from qgs.types import GaussianAttributes, ImageMemory, Views, map_tensors
 
-LOGITS = (0.0, 1.0, 100.0)
-"""Factors on the features that a head which has learned must turn into valid Gaussians."""
+FACTORS = (0.0, 1.0, 100.0)
+"""Of the features that a head which has learned must turn into valid Gaussians."""
+
+PATCHES = 12
+"""How many patches are changed, one at a time."""
+
+CLOSE = 1e-3
+"""How far attention weights, or their logarithms, may be from those that are recomputed."""
+
+NEGLIGIBLE = 1e-6
+"""Weights below which a token counts for hidden from a query."""
+
+Patch = tuple[int, int, int]
+"""View, row and column."""
 
 
 @check({"head"})
@@ -37,17 +42,14 @@ def check_head_gives_gaussians(case: Case) -> None:
 
     With initial parameters too, for ordinary features.
     """
-    _expect_gaussians(case, case.build(), 1.0, "with initial parameters,")
-    for factor in LOGITS:
-        _expect_gaussians(case, case.lively(), factor, f"for features times {factor:g}")
-
-
-def _expect_gaussians(case: Case, module: Any, factor: float, where: str) -> None:
+    modules = [(case.build(), 1.0, "with initial parameters,")]
+    modules += [(case.lively(), factor, f"for features times {factor:g}") for factor in FACTORS]
     state = inputs_of(case)["state"]
-    for mode in each_mode(module):
-        with drawn_from(0), torch.no_grad():
-            out = module(state.replace(factor * state.features))
-        _expect_valid(out, factor > 1, f"in {mode}, {where}")
+    for module, factor, where in modules:
+        for mode in each_mode(module):
+            with seeded(0), torch.no_grad():
+                out = module(state.replace(factor * state.features))
+            _expect_valid(out, factor > 1, f"in {mode}, {where}")
 
 
 def _expect_valid(out: GaussianAttributes, saturated: bool, where: str) -> None:
@@ -56,23 +58,19 @@ def _expect_valid(out: GaussianAttributes, saturated: bool, where: str) -> None:
     unit = torch.allclose(length, torch.ones_like(length), atol=1e-4)
     expect(unit, f"{where} quaternions are {length.min():.4g} to {length.max():.4g} long")
     expect(bool((out.scales > 0).all()), f"{where} a scale is {out.scales.min():.4g}")
-    low, high = out.opacities.min(), out.opacities.max()
-    inside = bool(low >= 0) and bool(high <= 1)
-    strict = inside and (saturated or (bool(low > 0) and bool(high < 1)))
-    expect(strict, f"{where} opacities are {low:.4g} to {high:.4g}")
-    low, high = out.colors.min(), out.colors.max()
-    expect(bool(low >= 0) and bool(high <= 1), f"{where} colours are {low:.4g} to {high:.4g}")
+    for name, x, ends in (("opacities", out.opacities, saturated), ("colours", out.colors, True)):
+        low, high = x.min().item(), x.max().item()
+        inside = (low >= 0 and high <= 1) if ends else (low > 0 and high < 1)
+        expect(inside, f"{where} {name} are {low:.4g} to {high:.4g}")
 
 
 @check({"queries"})
 def check_queries_are_shared_by_scenes(case: Case) -> None:
     """Every scene starts from the same state, for any number of scenes."""
     module = case.lively()
-    one = module(1)
-    several = module(3)
+    one, several = module(1), module(3)
     for scene in range(3):
-        own = mapped(several, lambda _, x, scene=scene: x[scene : scene + 1])
-        found = distance(one, own, 0.0, 0.0)
+        found = difference(one, map_tensors(lambda x, s=scene: x[s : s + 1], several))
         expect(not found, f"scene {scene} of 3 starts otherwise than a scene alone: {found}")
 
 
@@ -82,9 +80,13 @@ def check_queries_resize(case: Case) -> None:
 
     Checked of components whose option `count` says how many there are.
     """
-    module = case.build()
+    module, options = case.build(), case.config.model_dump(mode="json")
+    if "count" not in options:
+        raise CannotCheck("no option `count` says how many queries there are")
     for count in (max(module.count // 2, 1), module.count + 3):
-        learned = dict(_of_count(case, count).build(seed=1).state_dict())
+        text = json.dumps({**options, "count": count})
+        config = type(case.config).model_validate_json(text)
+        learned = dict(replace(case, config=config, state_dict=None).build(seed=1).state_dict())
         resized = module.resized(learned, torch.Generator().manual_seed(0))
         try:
             case.build(seed=2).load_state_dict(resized)
@@ -94,15 +96,6 @@ def check_queries_resize(case: Case) -> None:
             first = slice(min(len(values), len(resized[name]))) if values.ndim else ...
             kept = torch.equal(resized[name][first], values[first])
             expect(kept, f"of {count} queries, `resized` changes `{name}` of the first")
-
-
-def _of_count(case: Case, count: int) -> Case:
-    """The same component with another number of queries."""
-    options = case.config.model_dump(mode="json")
-    if "count" not in options:
-        raise CannotCheck("no option `count` says how many queries there are")
-    text = json.dumps({**options, "count": count})
-    return replace(case, config=type(case.config).model_validate_json(text), state_dict=None)
 
 
 @check({"supervision"})
@@ -128,77 +121,192 @@ def check_scenes_repeat(case: Case) -> None:
     frames = list(range(min(2, len(first))))
     images = first.images(frames)
     wanted = (len(frames), 3, *first.cameras.size)
-    expect(tuple(images.shape) == wanted, f"images are {described(images)}, not {wanted}")
+    right = tuple(images.shape) == wanted and images.dtype == torch.float32
+    expect(right, f"images are {described(images)}, not float32 of shape {wanted}")
     low, high = images.min().item(), images.max().item()
-    expect(images.dtype == torch.float32, f"images are {described(images)}, not float32")
     expect(low >= 0 and high <= 1, f"images are in [{low:.3g}, {high:.3g}]")
-    found = difference(first.cameras, second.cameras)
-    found = found or difference(images, second.images(frames))
+    found = difference([first.cameras, images], [second.cameras, second.images(frames)])
     expect(not found, f"opened again, {found}")
-
-
-@check({"renderer"})
-def check_no_gaussians_give_the_background(case: Case) -> None:
-    """Without Gaussians the image is the background, finite, with finite gradients."""
-    module, inputs = case.lively(), tracked_inputs(case, inputs_of(case))
-    empty = tracked(mapped(inputs["gaussians"], lambda _, x: x[:, :0]))
-    colour = torch.tensor([0.1, 0.6, 0.9]).to(inputs["cameras"].c2w)
-    out = module(empty, inputs["cameras"], colour)
-    backdrop = colour[:, None, None].expand_as(out.rgb)
-    expect(torch.allclose(out.rgb, backdrop, atol=1e-6), "the image is not the background")
-    expect(not bool(out.alpha.any()), "alpha is not zero")
-    expect(not bool(out.depth.any()), "depth is not zero")
-    expect(not not_finite(out), "the rendering is not finite")
-    total = scalar(out)
-    if total.requires_grad:
-        total.backward()
-    given = {**leaves(empty), **leaves(inputs["cameras"])}
-    broken = [n for n, x in given.items() if x.grad is not None and not x.grad.isfinite().all()]
-    expect(not broken, f"the gradient of {', '.join(broken)} is not finite")
-
-
-@check({"renderer"})
-def check_rendering_is_over_the_background(case: Case) -> None:
-    """alpha is in [0, 1], and where it is below 1 the background shows by what is missing."""
-    module, inputs = case.lively(), inputs_of(case)
-    black, white = (torch.full((3,), v).to(inputs["cameras"].c2w) for v in (0.0, 1.0))
-    dark, light = (module(*inputs.values(), background=colour) for colour in (black, white))
-    low, high = dark.alpha.min().item(), dark.alpha.max().item()
-    expect(low >= 0 and high <= 1 + 1e-5, f"alpha is {low:.4g} to {high:.4g}")
-    off = (light.rgb - dark.rgb - (1 - dark.alpha)).abs().max().item()
-    expect(off < 1e-4, f"the background shows by up to {off:.3g} more or less than 1 - alpha")
 
 
 @check({"losses"})
 def check_loss_is_a_mean_over_scenes(case: Case) -> None:
     """The terms of a batch are the mean of those of its scenes."""
     module, inputs = case.lively(), inputs_of(case)
-    alone = [
-        module(*mapped(inputs, lambda _, x, s=s: x[s : s + 1]).values()) for s in range(2)
-    ]  # fmt: skip
-    mean = {name: (alone[0][name] + alone[1][name]) / 2 for name in alone[0]}
-    found = distance(mean, module(*inputs.values()), 1e-4, 1e-6)
+    alone = [module(*map_tensors(lambda x, s=s: x[s : s + 1], inputs).values()) for s in range(2)]
+    found = difference(_mean(*alone), module(*inputs.values()), 1e-4, 1e-6)
     expect(not found, f"against the mean over scenes, {found}")
 
 
 @check({"losses"})
 def check_renderings_as_declared(case: Case) -> None:
     """A loss needs the renderings that `renderings` declares: of each view, of all, or none."""
-    module = case.lively()
+    module, inputs = case.lively(), inputs_of(case)
     assert isinstance(module, Loss)
-    inputs = inputs_of(case)
     terms = module(*inputs.values())
     for name, term in terms.items():
         expect(term.ndim == 0, f"the term `{name}` is of shape {tuple(term.shape)}, not 0-d")
     if module.renderings == "each":
-        parts = [module(*_view(inputs, view).values()) for view in range(2)]
-        mean = {name: (parts[0][name] + parts[1][name]) / 2 for name in parts[0]}
-        found = distance(mean, terms, 1e-4, 1e-6)
+        alone = []
+        for view in range(2):
+            seen = map_tensors(lambda x, v=view: x[:, v : v + 1], inputs["rendering"])
+            target = inputs["target"].select([view])
+            alone.append(module(inputs["prediction"], seen, target))
+        found = difference(_mean(*alone), terms, 1e-4, 1e-6)
         expect(not found, f"`each` is declared; against the mean over views, {found}")
 
 
-def _view(inputs: dict[str, Any], view: int) -> dict[str, Any]:
-    """The inputs of a loss with one of the target views."""
-    rendering, target = inputs["rendering"], inputs["target"]
-    seen = mapped(rendering, lambda _, x: x[:, view : view + 1])
-    return {**inputs, "rendering": seen, "target": target.select([view])}
+def _mean(one: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: (one[name] + other[name]) / 2 for name in one}
+
+
+@check({"encoder"})
+def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
+    """`grid` counts the patches of each view, `patch_rays` are their mean rays, in its order."""
+    module = case.lively()
+    for where, views in _wide_and_tall(case):
+        memory = module(views)
+        patch = _patch_size(where, views, memory)
+        rays = patch_rays(plucker_rays(views.cameras), patch)
+        found = difference({"patch_rays": memory.patch_rays}, {"patch_rays": rays}, 1e-4, 1e-5)
+        expect(not found, f"{where}, against the mean rays of patches of {patch} pixels, {found}")
+
+
+@check({"encoder"})
+def check_tokens_are_those_of_the_grid(case: Case) -> None:
+    """What one patch shows changes its own token most: that of its place in `grid`.
+
+    True of most of the patches, since a token may see far beyond its own. Keys may be those of the
+    rays alone.
+    """
+    module = case.build().eval()
+    for where, views in _wide_and_tall(case):
+        views = map_tensors(lambda x: x[:1], views)
+        memory = module(views)
+        patch, grid = _patch_size(where, views, memory), memory.grid
+        tokens = torch.randperm(math.prod(grid), generator=torch.Generator().manual_seed(0))
+        places = [_place(int(token), grid) for token in tokens[:PATCHES]]
+        changed = module(_one_patch_each(views, places, patch))
+        for name in ("keys", "values", "features"):
+            change = (getattr(changed, name) - getattr(memory, name)).square().sum(-1)
+            change = change.sum(1) if change.ndim == 3 else change
+            if not change.any():
+                expect(name == "keys", f"{where}, `{name}` stays as it is when the images change")
+                continue
+            moved = [_place(int(token), grid) for token in change.argmax(-1)]
+            astray = [pair for pair in zip(places, moved, strict=True) if pair[0] != pair[1]]
+            one, other = astray[0] if astray else (None, None)
+            expect(
+                2 * len(astray) < len(places),
+                f"{where}, a change at view, row, column {one} changes most the token of "
+                f"`{name}` at {other}, and so do {len(astray)} of {len(places)}",
+            )
+
+
+def _wide_and_tall(case: Case) -> Iterator[tuple[str, Views]]:
+    """Views of the size of the case and, where the component takes them, turned by 90 degrees."""
+    height, width = case.size
+    for size in dict.fromkeys([(height, width), (width, height)]):
+        if size == case.size or not case.problems(size):
+            where = f"with images of {size[0]} x {size[1]}"
+            yield where, inputs_of(case, Sizes(image=size))["views"]
+
+
+def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
+    """Pixels along a patch, as the grid of `memory` says."""
+    count, (height, width), grid = views.images.shape[1], views.cameras.size, memory.grid
+    patch = max(height // max(grid[1], 1), 1)
+    right = grid == (count, height / patch, width / patch)
+    seen = f"{where} of {count} views, `grid` is {grid}, which is not (V, H/P, W/P) for any P"
+    expect(right, seen)
+    return patch
+
+
+def _place(token: int, grid: Patch) -> Patch:
+    _, rows, columns = grid
+    return token // (rows * columns), token // columns % rows, token % columns
+
+
+def _one_patch_each(views: Views, places: list[Patch], patch: int) -> Views:
+    """A scene for each of `places`: the one given, with other noise in this one patch."""
+    scenes = map_tensors(lambda x: x.expand(len(places), *x.shape[1:]).clone(), views)
+    generator = torch.Generator().manual_seed(1)
+    for images, (view, row, column) in zip(scenes.images, places, strict=True):
+        seen = images[view, :, row * patch : (row + 1) * patch, column * patch :][..., :patch]
+        seen.copy_(torch.rand(seen.shape, generator=generator))
+    return scenes
+
+
+@check({"cross_attention"})
+def check_memo_is_of_the_memory_alone(case: Case) -> None:
+    """What `ImageMemory.once` keeps is made of the memory: not of the state, nor of a weight.
+
+    A layer gives on a memory that others have read what it gives on a fresh one. What a layer's own
+    weights make of the memory belongs to that layer alone, and into no memo.
+    """
+    layer, next_layer = case.lively(seed=0), case.lively(seed=1)
+    inputs, later = inputs_of(case), inputs_of(case, seed=1)
+    memory = inputs["memory"]
+    layer(inputs["state"], memory)
+    for reader, what in ((layer, "the state"), (next_layer, "a weight")):
+        read = reader(later["state"], memory)
+        found = difference(reader(later["state"], replace(memory)), read)
+        seen = f"what it keeps in the memory depends on {what}: read after another layer, {found}"
+        expect(not found, seen)
+
+
+@check({"cross_attention", "self_attention"})
+def check_explanation_is_a_softmax(case: Case) -> None:
+    """The weights that `explain` gives are the softmax of content and geometry."""
+    given = _explanation(case.lively(), inputs_of(case))
+    if given is None:
+        return
+    logits = given.content if given.geometry is None else given.content + given.geometry
+    weights, shape = logits.softmax(-1), described(given.weights)
+    expect(given.weights.shape == weights.shape, f"weights are {shape}, logits {described(logits)}")
+    off = (given.weights - weights).abs().max().item()
+    expect(off < CLOSE, f"weights are off the softmax of content and geometry by up to {off:.3g}")
+
+
+@check({"cross_attention"})
+def check_explanation_is_of_the_forward_pass(case: Case) -> None:
+    """The weights that `explain` gives are those by which a forward pass reads the values.
+
+    The gradient of a query's update in the value of a token is the weight, times what all tokens
+    share, times what all queries share where values are rescaled. So from one query to the next,
+    the lengths of these gradients change as the weights do, but for a factor. Where no geometry is
+    given, queries of equal features look at the same.
+    """
+    module, inputs = case.lively(), inputs_of(case)
+    given = _explanation(module, inputs)
+    if given is None or "memory.values" not in case.component.requires(case.config):
+        return
+    if given.geometry is None:
+        state = inputs["state"]
+        inputs["state"] = state.replace(state.features[:, :1].expand_as(state.features).clone())
+        given = _explanation(module, inputs) or given
+    inputs = mapped(inputs, lambda n, x: x.requires_grad_() if n == "memory.values" else x)
+    update, values = module(*inputs.values()), inputs["memory"].values
+    lengths = torch.stack([_lengths(update[:, n], values) for n in range(update.shape[1])], 2)
+    if not lengths.any():
+        return  # it reads no values, as another check says
+    off = (lengths.log() - given.weights.log()).diff(dim=2)
+    visible = torch.minimum(given.weights[:, :, 1:], given.weights[:, :, :-1]) > NEGLIGIBLE
+    high = off.where(visible, -torch.inf).amax(-1)
+    low = off.where(visible, torch.inf).amin(-1)
+    worst = (high - low).where(visible.any(-1), 0.0).max().item()
+    seen = "the weights change otherwise than the forward pass from one query to the next"
+    expect(worst < CLOSE, f"{seen}, in their logarithms by up to {worst:.3g}")
+
+
+def _lengths(update: Tensor, values: Tensor) -> Tensor:
+    """(B, h, M) of the gradients of a query's `update` (B, D) in `values` (B, h, M, d)."""
+    direction = torch.randn(update.shape, generator=torch.Generator().manual_seed(0))
+    (gradient,) = torch.autograd.grad(update, values, direction.to(update), retain_graph=True)
+    return gradient.norm(dim=-1)
+
+
+def _explanation(module: Any, inputs: Inputs) -> AttentionWeights | None:
+    """Attention of all queries, None for a component that does not explain itself."""
+    with torch.no_grad():
+        return module.explain(*inputs.values(), torch.arange(inputs["state"].features.shape[1]))

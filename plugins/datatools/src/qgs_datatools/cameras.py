@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-
 from qgs.data.photos.frames import Fault, Intrinsics, Size, intrinsics_faults, pose_faults
-from qgs_datatools.decoding import Decoded
-from qgs_datatools.findings import Finding, Photo
+
+from qgs_datatools.decoding import DecodedScene
+from qgs_datatools.findings import Finding
 
 _SAME = 2e-6  # of a rotation's entries, and of coordinates that float32 holds
 _DOUBLE = 1e-9  # of coordinates that float64 holds, after they were computed
@@ -18,161 +17,114 @@ _OF_EXTENT = 1e-4  # of the cameras' extent: farther apart, they stand apart
 _FAR_OFF_CENTRE = 0.25  # of a side, from the middle
 
 
-def camera_findings(
-    scene: str, photos: Sequence[Photo], decoded: Sequence[Decoded], sized: set[int]
-) -> tuple[list[Finding], list[Finding]]:
+def camera_findings(scene: DecodedScene, sized: set[int]) -> tuple[list[Finding], list[Finding]]:
     """What is wrong with single poses, and with intrinsics and the rest.
 
     sized: frames whose listed size is wrong, so that their intrinsics cannot be judged.
     """
     poses: list[Finding] = []
     others: list[Finding] = []
-    for frame, (photo, result) in enumerate(zip(photos, decoded, strict=True)):
+    for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         listed = photo.listed
         unread = bool(listed.faults) and not np.isfinite(listed.c2w).all()
         of_pose = [] if unread else list(pose_faults(listed.c2w))
         rest = list(listed.faults)
         if not listed.faults and frame not in sized:
-            rest += _intrinsics(listed.intrinsics, listed.size or result.size)
+            rest += _of_intrinsics(listed.intrinsics, listed.size or result.size)
         for faults, found in ((of_pose, poses), (rest, others)):
-            found += [
-                Finding(scene, fault.reason, fault.fix, (frame,), (listed.name,))
-                for fault in faults
-            ]
+            found += [scene.finding([frame], fault.reason, fault.fix) for fault in faults]
     return poses, others
 
 
-def _intrinsics(intrinsics: Intrinsics, size: Size | None) -> Iterator[Fault]:
+def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[Fault]:
     faults = list(intrinsics_faults(intrinsics, size))
-    yield from faults
     if size is None or faults:
-        return
+        return faults
     height, width = size
     _, _, cx, cy = intrinsics
-    if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _FAR_OFF_CENTRE:
-        yield Fault(
-            f"the principal point ({cx:.6g}, {cy:.6g}) is far from the middle of the {width} x "
-            f"{height} pixels",
-            "correct cx and cy, unless the photo is cut from a larger one",
-            fatal=False,
-        )
-
-
-@dataclass(frozen=True)
-class _Camera:
-    frame: int
-    name: str
-    c2w: np.ndarray
-    digest: bytes
+    if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) <= _FAR_OFF_CENTRE:
+        return []
+    reason = (
+        f"the principal point ({cx:.6g}, {cy:.6g}) is far from the middle of the {width} x "
+        f"{height} pixels"
+    )
+    return [Fault(reason, "correct cx and cy, unless the photo is cut from a larger one", False)]
 
 
 def sharing_findings(
-    scene: str,
-    photos: Sequence[Photo],
-    decoded: Sequence[Decoded],
-    sound: Sequence[int],
-    *,
-    float32: bool,
-) -> list[Finding]:
+    scene: DecodedScene, sound: Sequence[int], *, float32: bool
+) -> Iterator[Finding]:
     """Photos that share a pose, or only a place, among the frames whose poses are `sound`.
 
     float32: whether the format holds poses in float32.
     """
-    cameras = [
-        _Camera(frame, photos[frame].listed.name, photos[frame].listed.c2w, decoded[frame].digest)
-        for frame in sound
-    ]
-    if len(cameras) < 2:
-        return []
-    centres = np.stack([camera.c2w[:3, 3] for camera in cameras])
-    extent = float(np.ptp(centres, axis=0).max())
-    near, one_point = _tolerances(centres, extent, _rigidity(cameras), float32)
-    if extent <= one_point:
-        return [
-            Finding(
-                scene,
-                f"all {len(cameras)} cameras stand on one point, so that no depth can be told",
-                "export the poses with their translations",
-                tuple(camera.frame for camera in cameras),
-                tuple(camera.name for camera in cameras),
-            )
-        ]
-    findings: list[Finding] = []
-    for place in _together(cameras, lambda camera: camera.c2w[:3, 3], near):
-        groups = list(_together(place, lambda camera: camera.c2w[:3, :3].flatten(), _SAME))
-        for alike in groups:
-            findings += [_duplicate(scene, alike[0], other) for other in alike[1:]]
+    if len(sound) < 2:
+        return
+    poses = np.stack([scene.photos[frame].listed.c2w for frame in sound])
+    near, one_point = _tolerances(poses, float32)
+    if np.ptp(poses[:, :3, 3], axis=0).max() <= one_point:
+        reason = f"all {len(sound)} cameras stand on one point, so that no depth can be told"
+        yield scene.finding(sound, reason, "export the poses with their translations")
+        return
+    for place in _groups(poses[:, :3, 3], near):
+        groups = _groups(poses[place, :3, :3].reshape(len(place), 9), _SAME)
+        firsts = [sound[place[alike[0]]] for alike in groups]
+        for first, alike in zip(firsts, groups, strict=True):
+            for other in alike[1:]:
+                yield _duplicate(scene, first, sound[place[other]])
         if len(groups) > 1:
-            findings.append(_zero_baseline(scene, [alike[0] for alike in groups]))
-    return findings
+            first, *rest = firsts
+            yield scene.finding(
+                rest,
+                f"the camera stands on the same point as that of {_named(scene, first)}, a zero "
+                "baseline, so that the two tell no depth",
+                "correct the position, or remove one of the frames",
+            )
 
 
-def _tolerances(
-    centres: np.ndarray, extent: float, rigidity: float, float32: bool
-) -> tuple[float, float]:
+def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
     """How far apart two cameras, and all cameras, may be on one point, in the world's units.
 
     Coordinates are as precise as the format, or as the rotations beside them; far from the origin
     such errors exceed the steps between cameras, so that the extent bounds what is one place.
     """
-    distance = float(np.abs(centres).max())
-    precision = max(_SAME if float32 else _DOUBLE, rigidity)
+    rotations, centres = poses[:, :3, :3], poses[:, :3, 3]
+    off_rigid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    distance, extent = np.abs(centres).max(), np.ptp(centres, axis=0).max()
+    precision = max(_SAME if float32 else _DOUBLE, float(np.median(off_rigid)))
     together = _SAME if float32 else min(precision, _FLOAT32)
     return min(distance * precision, extent * _OF_EXTENT), distance * together
 
 
-def _together(
-    cameras: Sequence[_Camera], values: Callable[[_Camera], np.ndarray], tolerance: float
-) -> list[list[_Camera]]:
-    """Groups of cameras whose values differ from those of the group's first by no more.
+def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
+    """Groups of indices of `rows` (F, D) that differ from the group's first by no more.
 
-    Sorted by the first value, so that only cameras near in it are compared.
+    Sorted by the first value, so that only rows near in it are compared.
     """
-    rows = np.stack([values(camera) for camera in cameras])
     order = np.argsort(rows[:, 0], kind="stable")
     sorted_ = rows[order, 0]
-    groups: dict[int, list[_Camera]] = {}
-    leader = np.full(len(cameras), -1)
-    for place, camera in enumerate(cameras):
-        if leader[place] >= 0:
-            groups[leader[place]].append(camera)
+    groups: dict[int, list[int]] = {}
+    leader = np.full(len(rows), -1)
+    for index in range(len(rows)):
+        if leader[index] >= 0:
+            groups[leader[index]].append(index)
             continue
-        groups[place] = [camera]
-        low, high = np.searchsorted(sorted_, rows[place, 0] + np.array([-1.0, 1.0]) * tolerance)
+        groups[index] = [index]
+        low, high = np.searchsorted(sorted_, rows[index, 0] + np.array([-1.0, 1.0]) * tolerance)
         near = order[low : high + 1]
-        alike = near[np.abs(rows[near] - rows[place]).max(1) <= tolerance]
-        leader[alike[leader[alike] < 0]] = place
+        alike = near[np.abs(rows[near] - rows[index]).max(1) <= tolerance]
+        leader[alike[leader[alike] < 0]] = index
     return list(groups.values())
 
 
-def _rigidity(cameras: Sequence[_Camera]) -> float:
-    """How far rotations are from orthonormal in the median; centres are no better known."""
-    rotations = np.stack([camera.c2w[:3, :3] for camera in cameras])
-    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
-    return float(np.median(errors))
+def _duplicate(scene: DecodedScene, first: int, second: int) -> Finding:
+    which = _named(scene, first)
+    if scene.decoded[first].digest and scene.decoded[first].digest == scene.decoded[second].digest:
+        reason, fix = f"the photo and its pose repeat {which}", "remove one of the two"
+        return scene.finding([second], reason, fix, "warning")
+    reason = f"the pose repeats that of {which}, whose photo is another one"
+    return scene.finding([second], reason, "correct the pose, or remove one of the frames")
 
 
-def _duplicate(scene: str, first: _Camera, second: _Camera) -> Finding:
-    frames, names = (second.frame,), (second.name,)
-    which = f"frame {first.frame} ({first.name})"
-    if first.digest and first.digest == second.digest:
-        return Finding(
-            scene, f"the photo and its pose repeat {which}", "remove one of the two",
-            frames, names, "warning",
-        )  # fmt: skip
-    return Finding(
-        scene, f"the pose repeats that of {which}, whose photo is another one",
-        "correct the pose, or remove one of the frames", frames, names,
-    )  # fmt: skip
-
-
-def _zero_baseline(scene: str, cameras: Sequence[_Camera]) -> Finding:
-    first, *rest = cameras
-    return Finding(
-        scene,
-        f"the camera stands on the same point as that of frame {first.frame} ({first.name}), a "
-        "zero baseline, so that the two tell no depth",
-        "correct the position, or remove one of the frames",
-        tuple(camera.frame for camera in rest),
-        tuple(camera.name for camera in rest),
-    )
+def _named(scene: DecodedScene, frame: int) -> str:
+    return f"frame {frame} ({scene.photos[frame].listed.name})"

@@ -1,33 +1,28 @@
-"""`qgs data check`: all scenes of a data set, whatever its format."""
+"""All scenes of a data set, whatever its format, and its evaluation indices."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any
 
 import numpy as np
 from upath import UPath
 
-from qgs.data.photos.formats import READERS, Format, read_listing
-from qgs.data.recognition import recognised
+from qgs.data.photos import READERS, Format, read_listing
 from qgs_datatools.cameras import camera_findings, sharing_findings
-from qgs_datatools.decoding import Decoded, decode_all, file_findings, size_findings
-from qgs_datatools.findings import Candidate, Finding, Photo, merged
-from qgs_datatools.folders import (
-    Held,
-    IndexSummary,
-    chunk_folders,
-    dl3dv_scenes,
-    found_indices,
-    index_findings,
-    photo_folders,
-)
+from qgs_datatools.candidates import Candidate, dl3dv_scenes, photo_folders
+from qgs_datatools.chunks import chunk_folders
+from qgs_datatools.decoding import DecodedScene, decode_scene, file_findings, size_findings
+from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
+from qgs_datatools.indices import Held, IndexSummary, found_indices, index_findings
 
-_LISTS = {
+FORMATS = ("auto", *READERS, "chunks", "dl3dv")
+"""Formats of data sets; auto tells them from what is there."""
+
+_LISTINGS = {
     "nerfstudio": "transforms.json",
     "dl3dv": "transforms.json",
     "blender": "its transforms file",
@@ -35,6 +30,27 @@ _LISTS = {
     "llff": "poses_bounds.npy",
     "chunks": "the chunk",
 }
+
+
+@dataclass(frozen=True)
+class Options:
+    """How thorough a check is.
+
+    geometry: poses are judged against photos in so many scenes, spread over the data set.
+    headers_only: no image is decoded, and none is matched. format: one of FORMATS. images: folder
+    of photos to read instead of the listed one, such as images_4.
+    """
+
+    geometry: int = 20
+    headers_only: bool = False
+    threads: int = 8
+    format: str = "auto"
+    images: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.format not in FORMATS:
+            known = ", ".join(FORMATS)
+            raise ValueError(f"there is no format {self.format!r}: give one of {known}")
 
 
 @dataclass(frozen=True)
@@ -64,129 +80,14 @@ class SceneReport:
     @property
     def errors(self) -> int:
         """Number of findings that are errors."""
-        return sum(finding.severity == "error" for finding in self.findings)
+        return len(errors_of(self.findings))
 
     @property
     def epipolar(self) -> str:
         """Median distance of matches to epipolar lines in pixels, or why there is none."""
         if self.geometry is None:
             return "-"
-        if self.geometry.verdict is None:
-            return "not judged"
-        return f"{self.geometry.pixels:.2f}"
-
-
-def check_scene(
-    candidate: Candidate, *, threads: int, headers_only: bool, with_geometry: bool
-) -> SceneReport:
-    """Check one scene; whatever is wrong with it becomes a finding.
-
-    Raises MissingExtraError when a package that its format or the matching needs is missing.
-    """
-    report = SceneReport(candidate.name, candidate.scene, candidate.kind, candidate.split)
-    try:
-        photos = candidate.photos()
-    except (OSError, ValueError) as error:
-        return replace(report, findings=[Finding(candidate.name, *_reason_and_fix(error))])
-    if not photos:
-        nothing = Finding(candidate.name, "no photos are listed", "export the scene again")
-        return replace(report, findings=[nothing])
-    decoded = decode_all(photos, threads, headers_only)
-    return _judged(report, candidate, photos, decoded, with_geometry)
-
-
-def _judged(
-    report: SceneReport,
-    candidate: Candidate,
-    photos: Sequence[Photo],
-    decoded: Sequence[Decoded],
-    with_geometry: bool,
-) -> SceneReport:
-    name = candidate.name
-    files = file_findings(name, photos, decoded, _LISTS[candidate.kind])
-    sizes = size_findings(name, photos, decoded)
-    poses, others = camera_findings(name, photos, decoded, _frames(sizes))
-    placed = [frame for frame in range(len(photos)) if frame not in _frames(poses)]
-    placed = [frame for frame in placed if np.isfinite(photos[frame].listed.c2w).all()]
-    sharing = sharing_findings(name, photos, decoded, placed, float32=candidate.kind == "chunks")
-    findings = merged([*files, *sizes, *poses, *others, *sharing])
-    geometry = None
-    if with_geometry:
-        unsound = _frames([*sizes, *others, *sharing])
-        sound = [f for f in placed if f not in unsound and decoded[f].size is not None]
-        geometry = judge_scene(photos, decoded, sound, candidate.convention)
-        if geometry.verdict is not None or not _explained(findings, geometry):
-            findings += geometry_findings(name, geometry, photos, candidate.convention)
-    return replace(
-        report,
-        listed=len(photos),
-        decodable=sum(result.size is not None for result in decoded),
-        missing=sum(not photo.exists for photo in photos),
-        pose_problems=len(_frames([*poses, *sharing])),
-        geometry=geometry,
-        findings=findings,
-        **_drawn(photos, decoded, placed),
-    )
-
-
-def _drawn(
-    photos: Sequence[Photo], decoded: Sequence[Decoded], frames: Sequence[int]
-) -> dict[str, Any]:
-    """What a picture of the cameras needs."""
-    if not frames:
-        return {}
-    fov = []
-    for frame in frames:
-        listed = photos[frame].listed
-        height, width = listed.size or decoded[frame].size or (1, 1)
-        fov.append((width / 2 / listed.intrinsics[0], height / 2 / listed.intrinsics[1]))
-    c2w = np.stack([photos[frame].listed.c2w[:3] for frame in frames])
-    return {
-        "frames": tuple(frames),
-        "c2w": c2w.astype(np.float32),
-        "fov": np.array(fov, np.float32),
-    }
-
-
-def _frames(findings: Sequence[Finding]) -> set[int]:
-    return {
-        frame for finding in findings if finding.severity == "error" for frame in finding.frames
-    }
-
-
-def _explained(findings: Sequence[Finding], geometry: Geometry) -> bool:
-    """Whether other findings are why there is no verdict."""
-    return geometry.unjudged != TOO_FEW and any(f.severity == "error" for f in findings)
-
-
-def _reason_and_fix(error: Exception) -> tuple[str, str]:
-    """Readers end what they raise with a remedy behind the last colon."""
-    reason, colon, fix = str(error).rpartition(": ")
-    return (reason, fix) if colon else (str(error), "get the files again")
-
-
-CheckedFormat: TypeAlias = Literal[
-    "auto", "nerfstudio", "blender", "colmap", "llff", "chunks", "dl3dv"
-]
-
-
-_LISTINGS = (".json", ".npy")
-
-
-@dataclass(frozen=True)
-class Options:
-    """How thorough a check is.
-
-    geometry: poses are judged against photos in so many scenes, spread over the data set.
-    headers_only: no image is decoded, and none is matched. images: folder of photos to read instead
-    of the listed one, such as images_4.
-    """
-
-    geometry: int = 20
-    headers_only: bool = False
-    threads: int = 8
-    format: CheckedFormat = "auto"
-    images: str | None = None
+        return f"{self.geometry.pixels:.2f}" if self.geometry.distances else "not judged"
 
 
 @dataclass(frozen=True)
@@ -211,7 +112,7 @@ class CheckReport:
     @property
     def errors(self) -> int:
         """Number of findings that are errors."""
-        return sum(finding.severity == "error" for finding in self.findings)
+        return len(errors_of(self.findings))
 
 
 def check(
@@ -223,38 +124,37 @@ def check(
     """Check the data set at `path`, and evaluation indices: those given and those beside it.
 
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
-    is no data set at `path`, or no file at one of `indices`.
+    is no data set at `path`, or no file at one of `indices`, and MissingExtraError when a package
+    that the format needs is missing.
     """
-    if path.is_file() and path.suffix in _LISTINGS:
+    if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
     candidates, general, told = _candidates(path, options)
     if not candidates and not general:
-        read_listing(path, _photo_format(options))  # tells what is missing
+        read_listing(path, _photo_format(options))  # raises: what is missing for a photo folder
         raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
-    chosen, notes = _geometry_scenes(len(candidates), options)
+    judged, notes = _scenes_to_judge(len(candidates), options)
     scenes: list[SceneReport] = []
+    held: dict[str, list[Held]] = defaultdict(list)
     for number, candidate in enumerate(candidates):
         progress(number, len(candidates), candidate.name)
-        scenes.append(
-            check_scene(
-                candidate,
-                threads=options.threads,
-                headers_only=options.headers_only,
-                with_geometry=number in chosen,
-            )
-        )
+        report = check_scene(candidate, options, with_geometry=number in judged)
+        scenes.append(report)
+        held[report.scene].append(Held(report.split, report.listed - report.missing or None))
     summaries: list[IndexSummary] = []
-    held = _held(scenes)
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         findings, summary = index_findings(file, held, told)
         general += findings
         summaries += [summary] if summary else []
-    return CheckReport(str(path), scenes, general, summaries, len(chosen), notes)
+    return CheckReport(str(path), scenes, general, summaries, len(judged), notes)
 
 
 def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Finding], set[str]]:
     """Scenes, findings about files, and names of scenes that such findings may be about."""
-    kind = _kind(path, options.format)
+    kind = options.format
+    if kind == "auto":
+        is_chunk = path.is_file() and path.suffix == ".torch"
+        kind = "chunks" if is_chunk else recognised(path).removeprefix("qgs/")
     if kind == "chunks":
         folders = chunk_folders(path)
         return (
@@ -264,6 +164,8 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
         )
     if kind == "dl3dv":
         return dl3dv_scenes(path, options.images), [], set()
+    if "/" in kind:
+        return list(source_scenes(kind, path)), [], set()
     items = list(photo_folders(path, _photo_format(options), options.images))
     return (
         [item for item in items if isinstance(item, Candidate)],
@@ -273,37 +175,84 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
 
 
 def _photo_format(options: Options) -> Format:
-    return cast(Format, options.format if options.format in READERS else "auto")
+    return options.format if options.format in _PHOTO_FORMATS else "auto"
 
 
-def _kind(path: UPath, wanted: CheckedFormat) -> str:
-    if wanted != "auto":
-        return wanted
-    if path.is_file() and path.suffix == ".torch":
-        return "chunks"
-    return recognised(path).removeprefix("qgs/")
-
-
-def _geometry_scenes(count: int, options: Options) -> tuple[set[int], list[str]]:
+def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]:
     """The scenes whose poses are judged against photos, and what to tell of the others."""
     if options.headers_only:
         return set(), ["quick: only headers of images were read, and no pose was judged by photos"]
-    if find_spec("skimage") is None:
-        return set(), [
-            "no pose was judged by photos, which needs scikit-image: `pip install scikit-image`"
-        ]
     if not options.geometry:
         return set(), ["no pose was judged by photos (--geometry 0)"]
     places = np.linspace(0, max(count - 1, 0), min(options.geometry, count)).round().astype(int)
     chosen = set(places.tolist())
-    if len(chosen) < count:
-        left = f"poses were judged by photos in {len(chosen)} of {count} scenes; --geometry {count}"
-        return chosen, [f"{left} judges all"]
-    return chosen, []
+    if len(chosen) == count:
+        return chosen, []
+    left = f"poses were judged by photos in {len(chosen)} of {count} scenes; --geometry {count}"
+    return chosen, [f"{left} judges all"]
 
 
-def _held(scenes: Sequence[SceneReport]) -> dict[str, list[Held]]:
-    held: dict[str, list[Held]] = defaultdict(list)
-    for scene in scenes:
-        held[scene.scene].append(Held(scene.split, scene.listed - scene.missing or None))
-    return held
+def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) -> SceneReport:
+    """Check one scene; whatever is wrong with it becomes a finding. Raises as `check`."""
+    name = candidate.name
+    report = SceneReport(name, candidate.scene, candidate.kind, candidate.split)
+    try:
+        photos = candidate.photos()
+    except (OSError, ValueError) as error:
+        reason, colon, fix = str(error).rpartition(": ")  # messages end with a remedy
+        if not colon:
+            reason, fix = str(error), "get the files again"
+        return replace(report, findings=[Finding(name, reason, fix)])
+    if not photos:
+        nothing = Finding(name, "no photos are listed", "export the scene again")
+        return replace(report, findings=[nothing])
+    scene = decode_scene(name, photos, options.threads, options.headers_only)
+    files = list(file_findings(scene, _LISTINGS[candidate.kind]))
+    sizes = list(size_findings(scene))
+    poses, others = camera_findings(scene, _frames(sizes))
+    placed = [
+        frame
+        for frame, photo in enumerate(photos)
+        if frame not in _frames(poses) and np.isfinite(photo.listed.c2w).all()
+    ]
+    sharing = list(sharing_findings(scene, placed, float32=candidate.kind == "chunks"))
+    findings = merged([*files, *sizes, *poses, *others, *sharing])
+    geometry = None
+    if with_geometry:
+        unsound = _frames([*sizes, *others, *sharing])
+        sound = [f for f in placed if f not in unsound and scene.decoded[f].size is not None]
+        geometry = judge_scene(scene, sound, candidate.convention)
+        explained = errors_of(findings) and geometry.unjudged != TOO_FEW
+        if geometry.distances or not explained:
+            findings += geometry_findings(scene, geometry, candidate.convention)
+    return replace(
+        report,
+        listed=len(photos),
+        decodable=sum(result.size is not None for result in scene.decoded),
+        missing=sum(not photo.exists for photo in photos),
+        pose_problems=len(_frames([*poses, *sharing])),
+        geometry=geometry,
+        findings=findings,
+        **_drawn(scene, placed),
+    )
+
+
+def _frames(findings: Sequence[Finding]) -> set[int]:
+    return {frame for finding in errors_of(findings) for frame in finding.frames}
+
+
+def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
+    """What a picture of the cameras needs."""
+    if not frames:
+        return {}
+    fov = []
+    for frame in frames:
+        listed = scene.photos[frame].listed
+        height, width = listed.size or scene.decoded[frame].size or (1, 1)
+        fov.append((width / 2 / listed.intrinsics[0], height / 2 / listed.intrinsics[1]))
+    c2w = np.stack([scene.photos[frame].listed.c2w[:3] for frame in frames])
+    return {
+        "frames": tuple(frames),
+        "c2w": c2w.astype(np.float32),
+        "fov": np.array(fov, np.float32),
+    }

@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from enum import StrEnum
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
+    from qgs.contracts import SceneSource
     from qgs_datatools.check import CheckReport, SceneReport
+    from qgs_datatools.packing import Packed, Splits
 
 app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
 
 _ROWS = 40
-
-
-class Format(StrEnum):
-    """Formats of data sets; auto tells them from what is there."""
-
-    auto = "auto"
-    nerfstudio = "nerfstudio"
-    blender = "blender"
-    colmap = "colmap"
-    llff = "llff"
-    chunks = "chunks"
-    dl3dv = "dl3dv"
 
 
 @app.command("check")
@@ -40,8 +30,8 @@ def check(
         typer.Option(help="Evaluation index to compare with the scenes; repeatable."),
     ] = None,
     format: Annotated[
-        Format, typer.Option(help="Only scenes listed in this format.")
-    ] = Format.auto,
+        str, typer.Option(help="Only scenes listed in this format, such as colmap or chunks.")
+    ] = "auto",
     images: Annotated[
         str | None, typer.Option(help="Folder of photos to read, such as images_4.")
     ] = None,
@@ -61,13 +51,11 @@ def check(
     Every image is decoded, and poses are compared with what neighbouring photos share. Exit code 1
     when there are errors, 0 when there are none or only warnings.
     """
-    from rich.console import Console
-
     from qgs.data.paths import opened_path
     from qgs_datatools.check import Options, check
 
     console = Console()
-    options = Options(geometry, quick, threads, format.value, images)
+    options = Options(geometry, quick, threads, format, images)
     indices = [opened_path(name) for name in index or []]
     with console.status("listing scenes") as status:
         result = check(
@@ -88,8 +76,7 @@ def check(
 def _print(console: Console, result: CheckReport) -> None:
     if result.scenes:
         console.print(_table(result.scenes))
-    hidden = len(result.scenes) - _ROWS
-    if hidden > 0:
+    if (hidden := len(result.scenes) - _ROWS) > 0:
         _line(console, f"and {hidden} more scenes, none of them with more findings than these")
     for finding in result.findings:
         _line(console, str(finding))
@@ -98,16 +85,9 @@ def _print(console: Console, result: CheckReport) -> None:
     for note in result.notes:
         _line(console, f"note: {note}")
     warnings = len(result.findings) - result.errors
-    counts = (
-        _counted(len(result.scenes), "scene"),
-        _counted(result.errors, "error"),
-        _counted(warnings, "warning"),
-    )
-    _line(console, f"{result.path}: {', '.join(counts)}")
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+    counts = {"scene": len(result.scenes), "error": result.errors, "warning": warnings}
+    said = (f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
+    _line(console, f"{result.path}: {', '.join(said)}")
 
 
 def _line(console: Console, text: str) -> None:
@@ -115,43 +95,27 @@ def _line(console: Console, text: str) -> None:
 
 
 def _table(scenes: Sequence[SceneReport]) -> Table:
-    from rich.table import Table
-
     table = Table(header_style="bold", box=None, pad_edge=False)
     table.add_column("scene", overflow="fold", min_width=12)
     table.add_column("format")
     for column in ("frames", "decodable", "missing", "bad poses", "epipolar px"):
         table.add_column(column, justify="right")
-    shown = (
-        sorted(scenes, key=lambda scene: -len(scene.findings)) if len(scenes) > _ROWS else scenes
-    )
-    for scene in shown[:_ROWS]:
-        table.add_row(*_row(scene))
+    if len(scenes) > _ROWS:
+        scenes = sorted(scenes, key=lambda scene: -len(scene.findings))[:_ROWS]
+    for scene in scenes:
+        counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
+        table.add_row(scene.name, scene.kind, *map(str, counts), scene.epipolar)
     return table
-
-
-def _row(scene: SceneReport) -> list[str]:
-    counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
-    return [scene.name, scene.kind, *map(str, counts), scene.epipolar]
-
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from qgs.contracts import SceneSource
-    from qgs_datatools.packing import Packed, Splits
-
-Options = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Option of the source, such as images=images_4; repeatable."),
-]
 
 
 @app.command("pack")
 def pack(
     path: Annotated[str, typer.Argument(help="Data set, or recipe (.yaml) whose data to pack.")],
     out: Annotated[str, typer.Option(help="New folder or URL for the chunks.")],
-    options: Options = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Option of the source, such as images=images_4; repeatable."),
+    ] = None,
     image_size: Annotated[
         tuple[int, int] | None,
         typer.Option(help="Height and width of all images; their own by default.", min=1),
@@ -178,27 +142,26 @@ def pack(
     JPEG and PNG photos of pinhole cameras stay as they are; others are undistorted, resized if
     asked to, and written as PNG. Called again, it finishes what was interrupted.
     """
-    from rich.console import Console
-
     from qgs.data.paths import opened_path
     from qgs_datatools import packing
+    from qgs_datatools.entries import Encoding
 
     console = Console()
     source, settings = _opened(path, options or [], image_size)
     splits = _splits(source, test_scenes, test_every)
     settings |= {"test_scenes": test_scenes, "test_every": test_every}
-    with _Progress(console, sum(map(len, splits.values()))) as progress:
+    with _progress(console, sum(map(len, splits.values()))) as progress:
         packed = packing.pack(
             source,
             splits,
             opened_path(out),
             settings,
-            packing.Encoding(image_size is not None, jpeg),
+            Encoding(image_size is not None, jpeg),
             chunk_bytes=chunk_mb * 2**20,
             leave_out_broken=leave_out_broken,
-            progress=progress.scene,
+            progress=progress,
         )
-    _conclude(console, packed, out)
+    _print_packed(console, packed, out)
 
 
 def _opened(
@@ -209,13 +172,10 @@ def _opened(
     from qgs.data.paths import opened_path
     from qgs.data.recognition import recognised
 
-    overrides = [f"data.{option}" for option in options]
-    if Path(path).suffix in {".yaml", ".yml"}:
-        recipe = resolve(path, overrides)
-    else:
-        type_ = recognised(opened_path(path))
-        recipe = resolve({"recipe": 1, "data": {"type": type_, "path": path}}, overrides)
-    source = recipe.build_data()
+    recipe: Any = path
+    if Path(path).suffix not in {".yaml", ".yml"}:
+        recipe = {"recipe": 1, "data": {"type": recognised(opened_path(path)), "path": path}}
+    source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
     if image_size is not None:
         source = type(source)(source.config.model_copy(update={"image_size": image_size}))
     return source, {"source": type(source).name, **source.config.model_dump(mode="json")}
@@ -235,45 +195,29 @@ def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None
     return own_splits(source)
 
 
-class _Progress:
-    """A bar of scenes; nothing where no terminal is."""
-
-    def __init__(self, console: Console, scenes: int) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-        from rich.progress import TimeRemainingColumn as TimeLeft
-
-        columns = (MofNCompleteColumn(), BarColumn(), TimeLeft(), TextColumn("{task.description}"))
-        self._bar = Progress(
-            *columns, console=console, transient=True, disable=not console.is_terminal
-        )
-        self._task = self._bar.add_task("", total=scenes)
-
-    def __enter__(self) -> _Progress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def scene(self, name: str) -> None:
-        """A scene is dealt with."""
-        self._bar.update(self._task, advance=1, description=name)
+@contextmanager
+def _progress(console: Console, scenes: int) -> Iterator[Callable[[str], None]]:
+    """A bar of scenes, moved by the name of each; nothing where no terminal is."""
+    left, name = TimeRemainingColumn(), TextColumn("{task.description}")
+    columns = (MofNCompleteColumn(), BarColumn(), left, name)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task("", total=scenes)
+        yield lambda name: bar.update(task, advance=1, description=name)
 
 
-def _conclude(console: Console, packed: Packed, out: str) -> None:
+def _print_packed(console: Console, packed: Packed, out: str) -> None:
     scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
     again = f", {packed.resumed} of them packed before" if packed.resumed else ""
-    written = packed.frames - packed.kept
-    console.print(
+    _line(
+        console,
         f"{out}: scenes {scenes}{again}; {packed.frames} images now, {packed.kept} kept as they "
-        f"were, {written} written anew",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
+        f"were, {packed.frames - packed.kept} written anew",
     )
     if not packed.scenes["test"]:
-        console.print("there are no test scenes: held-out frames are what is evaluated")
+        _line(console, "there are no test scenes: held-out frames are what is evaluated")
     if packed.left_out:
-        console.print(f"{len(packed.left_out)} scenes could not be read and are left out:")
+        _line(console, f"{len(packed.left_out)} scenes could not be read and are left out:")
         for name, reason in packed.left_out.items():
-            console.print(f"  {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
+            _line(console, f"  {name}: {reason}")

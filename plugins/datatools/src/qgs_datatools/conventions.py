@@ -3,50 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 Reading = Callable[[np.ndarray], np.ndarray]
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 AS_READ = "as read"
 
-
-def _flipped(pose: np.ndarray) -> np.ndarray:
-    return pose @ _FLIP
-
-
-def _inverted(pose: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(pose)
-
-
-def _inverted_and_flipped(pose: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(pose) @ _FLIP
-
-
-def _from_right_up_back(pose: np.ndarray) -> np.ndarray:
-    """OpenGL columns that were read as LLFF's (down, right, back)."""
-    return np.stack([pose[:, 1], -pose[:, 0], pose[:, 2], pose[:, 3]], 1)
-
-
-def _from_right_down_forward(pose: np.ndarray) -> np.ndarray:
-    """OpenCV columns that were read as LLFF's."""
-    return np.stack([pose[:, 1], pose[:, 0], -pose[:, 2], pose[:, 3]], 1)
-
-
-def _turned(pose: np.ndarray) -> np.ndarray:
-    """Half a turn about the camera's y axis."""
-    return pose @ np.diag([-1.0, 1.0, -1.0, 1.0])
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_HALF_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])  # about the camera's y axis
+_RIGHT_UP_BACK = np.eye(4)[:, [1, 0, 2, 3]] * [1, -1, 1, 1]  # columns read as LLFF's
+_RIGHT_DOWN_FORWARD = np.eye(4)[:, [1, 0, 2, 3]] * [1, 1, -1, 1]
 
 
 @dataclass(frozen=True)
 class Misreading:
-    """What poses may have been meant as. meant: the OpenCV camera-to-world (4, 4) of a read one."""
+    """What poses may have been meant as.
 
-    meant: Reading
+    inverted: whether the matrix that was read is to be inverted. axes: (4, 4), the OpenCV camera
+    axes that were meant, by those that were read.
+    """
+
     reason: str
     fix: str
+    axes: np.ndarray = field(default_factory=lambda: np.eye(4))
+    inverted: bool = False
+
+    def meant(self, pose: np.ndarray) -> np.ndarray:
+        """The OpenCV camera-to-world (4, 4) that was meant by one that was read."""
+        return (np.linalg.inv(pose) if self.inverted else pose) @ self.axes
 
 
 @dataclass(frozen=True)
@@ -56,24 +42,30 @@ class Convention:
     name: str
     misreadings: Mapping[str, Misreading]
 
+    @property
+    def readings(self) -> Mapping[str, Reading]:
+        """Every way in which poses may have been meant, as they are read first."""
+        return {AS_READ: np.asarray} | {name: m.meant for name, m in self.misreadings.items()}
+
 
 OPENGL = Convention(
     "OpenGL camera-to-world",
     {
         "flipped": Misreading(
-            _flipped,
             "these look like OpenCV poses read as OpenGL",
             "negate columns 1 and 2 (the camera's y and z axes) of every transform_matrix",
+            _FLIP,
         ),
         "inverted": Misreading(
-            _inverted,
             "these look like OpenCV world-to-camera matrices read as OpenGL camera-to-world",
             "invert every transform_matrix, then negate its columns 1 and 2",
+            inverted=True,
         ),
         "inverted and flipped": Misreading(
-            _inverted_and_flipped,
             "these look like world-to-camera matrices read as camera-to-world",
             "invert every transform_matrix",
+            _FLIP,
+            inverted=True,
         ),
     },
 )
@@ -83,19 +75,20 @@ OPENCV = Convention(
     "OpenCV world-to-camera",
     {
         "flipped": Misreading(
-            _flipped,
             "these look like OpenGL poses read as OpenCV",
             "negate rows 1 and 2 (the camera's y and z axes) of every world-to-camera matrix",
+            _FLIP,
         ),
         "inverted": Misreading(
-            _inverted,
             "these look like camera-to-world matrices read as world-to-camera",
             "invert every matrix",
+            inverted=True,
         ),
         "inverted and flipped": Misreading(
-            _inverted_and_flipped,
             "these look like OpenGL camera-to-world matrices read as OpenCV world-to-camera",
             "negate columns 1 and 2 of every matrix, then invert it",
+            _FLIP,
+            inverted=True,
         ),
     },
 )
@@ -105,40 +98,33 @@ LLFF = Convention(
     "LLFF camera-to-world with axes (down, right, back)",
     {
         "OpenGL axes": Misreading(
-            _from_right_up_back,
             "these look like OpenGL poses (axes right, up, back), not LLFF's (down, right, back)",
             "write the columns as (-up, right, back)",
+            _RIGHT_UP_BACK,
         ),
         "OpenCV axes": Misreading(
-            _from_right_down_forward,
             "these look like OpenCV poses (axes right, down, forward), not OpenGL's nor LLFF's "
             "(down, right, back)",
             "write the columns as (down, right, -forward)",
+            _RIGHT_DOWN_FORWARD,
         ),
         "flipped": Misreading(
-            _flipped,
             "the axes look like (up, right, forward), OpenGL and OpenCV mixed, and LLFF's are "
             "(down, right, back)",
             "negate columns 0 and 2 of every pose",
+            _FLIP,
         ),
         "turned": Misreading(
-            _turned,
             "the axes look like (down, left, forward), OpenGL and OpenCV mixed, and LLFF's are "
             "(down, right, back)",
             "negate columns 1 and 2 of every pose",
+            _HALF_TURN,
         ),
         "inverted": Misreading(
-            _inverted,
             "these look like world-to-camera matrices read as camera-to-world",
             "invert every pose, and write its columns as (down, right, back)",
+            inverted=True,
         ),
     },
 )
 """poses_bounds.npy."""
-
-
-def readings(convention: Convention) -> Mapping[str, Reading]:
-    """Every way in which poses of this convention may have been meant, as they are read first."""
-    return {AS_READ: lambda pose: pose} | {
-        name: misreading.meant for name, misreading in convention.misreadings.items()
-    }

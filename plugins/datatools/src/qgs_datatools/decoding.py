@@ -5,18 +5,22 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import median, median_low
 
 from PIL import Image, UnidentifiedImageError
+from qgs.data.photos.frames import PhotoFrame, Size, open_mask, size_faults
 
-from qgs.data.photos.frames import Size, open_mask, size_faults
-from qgs_datatools.findings import Finding, Photo
+from qgs_datatools.candidates import Photo
+from qgs_datatools.findings import Finding, Severity
 
 _ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 _SMALLEST = (8, 8)  # asks JPEG for its coarsest picture: all bytes are read, few pixels are made
+_ROUNDING = 1.5  # pixels by which a scaled copy's sides may be off
+_CENTRED = 0.1  # of a side: how far from the middle a principal point usually lies at most
+_COPY = re.compile(r"images_\d+")
 
 
 @dataclass(frozen=True)
@@ -32,10 +36,29 @@ class Decoded:
     mask_error: str | None = None
 
 
-def decode_all(photos: Sequence[Photo], threads: int, headers_only: bool) -> list[Decoded]:
+@dataclass(frozen=True)
+class DecodedScene:
+    """The photos of a scene, and what decoding each of them gave."""
+
+    name: str
+    photos: Sequence[Photo]
+    decoded: Sequence[Decoded]
+
+    def finding(
+        self, frames: Sequence[int], reason: str, fix: str, severity: Severity = "error"
+    ) -> Finding:
+        """A finding about some of the frames."""
+        names = tuple(self.photos[frame].listed.name for frame in frames)
+        return Finding(self.name, reason, fix, tuple(frames), names, severity)
+
+
+def decode_scene(
+    name: str, photos: Sequence[Photo], threads: int, headers_only: bool
+) -> DecodedScene:
     """Try all photos, or their headers alone."""
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(lambda photo: _decode(photo, headers_only), photos))
+        decoded = pool.map(lambda photo: _decode(photo, headers_only), photos)
+        return DecodedScene(name, photos, list(decoded))
 
 
 def _decode(photo: Photo, headers_only: bool) -> Decoded:
@@ -48,16 +71,12 @@ def _decode(photo: Photo, headers_only: bool) -> Decoded:
             if not headers_only:
                 image.draft(None, _SMALLEST)
                 image.load()
+    except UnidentifiedImageError:
+        return Decoded(error="its header is none of a known image format")
     except _ERRORS as error:
-        return Decoded(error=_told(error))
+        return Decoded(error=str(error) or type(error).__name__)
     digest = hashlib.blake2b(data, digest_size=16).digest()
     return Decoded(size, digest, mask_error=None if headers_only else _mask_error(photo))
-
-
-def _told(error: Exception) -> str:
-    if isinstance(error, UnidentifiedImageError):
-        return "its header is none of a known image format"
-    return str(error) or type(error).__name__
 
 
 def _mask_error(photo: Photo) -> str | None:
@@ -71,53 +90,33 @@ def _mask_error(photo: Photo) -> str | None:
     return None
 
 
-def file_findings(
-    scene: str, photos: Sequence[Photo], decoded: Sequence[Decoded], where: str
-) -> list[Finding]:
-    """What is missing or damaged. where: what lists the photos, in words."""
-    findings: list[Finding] = []
-    for frame, (photo, result) in enumerate(zip(photos, decoded, strict=True)):
-        for reason, fix in _file_faults(photo, result, where):
-            findings.append(Finding(scene, reason, fix, (frame,), (photo.listed.name,)))
-    return findings
-
-
-def _file_faults(photo: Photo, result: Decoded, where: str) -> list[tuple[str, str]]:
-    listed, faults = photo.listed, []
-    if listed.name and not photo.exists:
-        faults.append(
-            ("the image does not exist", f"add the file, or remove the frame from {where}")
-        )
-    if result.error is not None:
-        faults.append(
-            (
-                f"the image cannot be decoded ({result.error})",
-                f"replace the file, or remove the frame from {where}",
-            )
-        )
-    if not photo.mask_exists:
-        assert listed.mask is not None
-        folder = listed.mask.parent.name
-        faults.append((f"its mask does not exist in {folder}", "add it, or list no mask"))
-    if result.mask_error is not None:
-        faults.append((result.mask_error, "replace the mask"))
-    return faults
-
-
-_ROUNDING = 1.5  # pixels by which a scaled copy's sides may be off
-_CENTRED = 0.1  # of a side: how far from the middle a principal point usually lies at most
-_COPY = re.compile(r"images_\d+")
+def file_findings(scene: DecodedScene, listing: str) -> Iterator[Finding]:
+    """What is missing or damaged. listing: what lists the photos, in words."""
+    for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
+        if photo.listed.name and not photo.exists:
+            fix = f"add the file, or remove the frame from {listing}"
+            yield scene.finding([frame], "the image does not exist", fix)
+        if result.error is not None:
+            fix = f"replace the file, or remove the frame from {listing}"
+            yield scene.finding([frame], f"the image cannot be decoded ({result.error})", fix)
+        if not photo.mask_exists and photo.listed.mask is not None:
+            reason = f"its mask does not exist in {photo.listed.mask.parent.name}"
+            yield scene.finding([frame], reason, "add it, or list no mask")
+        if result.mask_error is not None:
+            yield scene.finding([frame], result.mask_error, "replace the mask")
 
 
 @dataclass(frozen=True)
 class _Sized:
+    """A photo whose size is known, and listed too; sizes are (H, W)."""
+
     frame: int
-    photo: Photo
+    photo: PhotoFrame
     file: Size
     listed: Size
 
     @property
-    def said(self) -> str:
+    def reason(self) -> str:
         return (
             f"the image is {self.file[1]} x {self.file[0]} pixels, but listed as "
             f"{self.listed[1]} x {self.listed[0]}"
@@ -131,89 +130,62 @@ class _Sized:
         return abs(self.file[1] - scale * self.listed[1]) <= _ROUNDING
 
     @property
-    def is_scaled_copy(self) -> bool:
-        height, width = self.listed
-        return (
-            abs(self.file[0] - height * self.file[1] / width) <= _ROUNDING
-            or abs(self.file[1] - width * self.file[0] / height) <= _ROUNDING
+    def is_as_listed_or_scaled(self) -> bool:
+        """False too where only one of the sides is as listed, which no scale explains."""
+        (height, width), (rows, columns) = self.listed, self.file
+        scaled = (
+            abs(rows - height * columns / width) <= _ROUNDING
+            or abs(columns - width * rows / height) <= _ROUNDING
         )
+        return self.file == self.listed or (scaled and rows != height and columns != width)
 
-    @property
-    def is_reduced_folder(self) -> bool:
-        return bool(_COPY.fullmatch(self.photo.listed.path.parent.name))
-
-    def finding(self, scene: str, reason: str, fix: str) -> Finding:
-        return Finding(scene, reason, fix, (self.frame,), (self.photo.listed.name,))
+    def off_centre(self, size: Size) -> float:
+        """How far the principal point is from the middle of an image of `size`, of a side."""
+        _, _, cx, cy = self.photo.intrinsics
+        return max(abs(cx / size[1] - 0.5), abs(cy / size[0] - 0.5))
 
 
-def size_findings(scene: str, photos: Sequence[Photo], decoded: Sequence[Decoded]) -> list[Finding]:
+def size_findings(scene: DecodedScene) -> Iterator[Finding]:
     """Photos of another shape than listed, of another scale than the rest, or that shrank unasked.
 
     A scaled copy of the whole scene is right, since intrinsics follow the size; it is told only
     where the folder is not named as one (images_4), and is an error where intrinsics fit the files
     and not the listed size.
     """
-    sized = [
-        _Sized(frame, photo, result.size, photo.listed.size)
-        for frame, (photo, result) in enumerate(zip(photos, decoded, strict=True))
-        if result.size is not None and photo.listed.size is not None
-    ]
-    differing = [item for item in sized if _differs(item)]
-    findings = [item.finding(scene, *_told_of_sizes(item)) for item in differing]
-    alike = [item for item in sized if item not in differing]
+    alike: list[_Sized] = []
+    for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
+        if result.size is None or photo.listed.size is None:
+            continue
+        item = _Sized(frame, photo.listed, result.size, photo.listed.size)
+        if item.is_as_listed_or_scaled:
+            alike.append(item)
+            continue
+        fault = next(size_faults(item.file, item.listed), None)
+        fix = "give the original image, or correct the listed size"
+        reason, fix = (fault.reason, fault.fix) if fault else (item.reason, fix)
+        yield scene.finding([frame], reason, fix)
     if not alike:
-        return findings
+        return
     usual = median_low(item.scale for item in alike)
-    odd = [item for item in alike if not item.has_scale(usual)]
-    findings += [
-        item.finding(scene, f"{item.said}, another scale than the rest of the scene",
-                     "give the original image, or one scaled as the others")
-        for item in odd
-    ]  # fmt: skip
-    if usual != 1:
-        findings += _scaled(scene, [item for item in alike if item.has_scale(usual)])
-    return findings
-
-
-def _differs(item: _Sized) -> bool:
-    exact = item.file == item.listed
-    return not exact and (not item.is_scaled_copy or _one_side(item))
-
-
-def _one_side(item: _Sized) -> bool:
-    """Whether one side is as listed and the other is not, which no scale explains."""
-    return item.file[0] == item.listed[0] or item.file[1] == item.listed[1]
-
-
-def _told_of_sizes(item: _Sized) -> tuple[str, str]:
-    for fault in size_faults(item.file, item.listed):
-        return fault.reason, fault.fix
-    return item.said, "give the original image, or correct the listed size"
-
-
-def _scaled(scene: str, items: Sequence[_Sized]) -> list[Finding]:
-    first = items[0]
-    if _fits_files_only(items):
+    for item in alike:
+        if not item.has_scale(usual):
+            reason = f"{item.reason}, another scale than the rest of the scene"
+            yield scene.finding(
+                [item.frame], reason, "give the original image, or one scaled as the others"
+            )
+    if usual == 1:
+        return
+    scaled = [item for item in alike if item.has_scale(usual)]
+    fits_files = median(item.off_centre(item.file) for item in scaled) <= _CENTRED
+    if fits_files and median(item.off_centre(item.listed) for item in scaled) > _CENTRED:
+        severity: Severity = "error"
         fix = "correct the listed width and height, which the intrinsics do not go with"
-        return [item.finding(scene, item.said, fix) for item in items]
-    if first.is_reduced_folder:
-        return []
-    fix = "nothing if they are a scaled copy: intrinsics are scaled alike; else correct the size"
-    return [
-        Finding(scene, item.said, fix, (item.frame,), (item.photo.listed.name,), "warning")
-        for item in items
-    ]
-
-
-def _fits_files_only(items: Sequence[_Sized]) -> bool:
-    """Whether principal points lie in the middle of the files, and not of the listed size."""
-    return _off_centre(items, "file") <= _CENTRED < _off_centre(items, "listed")
-
-
-def _off_centre(items: Sequence[_Sized], size: str) -> float:
-    def distance(item: _Sized) -> float:
-        height, width = getattr(item, size)
-        _, _, cx, cy = item.photo.listed.intrinsics
-        return max(abs(cx / width - 0.5), abs(cy / height - 0.5))
-
-    return median(map(distance, items))
+    elif _COPY.fullmatch(scaled[0].photo.path.parent.name):
+        return
+    else:
+        severity = "warning"
+        fix = (
+            "nothing if they are a scaled copy: intrinsics are scaled alike; else correct the size"
+        )
+    for item in scaled:
+        yield scene.finding([item.frame], item.reason, fix, severity)

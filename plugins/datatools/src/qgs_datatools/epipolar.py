@@ -1,16 +1,16 @@
-"""Whether poses agree with photos: matched features against epipolar lines."""
+"""Points that two photos share, and how far they are from the epipolar lines of two poses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from skimage.feature import SIFT, match_descriptors
+from skimage.measure import ransac
+from skimage.transform import FundamentalMatrixTransform
 
-from qgs.contracts.component import MissingExtraError
-from qgs_datatools.conventions import AS_READ, Convention, Reading, readings
+from qgs_datatools.conventions import Reading
 
 MIN_MATCHES = 24
 """Fewer matches than this say nothing about a pair of photos."""
@@ -40,8 +40,8 @@ class Matches:
 
 
 def detect(grey: np.ndarray) -> Features:
-    """Features of an image (H, W) in [0, 1]. Raises MissingExtraError without scikit-image."""
-    sift = _skimage().feature.SIFT()
+    """Features of an image (H, W) in [0, 1]."""
+    sift: Any = SIFT()
     try:
         sift.detect_and_extract(grey)
     except RuntimeError:  # an image without any feature, such as a plain wall
@@ -49,52 +49,32 @@ def detect(grey: np.ndarray) -> Features:
     return Features(sift.keypoints[:, ::-1] + 0.5, sift.descriptors)
 
 
-def match(first: Features, second: Features, seed: int = 0) -> Matches:
+def match(first: Features, second: Features, seed: int = 0) -> Matches | None:
     """Mutual matches that agree with one epipolar geometry, found from the photos alone.
 
-    Poses play no part, so that wrong ones cannot hide behind the matches that they reject. Empty
+    Poses play no part, so that wrong ones cannot hide behind the matches that they reject. None
     when fewer than MIN_MATCHES remain.
     """
-    nothing = Matches(np.zeros((0, 2)), np.zeros((0, 2)))
     if min(len(first.points), len(second.points)) < MIN_MATCHES:
-        return nothing
-    pairs = _skimage().feature.match_descriptors(
+        return None
+    pairs = match_descriptors(
         first.descriptors, second.descriptors, max_ratio=_RATIO, cross_check=True
     )
     if len(pairs) < MIN_MATCHES:
-        return nothing
+        return None
     a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]
-    _, inliers = _skimage().measure.ransac(
+    found: Any = ransac(
         (a, b),
-        _skimage().transform.FundamentalMatrixTransform,
+        FundamentalMatrixTransform,
         min_samples=8,
         residual_threshold=_INLIER_PIXELS,
         max_trials=_TRIALS,
         rng=seed,
     )
+    inliers = found[1]
     if inliers is None or inliers.sum() < MIN_MATCHES:
-        return nothing
+        return None
     return Matches(a[inliers], b[inliers])
-
-
-@lru_cache(maxsize=1)
-def _skimage() -> Any:
-    try:
-        import skimage.feature
-        import skimage.measure
-        import skimage.transform
-    except ImportError as error:
-        raise MissingExtraError(
-            "matching photos needs scikit-image: `pip install query-gaussians-datatools`"
-        ) from error
-    return skimage
-
-
-TOLERANCE = 0.005
-"""Largest median distance that good poses leave, as a fraction of the image's diagonal."""
-
-CLEARLY_BETTER = 3.0
-"""A reading replaces the present one when its distance is this many times smaller."""
 
 
 @dataclass(frozen=True)
@@ -116,35 +96,6 @@ class Pair:
         first, second = (reading(pose) for pose in self.poses)
         distances = epipolar_distances(self.matches, first, second, self.intrinsics)
         return float(np.median(distances) / np.hypot(*self.size))
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """distances: median over pairs for each reading, fractions of the diagonal."""
-
-    distances: Mapping[str, float]
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the poses, as read, explain the photos."""
-        return self.distances[AS_READ] <= TOLERANCE and self.better is None
-
-    @property
-    def better(self) -> str | None:
-        """The reading that explains the photos where the present one does not."""
-        best = min(self.distances, key=lambda reading: self.distances[reading])
-        clear = self.distances[AS_READ] > CLEARLY_BETTER * self.distances[best]
-        return best if clear and self.distances[best] <= TOLERANCE else None
-
-
-def judge(pairs: Sequence[Pair], convention: Convention) -> Verdict:
-    """Compare on at least one pair what poses of a format may have been meant as."""
-    return Verdict(
-        {
-            name: float(np.median([pair.distance(reading) for pair in pairs]))
-            for name, reading in readings(convention).items()
-        }
-    )
 
 
 def epipolar_distances(
@@ -169,11 +120,12 @@ def epipolar_lines(
     is that of Hartley and Zisserman (2004), section 9.2.
     """
     relative = np.linalg.inv(second) @ first
-    rotation, shift = relative[:3, :3], relative[:3, 3]
-    x, y, z = shift
+    x, y, z = relative[:3, 3]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    inverse = [np.linalg.inv(_matrix(values)) for values in intrinsics]
-    fundamental = inverse[1].T @ cross @ rotation @ inverse[0]
+    inverse = [
+        np.linalg.inv([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]) for fx, fy, cx, cy in intrinsics
+    ]
+    fundamental = inverse[1].T @ cross @ relative[:3, :3] @ inverse[0]
     a, b = _homogeneous(matches.first), _homogeneous(matches.second)
     return b @ fundamental, a @ fundamental.T
 
@@ -185,8 +137,3 @@ def _line_distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.ones((len(points), 1))], 1)
-
-
-def _matrix(intrinsics: np.ndarray) -> np.ndarray:
-    fx, fy, cx, cy = intrinsics
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
-from qgs.data.photos.frames import Size
 from qgs_datatools.conventions import AS_READ, Convention
-from qgs_datatools.decoding import Decoded
-from qgs_datatools.epipolar import (
-    MIN_MATCHES,
-    TOLERANCE,
-    Features,
-    Pair,
-    Verdict,
-    detect,
-    judge,
-    match,
-)
-from qgs_datatools.findings import Finding, Photo
+from qgs_datatools.decoding import DecodedScene
+from qgs_datatools.epipolar import MIN_MATCHES, Features, Pair, detect, match
+from qgs_datatools.findings import Finding
 
 SIDE = 400
 """Pixels on the longer side of the photos that are matched."""
+
+TOLERANCE = 0.005
+"""Largest median distance that good poses leave, as a fraction of the image's diagonal."""
+
+CLEARLY_BETTER = 3.0
+"""A reading replaces the present one when its distance is this many times smaller."""
 
 TOO_FEW = f"too few matches, below {MIN_MATCHES} in every pair that was tried"
 
@@ -38,69 +33,102 @@ _NONSENSE = 0.02  # of the diagonal: no lens or rounding explains more
 
 @dataclass(frozen=True)
 class Geometry:
-    """verdict: None where nothing could be judged. unjudged: why.
+    """How well the poses of a scene explain its photos.
 
-    pairs: the worst first, as read; photos: both of the worst one as it was matched, (H, W, 3)
-    uint8. diagonal: of the photos' files, in pixels.
+    distances: median over pairs of the distance of matches to their epipolar lines, for each
+    reading of the poses, fractions of the diagonal; empty where nothing could be judged, and
+    unjudged says why. pairs: the worst first, as read; photos: both of the worst one as it was
+    matched, (H, W, 3) uint8. diagonal: of the photos' files, in pixels.
     """
 
+    distances: Mapping[str, float] = field(default_factory=dict)
+    unjudged: str = ""
     pairs: Sequence[Pair] = ()
     photos: tuple[np.ndarray, ...] = ()
-    verdict: Verdict | None = None
     diagonal: float = 0.0
-    unjudged: str = ""
 
     @property
     def fraction(self) -> float:
         """Median distance to the epipolar line as read, as a fraction of the diagonal."""
-        assert self.verdict is not None
-        return self.verdict.distances[AS_READ]
+        return self.distances[AS_READ]
 
     @property
     def pixels(self) -> float:
         """The same in pixels of the files."""
         return self.fraction * self.diagonal
 
+    @property
+    def better(self) -> str | None:
+        """The reading that explains the photos where the present one does not."""
+        best = min(self.distances, key=lambda reading: self.distances[reading])
+        clear = self.fraction > CLEARLY_BETTER * self.distances[best]
+        return best if clear and self.distances[best] <= TOLERANCE else None
 
-@dataclass
-class _Scene:
-    photos: Sequence[Photo]
-    decoded: Sequence[Decoded]
-    frames: Sequence[int]
-    _features: dict[int, tuple[Features, np.ndarray, Size]] = field(default_factory=dict)
+    @property
+    def agrees(self) -> bool:
+        """Whether the poses, as read, explain the photos."""
+        return self.fraction <= TOLERANCE and self.better is None
 
-    @cached_property
-    def centres(self) -> np.ndarray:
-        return np.stack([self.photos[frame].listed.c2w[:3, 3] for frame in self.frames])
+
+def judge_scene(scene: DecodedScene, sound: Sequence[int], convention: Convention) -> Geometry:
+    """Match up to five pairs, spread over the frames that are `sound`."""
+    if len(sound) < 2:
+        return Geometry(unjudged="fewer than 2 sound frames")
+    matcher = _Matcher(scene, sound)
+    if not np.ptp(matcher.centres, axis=0).any():
+        return Geometry(unjudged="all cameras on one point")
+    starts = np.linspace(0, len(sound) - 2, _STARTS).round().astype(int).tolist()
+    pairs = [pair for start in dict.fromkeys(starts) if (pair := matcher.first_pair(start))]
+    if not pairs:
+        return Geometry(unjudged=TOO_FEW)
+    pairs.sort(key=lambda pair: -pair.distance())
+    distances = {
+        name: float(np.median([pair.distance(reading) for pair in pairs]))
+        for name, reading in convention.readings.items()
+    }
+    photos = tuple(matcher.picture(frame)[0] for frame in pairs[0].frames)
+    size = scene.decoded[pairs[0].frames[0]].size
+    assert size is not None
+    return Geometry(distances, "", pairs, photos, float(np.hypot(*size)))
+
+
+class _Matcher:
+    """Pairs of a scene's frames, by their places in `frames`; features are detected once."""
+
+    def __init__(self, scene: DecodedScene, frames: Sequence[int]) -> None:
+        self.scene, self.frames = scene, frames
+        self.poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
+        self.centres = self.poses[:, :3, 3]
+        self._features: dict[int, tuple[Features, np.ndarray, tuple[int, int]]] = {}
 
     def picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        picture, intrinsics = self.photos[frame].picture(self.decoded[frame].size, SIDE)
-        return np.asarray(picture), intrinsics
+        """The photo as it is matched, and its intrinsics; by its number in the scene."""
+        return self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
 
-    def features(self, frame: int) -> tuple[Features, np.ndarray, Size]:
-        if frame not in self._features:
-            picture, intrinsics = self.picture(frame)
-            self._features[frame] = detect(picture @ _RGB_TO_GREY), intrinsics, picture.shape[:2]
-        return self._features[frame]
+    def first_pair(self, start: int) -> Pair | None:
+        """The frame at `start` and the first of its partners that shares enough with it."""
+        pairs = (self.pair(start, place) for place in self.partners(start))
+        return next((pair for pair in pairs if pair is not None), None)
 
     def pair(self, first: int, second: int) -> Pair | None:
-        """Frames by their places in `frames`; None where too little is shared."""
-        numbers = (self.frames[first], self.frames[second])
-        (one, k1, size), (two, k2, _) = map(self.features, numbers)
+        """None where too little is shared."""
+        for place in (first, second):
+            if place not in self._features:
+                picture, intrinsics = self.picture(self.frames[place])
+                height, width, _ = picture.shape
+                features = detect(picture @ _RGB_TO_GREY)
+                self._features[place] = features, intrinsics, (height, width)
+        (one, k1, size), (two, k2, _) = self._features[first], self._features[second]
         matches = match(one, two)
-        if not len(matches):
+        if matches is None:
             return None
-        poses = np.stack([self.photos[number].listed.c2w for number in numbers])
-        return Pair(numbers, matches, poses, np.stack([k1, k2]), size)
+        frames, poses = (self.frames[first], self.frames[second]), self.poses[[first, second]]
+        return Pair(frames, matches, poses, np.stack([k1, k2]), size)
 
     def partners(self, start: int) -> Iterator[int]:
         """Places of frames that may see the same: along the listing, then near in space."""
-        along = [
-            place
-            for gap in _GAPS
-            for place in (start + gap, start - gap)
-            if 0 <= place < len(self.frames)
-        ]
+        along = [place for gap in _GAPS for place in (start + gap, start - gap)]
+        along = [place for place in along if 0 <= place < len(self.frames)]
         forward = [place for place in along if place > start] or along
         near = np.argsort(np.linalg.norm(self.centres - self.centres[start], axis=1))
         extent = np.ptp(self.centres, axis=0).max()
@@ -110,91 +138,36 @@ class _Scene:
                 yield place
 
 
-def judge_scene(
-    photos: Sequence[Photo],
-    decoded: Sequence[Decoded],
-    sound: Sequence[int],
-    convention: Convention,
-) -> Geometry:
-    """Match up to five pairs, spread over the frames that are `sound`.
-
-    Raises MissingExtraError without scikit-image.
-    """
-    if len(sound) < 2:
-        return Geometry(unjudged="fewer than 2 sound frames")
-    scene = _Scene(photos, decoded, sound)
-    if not np.ptp(scene.centres, axis=0).any():
-        return Geometry(unjudged="all cameras on one point")
-    pairs = [pair for start in _starts(len(sound)) if (pair := _first_pair(scene, start))]
-    if not pairs:
-        return Geometry(unjudged=TOO_FEW)
-    pairs.sort(key=lambda pair: -pair.distance())
-    shown = tuple(scene.picture(frame)[0] for frame in pairs[0].frames)
-    size = decoded[pairs[0].frames[0]].size
-    assert size is not None
-    return Geometry(pairs, shown, judge(pairs, convention), float(np.hypot(*size)))
-
-
-def _starts(count: int) -> list[int]:
-    return list(dict.fromkeys(np.linspace(0, count - 2, _STARTS).round().astype(int).tolist()))
-
-
-def _first_pair(scene: _Scene, start: int) -> Pair | None:
-    pairs = (scene.pair(start, place) for place in scene.partners(start))
-    return next((pair for pair in pairs if pair is not None), None)
-
-
 def geometry_findings(
-    scene: str, geometry: Geometry, photos: Sequence[Photo], convention: Convention
-) -> list[Finding]:
-    """What the verdict means for the scene; a warning where there is none."""
-    if geometry.verdict is None:
-        return [
-            Finding(
-                scene,
-                f"the poses are not judged against the photos: {geometry.unjudged}",
-                "look at the cameras yourself, in the picture that --report draws",
-                severity="warning",
-            )
-        ]
-    frames = tuple(range(len(photos)))
-    names = tuple(photo.listed.name for photo in photos)
-    said = _said(geometry)
-    if geometry.verdict.better is not None:
-        misreading = convention.misreadings[geometry.verdict.better]
-        after = geometry.verdict.distances[geometry.verdict.better] * geometry.diagonal
-        reason = f"{misreading.reason} ({said}; {after:.1f} when read so)"
-        return [Finding(scene, reason, misreading.fix, frames, names)]
-    if not geometry.verdict.agrees:
-        bad = geometry.verdict.distances[AS_READ] > _NONSENSE
-        return [
-            Finding(
-                scene,
-                f"the poses do not explain the photos ({said}), nor in another convention",
-                "check that poses and photos are in the same order, and the intrinsics",
-                frames,
-                names,
-                "error" if bad else "warning",
-            )
-        ]
-    return [_odd_pair(scene, pair, photos, geometry) for pair in geometry.pairs
-            if pair.distance() > _ONE_PAIR]  # fmt: skip
-
-
-def _said(geometry: Geometry) -> str:
-    return (
+    scene: DecodedScene, geometry: Geometry, convention: Convention
+) -> Iterator[Finding]:
+    """What the distances mean for the scene; a warning where there are none."""
+    if not geometry.distances:
+        reason = f"the poses are not judged against the photos: {geometry.unjudged}"
+        fix = "look at the cameras yourself, in the picture that --report draws"
+        yield Finding(scene.name, reason, fix, severity="warning")
+        return
+    frames = range(len(scene.photos))
+    off = (
         f"matches lie {geometry.pixels:.1f} pixels from their epipolar lines, "
         f"median of {len(geometry.pairs)} pairs"
     )
-
-
-def _odd_pair(scene: str, pair: Pair, photos: Sequence[Photo], geometry: Geometry) -> Finding:
-    return Finding(
-        scene,
-        f"the two poses do not fit each other: matches lie "
-        f"{pair.distance() * geometry.diagonal:.1f} pixels from their epipolar lines",
-        "correct the pose of one of them, or remove it",
-        pair.frames,
-        tuple(photos[frame].listed.name for frame in pair.frames),
-        "warning",
-    )
+    if geometry.better is not None:
+        misreading = convention.misreadings[geometry.better]
+        after = geometry.distances[geometry.better] * geometry.diagonal
+        reason = f"{misreading.reason} ({off}; {after:.1f} when read so)"
+        yield scene.finding(frames, reason, misreading.fix)
+    elif not geometry.agrees:
+        reason = f"the poses do not explain the photos ({off}), nor in another convention"
+        fix = "check that poses and photos are in the same order, and the intrinsics"
+        severity = "error" if geometry.fraction > _NONSENSE else "warning"
+        yield scene.finding(frames, reason, fix, severity)
+    else:
+        for pair in geometry.pairs:
+            if (distance := pair.distance()) > _ONE_PAIR:
+                reason = (
+                    "the two poses do not fit each other: matches lie "
+                    f"{distance * geometry.diagonal:.1f} pixels from their epipolar lines"
+                )
+                fix = "correct the pose of one of them, or remove it"
+                yield scene.finding(pair.frames, reason, fix, "warning")

@@ -3,8 +3,7 @@
 from qgs.contracts import Plugin
 from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_ellipsoid.decoding import AxisScaledCenters
-from qgs_ellipsoid.head import EllipsoidHead
+from qgs_ellipsoid.head import AxisScaledCenters, EllipsoidHead
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 
 plugin = Plugin(

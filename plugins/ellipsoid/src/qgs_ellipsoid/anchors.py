@@ -1,4 +1,4 @@
-"""`ellipsoid/anchored`: every query carries a 3D anchor, a centre and an ellipsoid around it."""
+"""`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from qgs_locus.anchors import FrustumCenters, NormalCenters
 from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, raw_radius_of
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.contracts import Fields, ModelDims, Queries
 from qgs.types import QueryState, SpatialSupport
@@ -56,18 +56,15 @@ class EllipsoidQueries(Queries):
         return self.features.shape[0]
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """No weight decay on rotations: their length means nothing."""
+        """No weight decay on rotations, whose length has no effect."""
         return name != "rotation" and super().decays(name, parameter)
 
     def forward(self, batch_size: int) -> QueryState:
         """Features (B, N, D); fields centre (B, N, 3), rotation (B, N, 4), raw radii (B, N, 3)."""
-
-        def shared(x: Tensor) -> Tensor:
-            return x.expand(batch_size, -1, -1)
-
-        rotation = F.normalize(self.rotation, dim=-1)
-        shape = {ROTATION: shared(rotation), RAW_RADII: shared(self.raw_radii)}
-        return QueryState(shared(self.features), {CENTER: shared(self.center), **shape})
+        quats = F.normalize(self.rotation, dim=-1)
+        fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
+        fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
+        return QueryState(self.features.expand(batch_size, -1, -1), fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """The ellipsoids."""

@@ -9,12 +9,12 @@ from torch import Tensor
 
 
 def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A LocusGS state dict as one of the same recipe with ellipsoidal anchors and LocusGS's head.
+    """The state dict of a LocusGS for the same recipe with ellipsoidal anchors and LocusGS's head.
 
-    Radii become three equal ones and the rotation the identity; a refinement changes all three by
-    as much as LocusGS's changes its one. A model with `rotation: false` then is LocusGS; the head
-    of one that refines rotations is not in the result and keeps its own weights (`strict=False`).
-    Raises ValueError for weights without anchors that have a radius.
+    A radius becomes three equal ones, with equal steps in the refinement; rotations are the
+    identity. A model with `rotation: false` computes what LocusGS does. The result has no weights
+    of a refinement of rotations (load with `strict=False`). Raises ValueError for weights without
+    radii.
     """
     if "queries.raw_radius" not in weights:
         raise ValueError(

@@ -21,7 +21,7 @@ ROTATION_FIELD: Fields = {
 
 
 def radii_field(options: RadiusOptions) -> Fields:
-    """Raw radii (B, N, 3) along the axes of the anchor, read as LocusGS reads its one."""
+    """Raw radii (B, N, 3) along the axes of the anchor, with the encoding of LocusGS's one."""
     (scalar,) = radius_field(options).values()
     return {RAW_RADII: FieldSpec((3,), encoding=scalar.encoding)}
 

@@ -1,11 +1,12 @@
-"""`ellipsoid/gaussian_head`: Gaussians that turn and grow with their anchor."""
+"""`ellipsoid/gaussian_head`, `ellipsoid/axis_scaled`: Gaussians relative to their anchor."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import ClassVar
 
-from qgs_locus.fields import RadiusOptions, support_radius
+from qgs_locus.decoding import RadiusScaledCenters
+from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, support_radius
 from torch import Tensor
 
 from qgs.components import GaussianHead
@@ -13,16 +14,15 @@ from qgs.contracts import Fields
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import GaussianAttributes, QueryState
-from qgs_ellipsoid.fields import RAW_RADII, ROTATION, shape_fields
+from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
 from qgs_ellipsoid.rotations import quat_product, unit_quats
 
 
 class EllipsoidHead(GaussianHead):
-    """`qgs/gaussian_head` whose rotations and scales are those of the anchor's frame.
+    """`qgs/gaussian_head` whose rotations and scales are relative to the anchor.
 
-    A Gaussian is turned with its anchor, and measured along each of its axes by the radius that the
-    ellipsoid has in that direction: the scale s becomes s / |u / r| with u the axis in the frame of
-    the anchor.
+    A Gaussian is turned with its anchor. Its scale s along an axis is multiplied by the radius that
+    the ellipsoid has in that direction: s / |u / r|, with u the axis in the anchor's frame.
     """
 
     name: ClassVar[str] = "gaussian_head"
@@ -47,10 +47,30 @@ class EllipsoidHead(GaussianHead):
 
 
 @full_precision
-def radii_along(radii: Tensor, quats: Tensor) -> Tensor:
-    """Radii (B, N, K, 3) of ellipsoids in the directions of the axes of their Gaussians.
+def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
+    """Radii (B, N, K, 3) of ellipsoids along the axes of their Gaussians.
 
-    radii (B, N, 3); quats (B, N, K, 4), Gaussian to anchor. A unit vector u of the anchor's frame
-    leaves the ellipsoid at 1 / |u / r|.
+    quats: Gaussian to anchor. In direction u of the anchor's frame the radius is 1 / |u / r|.
     """
-    return 1 / (quat_to_matrix(quats) / radii[:, :, None, :, None]).norm(dim=-2)
+    return 1 / (quat_to_matrix(quats_BNK4) / radii_BN3[:, :, None, :, None]).norm(dim=-2)
+
+
+class AxisScaledCenters(RadiusScaledCenters):
+    """mean = mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
+
+    name: ClassVar[str] = "axis_scaled"
+
+    @classmethod
+    def requires(cls, config: RadiusScaledCenters.Config) -> Fields:
+        """Centres and shapes."""
+        return {**CENTER_FIELD, **shape_fields(config)}
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        displaced = self.config.displacement(offsets)
+        return _placed(state[CENTER], anchor_axes(state, self.config), displaced)
+
+
+@full_precision
+def _placed(center_BN3: Tensor, axes_BN33: Tensor, offsets_BNK3: Tensor) -> Tensor:
+    return center_BN3[:, :, None] + offsets_BNK3 @ axes_BN33.mT

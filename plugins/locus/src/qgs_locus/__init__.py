@@ -4,10 +4,10 @@ from qgs.contracts import Plugin
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
-from qgs_locus.layout import LOCUSGS
 from qgs_locus.refinement import AnchorRefinement
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from qgs_locus.visibility import AnchorVisibility
+from qgs_locus.weights import LOCUSGS
 
 FRUSTUM = FrustumCenters(kind="frustum")
 

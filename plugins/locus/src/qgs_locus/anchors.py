@@ -1,4 +1,4 @@
-"""`locus/anchored`: every query carries a 3D anchor, centre and support radius."""
+"""`locus/anchored`: every query has a 3D anchor, a centre with a support radius."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class AnchoredQueries(Queries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options of the radius need a radius."""
+        """Options of a radius that there is not."""
         if not config.radius:
             idle = ("init_radius", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`radius` is false")
@@ -128,9 +128,9 @@ class AnchoredQueries(Queries):
         return QueryState(self.features.expand(batch_size, -1, -1), fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """Balls of the support radius; points (radius 0) for anchors without one."""
-        center = state[CENTER]
-        radius = torch.zeros_like(center[..., :1])
+        """Balls of the support radius, points for anchors without one."""
+        center_BN3 = state[CENTER]
+        r_BN1 = torch.zeros_like(center_BN3[..., :1])
         if self.config.radius:
-            radius = support_radius(state[RAW_RADIUS], self.config)
-        return SpatialSupport(center, radius[..., None] * torch.eye(3).to(center))
+            r_BN1 = support_radius(state[RAW_RADIUS], self.config)
+        return SpatialSupport(center_BN3, r_BN1[..., None] * torch.eye(3).to(center_BN3))

@@ -1,4 +1,4 @@
-"""`locus/ray_biased`: queries look first at the rays that pass near their anchor."""
+"""`locus/ray_biased`: queries attend more to rays that pass near their anchor."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ class RayBiasedCrossAttention(CrossAttention):
     """
 
     name: ClassVar[str] = "ray_biased"
+    raw_radius: ClassVar[str] = RAW_RADIUS
 
     class Config(RadiusOptions):
         bandwidth: Literal["radius", "fixed"] = "radius"
@@ -69,11 +70,11 @@ class RayBiasedCrossAttention(CrossAttention):
         """Keys, values, patch rays, centres, and radii if the bandwidth follows them."""
         memory = ("memory.keys", "memory.values", "memory.patch_rays")
         radius = radius_field(config) if config.bandwidth == "radius" else {}
-        return {name: MEMORY_FIELDS[name] for name in memory} | dict(CENTER_FIELD) | dict(radius)
+        return {**{name: MEMORY_FIELDS[name] for name in memory}, **CENTER_FIELD, **radius}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """A fixed bandwidth reads no radius."""
+        """Options of a radius that a fixed bandwidth does not read."""
         if config.bandwidth == "fixed":
             idle = ("sigma_sq_min", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`bandwidth` is fixed")
@@ -87,29 +88,24 @@ class RayBiasedCrossAttention(CrossAttention):
         """Squared bandwidth: (B, N, 1), or one number when fixed."""
         if self.config.bandwidth == "fixed":
             return self.config.sigma0**2
-        radius = support_radius(state[RAW_RADIUS], self.config)
-        return (self.config.sigma0 * radius).square().clamp_min(self.config.sigma_sq_min)
+        r_BN1 = support_radius(state[self.raw_radius], self.config)
+        return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
     def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        """gamma b (B, N, M), float32, computed from the state that enters the layer."""
-        eps = self.config.direction_eps
-        features = memory.once(
+        """gamma b (B, N, M), float32, of the state before this layer."""
+        config, eps = self.config, self.config.direction_eps
+        rays_BFM = memory.once(
             f"locus.ray_features.{eps:g}", lambda: ray_features(memory.patch_rays, eps)
         )
-        return ray_bias(
-            state[CENTER],
-            self.sigma_sq(state),
-            features,
-            self.config.bias_min,
-            self.gamma,
-        )
+        sigma_sq = self.sigma_sq(state)
+        return ray_bias(state[CENTER], sigma_sq, rays_BFM, config.bias_min, self.gamma)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
         """The update (B, N, D)."""
-        bias = self.bias(state, memory)
-        return self.core(state.features, memory.keys, memory.values, bias)
+        bias_BNM = self.bias(state, memory)
+        return self.core(state.features, memory.keys, memory.values, bias_BNM)
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
         """Attention over image tokens, with the bias apart."""
-        bias = self.bias(state, memory)
-        return self.core.explain(state.features, memory.keys, queries, bias)
+        bias_BNM = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias_BNM)

@@ -1,22 +1,15 @@
-"""`locus/anchor_offset`, `locus/radius_scaled`: Gaussians stand around their query's anchor."""
+"""`locus/anchor_offset`, `locus/radius_scaled`: means around the query's anchor."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 from pydantic import Field
 from torch import Tensor
 
 from qgs.components import posact
-from qgs.contracts import (
-    Centers,
-    ComponentConfig,
-    Fields,
-    Problem,
-    RecipeContext,
-    without_effect,
-)
+from qgs.contracts import Centers, ComponentConfig, Fields, Problem, RecipeContext, without_effect
 from qgs.geometry.precision import at_least_float32
 from qgs.types import QueryState
 from qgs_locus.fields import (
@@ -46,11 +39,6 @@ class OffsetOptions(ComponentConfig):
         return posact(raw, self.input_limit, self.output_limit)
 
 
-def _idle_limits(config: OffsetOptions) -> Iterator[Problem]:
-    if config.offset == "linear":
-        yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
-
-
 class AnchorOffsetCenters(Centers):
     """mean = mu + posact(offset)."""
 
@@ -68,15 +56,16 @@ class AnchorOffsetCenters(Centers):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Limits are those of posact."""
-        return _idle_limits(config)
+        """Limits of a posact that is not used."""
+        if config.offset == "linear":
+            yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
         return state[CENTER][:, :, None] + self.config.displacement(offsets)
 
 
-class RadiusScaledCenters(Centers):
+class RadiusScaledCenters(AnchorOffsetCenters):
     """mean = mu + r posact(offset)."""
 
     name: ClassVar[str] = "radius_scaled"
@@ -91,13 +80,7 @@ class RadiusScaledCenters(Centers):
         """Centres and radii."""
         return {**CENTER_FIELD, **radius_field(config)}
 
-    @classmethod
-    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Limits are those of posact."""
-        return _idle_limits(config)
-
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
-        radius = support_radius(state[RAW_RADIUS], self.config)
-        displacement = radius[:, :, None] * self.config.displacement(offsets)
-        return state[CENTER][:, :, None] + displacement
+        r_BN1 = support_radius(state[RAW_RADIUS], self.config)
+        return state[CENTER][:, :, None] + r_BN1[:, :, None] * self.config.displacement(offsets)

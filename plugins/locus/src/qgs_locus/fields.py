@@ -1,4 +1,4 @@
-"""The anchor of a query as state fields, and how its radius is read."""
+"""The state fields of an anchor, and how its radius follows from the raw radius."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CENTER_FIELD: Fields = {CENTER: FieldSpec((3,), frame="world")}
 
 
 class RadiusOptions(ComponentConfig):
-    """How a support radius r is read from the raw radius rho; all components must agree."""
+    """How the support radius r follows from the raw radius rho; all components must agree."""
 
     radius_bound: Literal["floor", "offset"] = "floor"
     """r = max(softplus(rho), radius_min) ("floor", release) or softplus(rho) + radius_min (paper);
@@ -30,7 +30,7 @@ class RadiusOptions(ComponentConfig):
 
 
 def radius_field(options: RadiusOptions) -> Fields:
-    """Raw radius rho (B, N, 1) with its reading, so that a mismatch is refused at compose."""
+    """Raw radius rho (B, N, 1); the encoding lets the composer refuse components that disagree."""
     reading = {
         "floor": f"radius = max(softplus(x), {options.radius_min:g})",
         "offset": f"radius = softplus(x) + {options.radius_min:g}",
@@ -40,7 +40,7 @@ def radius_field(options: RadiusOptions) -> Fields:
 
 @full_precision
 def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
-    """Support radius r > 0, world units, of a raw radius of any shape."""
+    """Support radii r > 0, world units, of raw radii of any shape."""
     radius = F.softplus(raw_radius)
     if options.radius_bound == "floor":
         return radius.clamp_min(options.radius_min)

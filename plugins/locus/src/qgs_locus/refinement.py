@@ -1,4 +1,4 @@
-"""`locus/refine`: anchors move and their radii change after every layer."""
+"""`locus/refine`: updates the centres and radii of anchors after each decoder layer."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from qgs.components import Mlp, posact
 from qgs.contracts import Fields, ModelDims, Problem, RecipeContext, Refinement, without_effect
 from qgs.geometry.precision import at_least_float32
 from qgs.types import QueryState
-from qgs_locus.fields import CENTER, CENTER_FIELD, RAW_RADIUS, RadiusOptions, radius_field
+from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field
 
 
 class AnchorRefinement(Refinement):
     """mu += posact(MLP_mu(x)), rho += MLP_rho(x), heads shared by all layers (LocusGS)."""
 
     name: ClassVar[str] = "refine"
+    parts: ClassVar[tuple[str, ...]] = ("`center`", "`radius`")
 
     class Config(RadiusOptions):
         center: bool = True
@@ -41,7 +42,8 @@ class AnchorRefinement(Refinement):
         if config.center:
             self.center_mlp = self._head(3)
         if config.radius:
-            self.radius_mlp = self._head(1)
+            ((self.raw_radius, spec),) = self.radius_field(config).items()
+            self.radius_mlp = self._head(int(spec.shape[0]))
 
     def _head(self, channels: int) -> Mlp:
         mlp = Mlp(self.dims.width, self.dims.width, channels)
@@ -51,10 +53,15 @@ class AnchorRefinement(Refinement):
         return mlp
 
     @classmethod
+    def radius_field(cls, config: Config) -> Fields:
+        """The raw radius; a subclass may have another one, with any number of channels."""
+        return radius_field(config)
+
+    @classmethod
     def requires(cls, config: Config) -> Fields:
         """Whatever is refined."""
         center = CENTER_FIELD if config.center else {}
-        return {**center, **(radius_field(config) if config.radius else {})}
+        return {**center, **(cls.radius_field(config) if config.radius else {})}
 
     @classmethod
     def provides(cls, config: Config) -> Fields:
@@ -63,35 +70,30 @@ class AnchorRefinement(Refinement):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Something must be refined, and every option must matter."""
-        if not config.center and not config.radius:
+        """Nothing to refine, and options without effect."""
+        if not cls.requires(config):
             yield Problem(
                 "",
-                "`center` and `radius` are both false: nothing is refined",
+                f"nothing is refined: {', '.join(cls.parts)} are all false",
                 "set one of them to true, or use `qgs/none` in the slot `refinement`",
             )
         limits = ("input_limit", "output_limit")
         if not config.center:
-            idle = ("center_step", *limits)
-            yield from without_effect(config, idle, "`center` is false")
+            yield from without_effect(config, ("center_step", *limits), "`center` is false")
         elif config.center_step == "linear":
             yield from without_effect(config, limits, "`center_step` is linear")
         if not config.radius:
-            idle = ("radius_bound", "radius_min")
-            yield from without_effect(config, idle, "`radius` is false")
+            yield from without_effect(config, ("radius_bound", "radius_min"), "`radius` is false")
 
     def forward(self, state: QueryState) -> QueryState:
         """A state with moved centres and changed raw radii."""
         refined: dict[str, Tensor] = {}
         if self.config.center:
-            refined[CENTER] = state[CENTER] + self._center_step(state.features)
+            step_BN3 = self.center_mlp(state.features)
+            if self.config.center_step == "posact":
+                step_BN3 = posact(step_BN3, self.config.input_limit, self.config.output_limit)
+            refined[CENTER] = state[CENTER] + at_least_float32(step_BN3)
         if self.config.radius:
             step = at_least_float32(self.radius_mlp(state.features))
-            refined[RAW_RADIUS] = state[RAW_RADIUS] + step
+            refined[self.raw_radius] = state[self.raw_radius] + step
         return state.replace(fields=refined)
-
-    def _center_step(self, features: Tensor) -> Tensor:
-        step = self.center_mlp(features)
-        if self.config.center_step == "linear":
-            return at_least_float32(step)
-        return posact(step, self.config.input_limit, self.config.output_limit)

@@ -1,4 +1,4 @@
-"""`locus/anchor_aware`: queries exchange what they know, knowing where they are."""
+"""`locus/anchor_aware`: self-attention with an embedding of the anchors' centres."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def sine_embedding(
 
 
 class AnchorAwareSelfAttention(SelfAttention):
-    """Self-attention over x + p with p = MLP(PE(mu)); queries, keys and values all see p.
+    """Self-attention over x + p with p = MLP(PE(mu)), for queries, keys and values.
 
-    The residual stream itself does not keep p.
+    The residual stream does not keep p.
     """
 
     name: ClassVar[str] = "anchor_aware"
@@ -45,7 +45,7 @@ class AnchorAwareSelfAttention(SelfAttention):
         features: int = Field(default=128, ge=2, multiple_of=2)
         """Sines and cosines per axis."""
         temperature: float = Field(default=10_000.0, gt=0)
-        """Longest period over shortest, nearly; base of the frequencies of the sines."""
+        """About the ratio of the longest to the shortest wavelength of the sines."""
         divisor_eps: float = Field(default=1e-6, ge=0)
         """Added to the divisor of each frequency (LocusGS release)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
@@ -66,10 +66,11 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     def position_embedding(self, state: QueryState) -> Tensor:
         """p (B, N, D)."""
-        center, config = state[CENTER], self.config
-        position = torch.tanh(center) if config.position == "tanh" else center
+        position_BN3, c = state[CENTER], self.config
+        if c.position == "tanh":
+            position_BN3 = torch.tanh(position_BN3)
         return self.position_mlp(
-            sine_embedding(position, config.features, config.temperature, config.divisor_eps)
+            sine_embedding(position_BN3, c.features, c.temperature, c.divisor_eps)
         )
 
     def forward(self, state: QueryState) -> Tensor:
@@ -78,5 +79,5 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
         """Attention over queries."""
-        normed = self.norm(state.features + self.position_embedding(state))
-        return self.attention.explain(normed, queries)
+        x_BND = self.norm(state.features + self.position_embedding(state))
+        return self.attention.explain(x_BND, queries)

@@ -1,4 +1,4 @@
-"""`locus/anchor_visibility`: anchors that no supervised view sees are drawn towards one."""
+"""`locus/anchor_visibility`: moves anchors that no target view sees towards the nearest one."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class AnchorVisibility(Loss):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options must go together, and each must matter."""
+        """Options that contradict each other or have no effect."""
         return config.conflicts()
 
     def forward(

@@ -1,14 +1,66 @@
-"""Bands of images and depth maps of a room: bounds, rays and colours, one compiled call each."""
+"""Images and depth maps of a room, in bands of rows, each one compiled call."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
+import torch
 from numba import njit
 
-from qgs_rooms.materials import OPTIONS
 from qgs_rooms.raycast import ray_basis, screen_bounds, trace
 from qgs_rooms.shading import paint
 from qgs_rooms.shapes import Room
+from qgs_rooms.textures import OPTIONS
+
+_BAND = 64  # rows of an image that one thread casts at a time
+
+
+def cast_images(
+    room: Room,
+    floor: np.ndarray,
+    c2w: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    samples: int,
+) -> np.ndarray:
+    """Images (F, H, W, 3) uint8; a pixel is the mean of samples x samples rays on a regular grid.
+
+    floor: see `shading.floor_shadows`. c2w: (F, 4, 4) OpenCV. intrinsics: fx, fy, cx, cy in pixels.
+    size: (H, W).
+    """
+    images = np.empty((len(c2w), *size, 3), np.uint8)
+    packed = (room.shapes, room.textures, room.size, room.lights)
+
+    def cast(frame: int, top: int, bottom: int) -> None:
+        band = images[frame][top:bottom]
+        _colors(band, top, samples, packed, floor, c2w[frame], intrinsics)
+
+    _in_bands(cast, len(c2w), size[0])
+    return images
+
+
+def cast_depths(
+    room: Room, c2w: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Depths (F, H, W) float32: z of the ray through each pixel's centre; see `cast_images`."""
+    depths = np.empty((len(c2w), *size), np.float32)
+
+    def cast(frame: int, top: int, bottom: int) -> None:
+        view = (room.shapes, room.size, c2w[frame], intrinsics)
+        depths[frame, top:bottom] = _traced(bottom - top, size[1], top, 1, *view)[0]
+
+    _in_bands(cast, len(c2w), size[0])
+    return depths
+
+
+def _in_bands(cast: Callable[[int, int, int], None], frames: int, height: int) -> None:
+    """Call `cast(frame, top, bottom)` for all rows of all frames, on torch's number of threads."""
+    tops = range(0, height, _BAND)
+    bands = [(frame, top, min(top + _BAND, height)) for frame in range(frames) for top in tops]
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(lambda band: cast(*band), bands))  # raises what a thread raised
 
 
 @njit(**OPTIONS)
@@ -26,31 +78,3 @@ def _colors(image, top, samples, room, floor, c2w, intrinsics):
     rows, columns, _ = image.shape
     t, code, rays = _traced(rows, columns, top, samples, shapes, size, c2w, intrinsics)
     paint(image, t, code, top, samples, room, floor, c2w, rays)
-
-
-def cast_colors(
-    image: np.ndarray,
-    rows: tuple[int, int],
-    samples: int,
-    room: Room,
-    floor: np.ndarray,
-    c2w: np.ndarray,
-    intrinsics: np.ndarray,
-) -> None:
-    """Write rows [rows[0], rows[1]) of image (H, W, 3) uint8.
-
-    Each pixel is the mean of samples x samples rays on a regular grid. floor: see
-    `shadows.floor_shadows`. c2w: (4, 4) OpenCV. intrinsics: fx, fy, cx, cy in pixels.
-    """
-    packed = (room.shapes, room.textures, room.size, room.lights)
-    _colors(image[slice(*rows)], rows[0], samples, packed, floor, c2w, intrinsics)
-
-
-def cast_depths(
-    depth: np.ndarray, rows: tuple[int, int], room: Room, c2w: np.ndarray, intrinsics: np.ndarray
-) -> None:
-    """Write rows [rows[0], rows[1]) of depth (H, W) float32: z of the ray through pixel centres."""
-    top, bottom = rows
-    depth[top:bottom] = _traced(
-        bottom - top, depth.shape[1], top, 1, room.shapes, room.size, c2w, intrinsics
-    )[0]

@@ -1,18 +1,14 @@
-"""Shapes of a room's furniture."""
+"""Pieces of furniture, each a list of shapes about the origin whose back is towards +y."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from random import Random
 
 import numpy as np
 
-from qgs_rooms.draws import Draws
 from qgs_rooms.materials import Materials
 from qgs_rooms.shapes import Shape, box, cylinder, sphere
-
-# kind, centre x y z, half sizes x y z, cos and sin of the turn about z, texture
-# kind, period, seed, emission, colours a, b and c (RGB each)
-
 
 Piece = list[Shape]
 
@@ -22,12 +18,11 @@ def _legs(w: float, d: float, h: float, thick: float, texture: int) -> Piece:
     return [box(a * x, b * y, 0, (thick, thick, h), texture) for a in (-1, 1) for b in (-1, 1)]
 
 
-def _on_top(rng: Draws, m: Materials, x: float, y: float, z: float) -> Piece:
+def _on_top(rng: Random, m: Materials, x: float, y: float, z: float) -> Piece:
     """Something small that stands at (x, y, z)."""
-    pick = rng.integers(5)
+    pick = rng.randrange(5)
     if pick == 0:
-        r = rng.uniform(0.05, 0.09)
-        h = rng.uniform(0.15, 0.3)
+        r, h = rng.uniform(0.05, 0.09), rng.uniform(0.15, 0.3)
         return [
             cylinder(x, y, z, r, h, m.fabric()),
             sphere(x, y, z + h - 0.3 * r, 1.5 * r, m.paint()),
@@ -48,12 +43,12 @@ def _on_top(rng: Draws, m: Materials, x: float, y: float, z: float) -> Piece:
     return [box(x, y, z, (0.16, 0.16, rng.uniform(0.1, 0.25)), m.fabric())]
 
 
-def table(rng: Draws, m: Materials) -> Piece:
+def table(rng: Random, m: Materials) -> Piece:
     """A dining table with things on it and chairs around."""
     w, d, h = rng.uniform(1.0, 1.6), rng.uniform(0.7, 0.95), rng.uniform(0.7, 0.76)
     wood = m.timber()
     piece = [box(0, 0, h - 0.04, (w, d, 0.04), wood), *_legs(w, d, h - 0.04, 0.06, wood)]
-    for x in rng.several(-0.38, 0.38, rng.integers(1, 4)):
+    for x in [rng.uniform(-0.38, 0.38) for _ in range(rng.randrange(1, 4))]:
         piece += _on_top(rng, m, x * w, rng.uniform(-0.3, 0.3) * d, h)
     seat, frame = m.fabric(), m.timber()
     for side in (0.0, np.pi):
@@ -76,12 +71,12 @@ def _chair(seat: int, frame: int) -> Piece:
     ]
 
 
-def chair(rng: Draws, m: Materials) -> Piece:
+def chair(rng: Random, m: Materials) -> Piece:
     """A single chair."""
     return _chair(m.fabric(), m.timber())
 
 
-def round_table(rng: Draws, m: Materials) -> Piece:
+def round_table(rng: Random, m: Materials) -> Piece:
     """A round table on one foot."""
     r, h = rng.uniform(0.35, 0.55), rng.uniform(0.45, 0.72)
     wood, metal = m.timber(), m.metal()
@@ -93,7 +88,7 @@ def round_table(rng: Draws, m: Materials) -> Piece:
     return piece + _on_top(rng, m, 0.3 * r, 0.2 * r, h) + _on_top(rng, m, -0.4 * r, 0, h)
 
 
-def sofa(rng: Draws, m: Materials) -> Piece:
+def sofa(rng: Random, m: Materials) -> Piece:
     """A sofa with arms and cushions."""
     w, d = rng.uniform(1.4, 2.1), 0.85
     cloth, feet = m.fabric(), m.metal()
@@ -104,19 +99,17 @@ def sofa(rng: Draws, m: Materials) -> Piece:
         box(w / 2 - 0.09, 0, 0.42, (0.18, d, 0.18), cloth),
         *_legs(w, d, 0.1, 0.06, feet),
     ]
-    for x in rng.several(-0.32, 0.32, rng.integers(1, 4)):
+    for x in [rng.uniform(-0.32, 0.32) for _ in range(rng.randrange(1, 4))]:
         cushion = box(0, 0, 0.43, (0.4, 0.13, 0.36), m.fabric())
         piece.append(cushion.moved(x * w, 0.12, rng.gauss(0, 0.15)))
     return piece
 
 
-def shelf(rng: Draws, m: Materials) -> Piece:
+def shelf(rng: Random, m: Materials) -> Piece:
     """A bookcase, some boards full of books, others with ornaments."""
     w, d = rng.uniform(0.8, 1.5), 0.32
-    levels = rng.integers(3, 6)
-    step = 0.38
-    h = levels * step
-    wood = m.timber()
+    levels, step = rng.randrange(3, 6), 0.38
+    h, wood = levels * step, m.timber()
     piece = [
         box(-w / 2, 0, 0, (0.04, d, h), wood),
         box(w / 2, 0, 0, (0.04, d, h), wood),
@@ -137,12 +130,12 @@ def shelf(rng: Draws, m: Materials) -> Piece:
     return piece
 
 
-def sideboard(rng: Draws, m: Materials) -> Piece:
+def sideboard(rng: Random, m: Materials) -> Piece:
     """A low cupboard with doors and things on it."""
     w, d, h = rng.uniform(1.0, 1.7), 0.42, rng.uniform(0.6, 0.85)
     front, knob = m.paint() if rng.random() < 0.4 else m.timber(), m.metal()
     piece = [box(0, 0, 0.08, (w, d, h - 0.08), m.timber()), box(0, 0, 0, (w - 0.1, d, 0.08), knob)]
-    doors = rng.integers(2, 4)
+    doors = rng.randrange(2, 4)
     for i in range(doors):
         x = (i + 0.5) * w / doors - w / 2
         piece.append(box(x, -d / 2, 0.12, (w / doors - 0.04, 0.03, h - 0.18), front))
@@ -153,7 +146,7 @@ def sideboard(rng: Draws, m: Materials) -> Piece:
     return piece
 
 
-def wardrobe(rng: Draws, m: Materials) -> Piece:
+def wardrobe(rng: Random, m: Materials) -> Piece:
     """A tall cupboard."""
     w, d, h = rng.uniform(0.9, 1.4), 0.55, rng.uniform(1.7, 2.1)
     front, knob = m.timber(), m.metal()
@@ -164,7 +157,7 @@ def wardrobe(rng: Draws, m: Materials) -> Piece:
     return piece
 
 
-def floor_lamp(rng: Draws, m: Materials) -> Piece:
+def floor_lamp(rng: Random, m: Materials) -> Piece:
     """A lamp on a pole."""
     metal, h = m.metal(), rng.uniform(1.2, 1.5)
     return [
@@ -174,7 +167,7 @@ def floor_lamp(rng: Draws, m: Materials) -> Piece:
     ]
 
 
-def plant(rng: Draws, m: Materials) -> Piece:
+def plant(rng: Random, m: Materials) -> Piece:
     """A pot with a few round clumps of leaves."""
     green = (0.15 + 0.2 * rng.random(), 0.4 + 0.2 * rng.random(), 0.15)
     leaves = m.add(6, 0.06, ((0.08, 0.22, 0.08), green, green))
@@ -182,34 +175,29 @@ def plant(rng: Draws, m: Materials) -> Piece:
         cylinder(0, 0, 0, 0.17, 0.32, m.paint()),
         cylinder(0, 0, 0.32, 0.025, 0.35, m.timber()),
     ]
-    for _ in range(rng.integers(3, 6)):
-        x, y = rng.several(-0.16, 0.16, 2)
+    for _ in range(rng.randrange(3, 6)):
+        x, y = [rng.uniform(-0.16, 0.16) for _ in range(2)]
         piece.append(sphere(x, y, rng.uniform(0.5, 0.85), rng.uniform(0.12, 0.2), leaves))
     return piece
 
 
-def balls(rng: Draws, m: Materials) -> Piece:
+def balls(rng: Random, m: Materials) -> Piece:
     """Balls left on the floor."""
+    between = rng.uniform
     return [
-        sphere(
-            rng.uniform(-0.35, 0.35),
-            rng.uniform(-0.35, 0.35),
-            0.0,
-            rng.uniform(0.08, 0.2),
-            m.fabric(),
-        )
-        for _ in range(rng.integers(1, 4))
+        sphere(between(-0.35, 0.35), between(-0.35, 0.35), 0, between(0.08, 0.2), m.fabric())
+        for _ in range(rng.randrange(1, 4))
     ]
 
 
-def crates(rng: Draws, m: Materials) -> Piece:
+def crates(rng: Random, m: Materials) -> Piece:
     """A stack of two boxes."""
     a, b = rng.uniform(0.35, 0.5), rng.uniform(0.22, 0.33)
     upper = box(0, 0, a, (b, b, b), m.fabric()).moved(0.03, 0.02, rng.uniform(0, 1.5))
     return [box(0, 0, 0, (a, a, a), m.fabric()), upper]
 
 
-Maker = Callable[[Draws, Materials], Piece]
+Maker = Callable[[Random, Materials], Piece]
 AGAINST_WALLS: tuple[Maker, ...] = (
     shelf, sofa, sideboard, wardrobe, shelf, sideboard, plant, floor_lamp, crates,
 )  # fmt: skip

@@ -1,6 +1,7 @@
 """Where a ray o + t d meets a shape: slabs, spheres and upright cylinders, entry points only.
 
-All numbers are float32, constants too: a wider one would widen the loops that LLVM vectorises."""
+All numbers are float32, constants too: a wider one would widen the loops that LLVM vectorises.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +11,18 @@ import numpy as np
 from numba import njit
 
 from qgs_rooms import shapes as s
-from qgs_rooms.materials import INNER, OPTIONS
+from qgs_rooms.textures import INNER, OPTIONS
 
 NEAR = np.float32(0.02)
-
-
 NONE = np.float32(np.inf)
-
-
-_TINY = np.float32(1e-9)
-
-
-_ZERO, _ONE = np.float32(0), np.float32(1)
-
-
-_BOX, _SPHERE = s.BOX, s.SPHERE
+TINY = np.float32(1e-9)
+ZERO, ONE = np.float32(0), np.float32(1)
 
 
 @njit(**INNER)
 def reciprocal(x):
     """1 / x, large where x is 0."""
-    return _ONE / (x if abs(x) > _TINY else _TINY)
+    return ONE / (x if abs(x) > TINY else TINY)
 
 
 @njit(**INNER)
@@ -43,12 +35,12 @@ def slab(o, inverse, h):
 @njit(**INNER)
 def hit_sphere(o, d, radius):
     """Entry into the sphere of `radius` around the origin."""
-    inverse = _ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
     x, y, z = o[0] + middle * d[0], o[1] + middle * d[1], o[2] + middle * d[2]
     inside = radius * radius - (x * x + y * y + z * z)
-    t = middle - math.sqrt(max(inside, _ZERO) * inverse)
-    return t if (inside > _ZERO) & (t > NEAR) else NONE
+    t = middle - math.sqrt(max(inside, ZERO) * inverse)
+    return t if (inside > ZERO) & (t > NEAR) else NONE
 
 
 @njit(**INNER)
@@ -59,9 +51,9 @@ def hit_cylinder(o, d, radius, half):
     middle = -(o[0] * d[0] + o[1] * d[1]) * inverse
     x, y = o[0] + middle * d[0], o[1] + middle * d[1]
     inside = radius * radius - (x * x + y * y)
-    root = math.sqrt(max(inside, _ZERO) * inverse)
+    root = math.sqrt(max(inside, ZERO) * inverse)
     near, far = max(low, middle - root), min(high, middle + root)
-    return near if (inside > _ZERO) & (near > NEAR) & (near <= far) else NONE, low
+    return near if (inside > ZERO) & (near > NEAR) & (near <= far) else NONE, low
 
 
 @njit(**INNER)
@@ -92,14 +84,8 @@ def hit(shapes, i, o, d):
     """t at which the ray o + t d enters shape i, or inf."""
     lo = local_point(shapes, i, o[0], o[1], o[2])
     ld = local(shapes, i, d[0], d[1], d[2])
-    if shapes[i, 0] == _BOX:
+    if shapes[i, 0] == s.BOX:
         return hit_box(lo, ld, (shapes[i, 4], shapes[i, 5], shapes[i, 6]))[0]
-    if shapes[i, 0] == _SPHERE:
+    if shapes[i, 0] == s.SPHERE:
         return hit_sphere(lo, ld, shapes[i, 4])
     return hit_cylinder(lo, ld, shapes[i, 4], shapes[i, 6])[0]
-
-
-_BOX, _SPHERE = s.BOX, s.SPHERE
-
-
-_ZERO, _ONE = np.float32(0), np.float32(1)

@@ -1,12 +1,12 @@
-"""The plan of a room: walls, openings, furniture and cameras, drawn from a seed."""
+"""The plan of a room: walls, openings, furniture and lights, drawn from a seed."""
 
 from __future__ import annotations
 
 import math
+from random import Random
 
 import numpy as np
 
-from qgs_rooms.draws import Draws
 from qgs_rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
 from qgs_rooms.materials import Materials
 from qgs_rooms.shapes import Room, Shape, box, cylinder
@@ -14,15 +14,37 @@ from qgs_rooms.shapes import Room, Shape, box, cylinder
 CLEARANCE = 0.4  # metres between a camera and the nearest shape
 _GAP = 0.05  # metres between pieces
 
+Size = tuple[float, float, float]
 Point = tuple[float, float, float]
 # Corners of a piece that fits wherever any does.
 _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
+def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
+    """A room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
+    m = Materials(rng)
+    wall = m.wall()
+    walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
+    surfaces = [*walls, m.floor(), m.pale()]
+    furnisher = Furnisher(size, eyes)
+    _centre(rng, m, furnisher)
+    for side in range(4):
+        _against_wall(rng, m, furnisher, side)
+    for _ in range(3):
+        maker = rng.choice(LOOSE)
+        x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
+        furnisher.place(maker(rng, m), x, y, rng.uniform(0, 2 * math.pi))
+    window_side = rng.randrange(4)
+    shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
+    head = [m.rows[i] for i in surfaces]
+    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes], np.float32)
+    return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
+
+
 class Furnisher:
     """Places pieces one by one where they hit neither each other nor the cameras."""
 
-    def __init__(self, size: tuple[float, float, float], eyes: np.ndarray) -> None:
+    def __init__(self, size: Size, eyes: np.ndarray) -> None:
         self.size, self.eyes = size, eyes.tolist()
         self.shapes: list[Shape] = []
         self._taken: list[tuple[float, float, float, float]] = []
@@ -39,17 +61,23 @@ class Furnisher:
     def free(self, low: Point, high: Point) -> bool:
         """Whether the box between two corners is in the room, off other pieces and the cameras."""
         half_x, half_y = self.size[0] / 2, self.size[1] / 2
-        inside = -half_x <= low[0] and high[0] <= half_x and -half_y <= low[1] and high[1] <= half_y
-        return inside and not self._blocked(low, high) and clear_of(low, high, self.eyes)
-
-    def _blocked(self, low: Point, high: Point) -> bool:
-        return any(
-            low[0] < x1 + _GAP
-            and high[0] > x0 - _GAP
-            and low[1] < y1 + _GAP
-            and high[1] > y0 - _GAP
-            for x0, y0, x1, y1 in self._taken
-        )
+        if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
+            return False
+        for x0, y0, x1, y1 in self._taken:
+            if (
+                low[0] < x1 + _GAP
+                and high[0] > x0 - _GAP
+                and low[1] < y1 + _GAP
+                and high[1] > y0 - _GAP
+            ):
+                return False
+        for x, y, z in self.eyes:
+            dx = max(low[0] - x, x - high[0], 0.0)
+            dy = max(low[1] - y, y - high[1], 0.0)
+            dz = max(low[2] - z, z - high[2], 0.0)
+            if dx * dx + dy * dy + dz * dz <= CLEARANCE**2:
+                return False
+        return True
 
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
@@ -67,41 +95,9 @@ def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Po
     return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
 
 
-def clear_of(low: Point, high: Point, eyes: list[list[float]]) -> bool:
-    """Whether every eye keeps its clearance from the box between `low` and `high`."""
-    for x, y, z in eyes:
-        dx = max(low[0] - x, x - high[0], 0.0)
-        dy = max(low[1] - y, y - high[1], 0.0)
-        dz = max(low[2] - z, z - high[2], 0.0)
-        if dx * dx + dy * dy + dz * dz <= CLEARANCE**2:
-            return False
-    return True
-
-
-def furnish(rng: Draws, size: tuple[float, float, float], eyes: np.ndarray) -> Room:
-    """A room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
-    m = Materials(rng)
-    wall = m.wall()
-    walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
-    surfaces = [*walls, m.floor(), m.pale()]
-    furnisher = Furnisher(size, eyes)
-    _centre(rng, m, furnisher)
-    for side in range(4):
-        _against_wall(rng, m, furnisher, side)
-    for _ in range(3):
-        maker = LOOSE[rng.integers(len(LOOSE))]
-        x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
-        furnisher.place(maker(rng, m), x, y, rng.uniform(0, 2 * math.pi))
-    window_side = rng.integers(4)
-    shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
-    head = [m.rows[i] for i in surfaces]
-    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes], np.float32)
-    return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
-
-
-def _centre(rng: Draws, m: Materials, furnisher: Furnisher) -> None:
-    maker = CENTRAL[rng.integers(len(CENTRAL))]
-    turn = float(rng.integers(4)) * math.pi / 2 + rng.gauss(0, 0.12)
+def _centre(rng: Random, m: Materials, furnisher: Furnisher) -> None:
+    maker = rng.choice(CENTRAL)
+    turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
     piece = maker(rng, m)
     for _ in range(4):
         x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
@@ -109,22 +105,19 @@ def _centre(rng: Draws, m: Materials, furnisher: Furnisher) -> None:
             return
 
 
-def _against_wall(rng: Draws, m: Materials, furnisher: Furnisher, side: int) -> None:
+def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) -> None:
     """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
     across, along = furnisher.size[side % 2], furnisher.size[1 - side % 2]
     turn = math.pi / 2 + side * math.pi / 2
     position = -along / 2 + rng.uniform(0.1, 0.6)
     while position < along / 2 - 0.4:
         spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
-        if not furnisher.free(*spot):
-            position += rng.uniform(0.1, 0.5)
-            continue
-        piece = AGAINST_WALLS[rng.integers(len(AGAINST_WALLS))](rng, m)
-        low, high = bounds(piece)
-        away = across / 2 - float(high[1]) - 0.02
-        middle = position - float(low[0])
-        if furnisher.place(piece, *_from_wall(side, away, middle), turn):
-            position += float(high[0] - low[0])
+        if furnisher.free(*spot):
+            piece = rng.choice(AGAINST_WALLS)(rng, m)
+            low, high = bounds(piece)
+            at = _from_wall(side, across / 2 - float(high[1]) - 0.02, position - float(low[0]))
+            if furnisher.place(piece, *at, turn):
+                position += float(high[0] - low[0])
         position += rng.uniform(0.1, 0.5)
 
 
@@ -135,9 +128,7 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
     return cos * away + sin * along, sin * away - cos * along
 
 
-def _on_walls(
-    rng: Draws, m: Materials, size: tuple[float, float, float], window_side: int
-) -> list[Shape]:
+def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[Shape]:
     """A window on one wall, pictures on the others."""
     shapes: list[Shape] = []
     for side in range(4):
@@ -151,7 +142,7 @@ def _on_walls(
             places = [place for place in places if rng.random() < 0.65]
             hung = []
         for place in places:
-            width, height = rng.several(0.4, 0.75, 2)
+            width, height = [rng.uniform(0.4, 0.75) for _ in range(2)]
             item = hung or _framed(m.timber(), m.picture(), width, height, 1.45, 0.05)
             x, y = _from_wall(side, across / 2, place)
             shapes += [shape.moved(x, y, turn) for shape in item]
@@ -167,22 +158,21 @@ def _framed(
     ]
 
 
-def _fixed(rng: Draws, m: Materials, size: tuple[float, float, float]) -> list[Shape]:
+def _fixed(rng: Random, m: Materials, size: Size) -> list[Shape]:
     """The rug, the skirting boards and the ceiling lamp."""
     board = m.pale()
     w, d, h = size
-    shapes = [box(0, side * d / 2, 0, (w, 0.04, 0.09), board) for side in (-1, 1)] + [
-        box(side * w / 2, 0, 0, (0.04, d, 0.09), board) for side in (-1, 1)
-    ]
+    shapes = [box(0, side * d / 2, 0, (w, 0.04, 0.09), board) for side in (-1, 1)]
+    shapes += [box(side * w / 2, 0, 0, (0.04, d, 0.09), board) for side in (-1, 1)]
     shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, m.glow()))
     if rng.random() < 0.75:
         rug = box(0, 0, 0, (rng.uniform(0.35, 0.6) * w, rng.uniform(0.35, 0.6) * d, 0.012), m.rug())
-        x, y = rng.several(-0.3, 0.3, 2)
+        x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
         shapes.append(rug.moved(x, y, rng.gauss(0, 0.1)))
     return shapes
 
 
-def _lights(rng: Draws, size: tuple[float, float, float], window_side: int) -> np.ndarray:
+def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
     lamp = (0.0, 0.0, size[2] - 0.2, rng.uniform(0.55, 0.95))
     return np.array([lamp, (x, y, 1.6, rng.uniform(0.45, 1.2))])

@@ -1,4 +1,4 @@
-"""Rays into a room: intersections, and pictures by ray casting."""
+"""Which surface each ray of an image meets first: shapes by the screen rows that they cover."""
 
 from __future__ import annotations
 
@@ -7,18 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
-from qgs_rooms.intersections import (
-    _BOX,
-    _ONE,
-    _SPHERE,
-    _ZERO,
-    hit_box,
-    hit_cylinder,
-    hit_sphere,
-    local,
-    local_point,
-)
-from qgs_rooms.materials import INNER
+from qgs_rooms import shapes as s
+from qgs_rooms.intersections import ONE, ZERO, hit_box, hit_cylinder, hit_sphere, local, local_point
+from qgs_rooms.textures import INNER
 
 _PLANE = 0.02  # shapes are clipped where they come nearer to the camera's plane than this
 
@@ -84,12 +75,12 @@ def _walls(t, code, steps, o, base, step, size):
         z = base[2] + steps[k] * step[2]
         tx = (math.copysign(_HALF * size[0], x) - o[0]) / x
         ty = (math.copysign(_HALF * size[1], y) - o[1]) / y
-        tz = ((size[2] if z > _ZERO else _ZERO) - o[2]) / z
+        tz = ((size[2] if z > ZERO else ZERO) - o[2]) / z
         first_x, first_y = (tx <= ty) & (tx <= tz), ty <= tz
         t[k] = tx if first_x else (ty if first_y else tz)
         along = x if first_x else (y if first_y else z)
         face = _X if first_x else (_Y if first_y else _Z)
-        code[k] = face + (_ONE if along > _ZERO else _ZERO)
+        code[k] = face + (ONE if along > ZERO else ZERO)
 
 
 @njit(**INNER)
@@ -98,7 +89,7 @@ def _box_row(t, code, steps, o, base, step, h, own):
         x, y = base[0] + steps[k] * step[0], base[1] + steps[k] * step[1]
         hit, near_x, near_y = hit_box(o, (x, y, base[2] + steps[k] * step[2]), h)
         closer = hit < t[k]
-        part = own if hit == near_x else (own + _ONE if hit == near_y else own + _ONE + _ONE)
+        part = own if hit == near_x else (own + ONE if hit == near_y else own + ONE + ONE)
         t[k] = hit if closer else t[k]
         code[k] = part if closer else code[k]
 
@@ -121,7 +112,7 @@ def _cylinder_row(t, code, steps, o, base, step, radius, half, own):
         hit, cap = hit_cylinder(o, d, radius, half)
         closer = hit < t[k]
         t[k] = hit if closer else t[k]
-        code[k] = (own + _ONE if hit == cap else own) if closer else code[k]
+        code[k] = (own + ONE if hit == cap else own) if closer else code[k]
 
 
 @njit(**INNER)
@@ -180,9 +171,9 @@ def trace(t, code, top, samples, shapes, size, bounds, c2w, rays):
             base = _row_base(rays, top + (i + 0.5) / samples)
             lb = local(shapes, k, base[0], base[1], base[2])
             near, codes = t[i, first:last], code[i, first:last]
-            if shapes[k, 0] == _BOX:
+            if shapes[k, 0] == s.BOX:
                 _box_row(near, codes, along, lo, lb, ls, h, own)
-            elif shapes[k, 0] == _SPHERE:
+            elif shapes[k, 0] == s.SPHERE:
                 _sphere_row(near, codes, along, lo, lb, ls, h[0], own)
             else:
                 _cylinder_row(near, codes, along, lo, lb, ls, h[0], h[2], own)

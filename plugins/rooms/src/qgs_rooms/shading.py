@@ -1,4 +1,4 @@
-"""Light on surfaces: shading and shadows."""
+"""Colours of what rays meet: light, the shadows on the floor, textures."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numba import njit
 
 from qgs_rooms import shapes as s
 from qgs_rooms.intersections import hit, local_point
-from qgs_rooms.materials import INNER, OPTIONS, mixture, smooth
 from qgs_rooms.raycast import WALLS
+from qgs_rooms.textures import INNER, OPTIONS, mixture, smooth
 
 _SHADOW = 0.36  # how much of the light the lamp's shadow takes
 _UNDER = np.float32(-1)
@@ -87,7 +87,6 @@ def floor_shadows(shapes, size, lamp, cells):
     return 1 - _blurred(_blurred(darkness))
 
 
-_BOX, _SPHERE = s.BOX, s.SPHERE
 _FLOOR = 4
 _FLAT = 0.03  # what lies on the floor and is lower than this shows the floor's shadows
 _TAKEN = np.float32(-1)
@@ -119,7 +118,7 @@ def _on_round(x, y, z, h, kind, part):
     if part == 1:
         return (0.0, 0.0, math.copysign(1.0, z)), x, y, x / h[0], y / h[0]
     angle = math.atan2(y, x)
-    normal = (x / h[0], y / h[0], z / h[0] if kind == _SPHERE else 0.0)
+    normal = (x / h[0], y / h[0], z / h[0] if kind == s.SPHERE else 0.0)
     return normal, angle * h[0], z, angle / math.pi, z / h[2]
 
 
@@ -132,7 +131,7 @@ def _surface(shapes, size, code, x, y, z):
     i, part = (code - WALLS) >> 2, (code - WALLS) & 3
     lx, ly, lz = local_point(shapes, i, x, y, z)
     h = (float(shapes[i, 4]), float(shapes[i, 5]), float(shapes[i, 6]))
-    if shapes[i, 0] == _BOX:
+    if shapes[i, 0] == s.BOX:
         n, u, v, p, q = _on_box(lx, ly, lz, h, part)
     else:
         n, u, v, p, q = _on_round(lx, ly, lz, h, shapes[i, 0], part)

@@ -1,7 +1,8 @@
 """Rows of numbers that describe shapes and textures to the ray caster.
 
 World frame: metres, x and y along the walls, z up, the floor at z = 0, the room centred on the
-z axis. A shape is upright; it may be turned about z."""
+z axis. A shape is upright; it may be turned about z.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 BOX, SPHERE, CYLINDER = range(3)
-
-
-SHAPE_FIELDS = 10
-
-
-TEXTURE_FIELDS = 13
-
-
+SHAPE_FIELDS = 10  # kind, centre x y z, half sizes x y z, cos and sin of the turn, texture
+TEXTURE_FIELDS = 13  # kind, period, seed, emission, RGB of three colours
 (PLAIN, CHECKER, STRIPES, PLANKS, TILES, BRICKS, CLOUDS, GRADIENT, PICTURE, RUG, WINDOW, DOTS,
  BOOKS) = range(13)  # fmt: skip
-
 
 Color = tuple[float, float, float]
 

@@ -1,12 +1,14 @@
-"""`rooms/procedural`: endless furnished rooms, ray-cast on demand."""
+"""`rooms/procedural`: endless furnished rooms, ray-cast on demand.
+
+Kernels are imported when the first room is drawn: numba takes longer to load than a recipe does.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from functools import cached_property
-from importlib.util import find_spec
+from random import Random
 from typing import ClassVar
 
 import numpy as np
@@ -15,36 +17,37 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.contracts.component import MissingExtraError
-from qgs.data.lazy import LazyScenes
+from qgs.data.scenes import LazyScenes
 from qgs.types import Cameras
-from qgs_rooms.draws import Draws
 from qgs_rooms.path import camera_path
 from qgs_rooms.shapes import Room
 
-_BAND = 64  # rows of an image that one thread casts at a time
 _SHADOW_CELLS = 80
+
+ImageCache = dict[tuple[str, int], np.ndarray]
+"""Images (H, W, 3) uint8 by scene and frame; once it is full, what it holds stays."""
 
 
 class RoomsConfig(SceneSource.Config):
-    """Options of `rooms/procedural`.
+    """Options of `rooms/procedural`."""
 
-    scenes, test_scenes: rooms of the two splits; no room is in both. views_per_scene: cameras on
-    each path. samples: rays per pixel along each axis. fov: least and largest horizontal field of
-    view, degrees. seed: all rooms follow from it. cache_mb: megabytes of images kept in memory,
-    0 for none.
-    """
-
-    undecisive: ClassVar[frozenset[str]] = SceneSource.Config.undecisive | {"cache_mb"}
+    unhashed_options: ClassVar[frozenset[str]] = SceneSource.Config.unhashed_options | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
     scenes: int = Field(default=2000, ge=1)
+    """Rooms of the training split."""
     test_scenes: int = Field(default=32, ge=1)
+    """Rooms of the test split; none of them is in the training split."""
     views_per_scene: int = Field(default=8, ge=2)
+    """Cameras on the path through each room."""
     samples: int = Field(default=2, ge=1, le=8)
+    """Rays per pixel along each axis."""
     fov: tuple[float, float] = (60.0, 75.0)
+    """Least and largest horizontal field of view, degrees."""
     seed: int = Field(default=0, ge=0)
+    """All rooms follow from it."""
     cache_mb: int = Field(default=512, ge=0)
+    """Megabytes of images kept in memory; 0 keeps none."""
 
     @model_validator(mode="after")
     def _fov_is_a_range(self) -> RoomsConfig:
@@ -56,24 +59,6 @@ class RoomsConfig(SceneSource.Config):
         return self
 
 
-class ImageCache:
-    """Decoded images (H, W, 3) uint8 by key, until the budget in bytes is spent."""
-
-    def __init__(self, budget: int) -> None:
-        self._left = budget
-        self._images: dict[tuple[str, int], np.ndarray] = {}
-
-    def get(self, key: tuple[str, int]) -> np.ndarray | None:
-        """The image of `key`, None when it was not kept."""
-        return self._images.get(key)
-
-    def put(self, key: tuple[str, int], image: np.ndarray) -> None:
-        """Keep `image` if there is room for it."""
-        if key not in self._images and image.nbytes <= self._left:
-            self._left -= image.nbytes
-            self._images[key] = image
-
-
 class RoomScene(Scene):
     """One room and the cameras on its path. World: metres, z up, the floor at 0."""
 
@@ -81,13 +66,12 @@ class RoomScene(Scene):
         self.name = f"{split}/{index:06d}"
         self._config, self._cache = config, cache
         rng = np.random.default_rng([config.seed, 0 if split == "train" else 1, index])
-        self._layout_seed, camera_rng = int(rng.integers(1 << 62)), rng
-        sizes = camera_rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
+        self._plan_seed = int(rng.integers(1 << 62))
+        sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
-        self._c2w = camera_path(camera_rng, self.size, config.views_per_scene)
+        self._c2w = camera_path(rng, self.size, config.views_per_scene)
         height, width = config.image_size
-        fov = math.radians(float(camera_rng.uniform(*config.fov)))
-        focal = width / 2 / math.tan(fov / 2)
+        focal = width / 2 / math.tan(math.radians(float(rng.uniform(*config.fov))) / 2)
         self._intrinsics = np.array([focal, focal, width / 2, height / 2])
 
     def __len__(self) -> int:
@@ -104,7 +88,7 @@ class RoomScene(Scene):
         """The furnished room."""
         from qgs_rooms.plan import furnish
 
-        return furnish(Draws(self._layout_seed), self.size, self._c2w[:, :3, 3])
+        return furnish(Random(self._plan_seed), self.size, self._c2w[:, :3, 3])
 
     @cached_property
     def _floor(self) -> np.ndarray:
@@ -114,51 +98,29 @@ class RoomScene(Scene):
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`."""
-        known = {frame: self._cache.get((self.name, frame)) for frame in frames}
-        missing = [frame for frame, image in known.items() if image is None]
-        for frame, image in zip(missing, self._cast_colors(missing), strict=True):
-            self._cache.put((self.name, frame), image)
-            known[frame] = image
-        out = np.empty((len(frames), 3, *self._config.image_size), np.float32)
+        config, cache = self._config, self._cache
+        images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
+        if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
+            from qgs_rooms.casting import cast_images
+
+            size, cameras = config.image_size, (self._c2w[missing], self._intrinsics)
+            cast = cast_images(self.room, self._floor, *cameras, size, config.samples)
+            images.update(zip(missing, cast, strict=True))
+            fitting = config.cache_mb * 2**20 // cast[0].nbytes - len(cache)
+            cache.update(
+                {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
+            )
+        out = np.empty((len(frames), 3, *config.image_size), np.float32)
         for place, frame in enumerate(frames):
-            image = known[frame]
-            assert image is not None
-            np.multiply(image.transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
+            np.multiply(images[frame].transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
         return torch.from_numpy(out)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre."""
         from qgs_rooms.casting import cast_depths
 
-        room, out = self.room, np.empty((len(frames), *self._config.image_size), np.float32)
-        self._cast(
-            lambda i, rows: cast_depths(out[i], rows, room, self._c2w[frames[i]], self._intrinsics),
-            len(frames),
-        )
-        return torch.from_numpy(out)[:, None]
-
-    def _cast_colors(self, frames: Sequence[int]) -> np.ndarray:
-        from qgs_rooms.casting import cast_colors
-
-        out = np.empty((len(frames), *self._config.image_size, 3), np.uint8)
-        if not frames:
-            return out
-        room, floor, samples = self.room, self._floor, self._config.samples
-        self._cast(
-            lambda i, rows: cast_colors(
-                out[i], rows, samples, room, floor, self._c2w[frames[i]], self._intrinsics
-            ),
-            len(frames),
-        )
-        return out
-
-    def _cast(self, cast: Callable[[int, tuple[int, int]], None], frames: int) -> None:
-        """Call `cast(i, rows)` for bands of rows of every frame, on torch's number of threads."""
-        height = self._config.image_size[0]
-        bands = [(top, min(top + _BAND, height)) for top in range(0, height, _BAND)]
-        work = [(i, rows) for i in range(frames) for rows in bands]
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-            list(pool.map(lambda unit: cast(*unit), work))
+        cameras = (self._c2w[list(frames)], self._intrinsics)
+        return torch.from_numpy(cast_depths(self.room, *cameras, self._config.image_size))[:, None]
 
 
 class RoomScenes(LazyScenes):
@@ -184,15 +146,9 @@ class RoomsSource(SceneSource):
 
     def __init__(self, config: RoomsConfig) -> None:
         super().__init__(config)
-        if find_spec("numba") is None:
-            raise MissingExtraError(
-                "the data source rooms/procedural needs numba, which is not installed: run "
-                '`pip install "query-gaussians[cpu]"`'
-            )
-        cache = ImageCache(config.cache_mb * 2**20)
-        train = RoomScenes(config, "train", config.scenes, cache)
-        test = RoomScenes(config, "test", config.test_scenes, cache)
-        self._scenes: dict[Split, RoomScenes] = {"train": train, "test": test}
+        cache: ImageCache = {}
+        counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
+        self._scenes = {split: RoomScenes(config, split, n, cache) for split, n in counts.items()}
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """See `SceneSource`."""

@@ -1,0 +1,138 @@
+"""A scene as the entry of a chunk: images keep their bytes where they can."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from PIL import Image
+from qgs.data.photos.frames import undistorted
+from qgs.data.photos.scene import EncodedFrame, EncodedScene
+from torch import Tensor
+
+from qgs.contracts import Scene
+from qgs.data.images import decode_gray, decode_rgb
+
+ChunkEntry: TypeAlias = dict[str, Any]
+
+_KEPT_FORMATS = {"JPEG", "MPO", "PNG"}  # MPO: a JPEG with further pictures behind it
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How images are written that cannot stay as they are.
+
+    resized: whether all are written at the size that their source delivers; else they keep their
+    own. jpeg: quality; None for PNG, which loses nothing.
+    """
+
+    resized: bool = False
+    jpeg: int | None = None
+
+    def image(self, pixels: np.ndarray) -> bytes:
+        """(H, W, 3) uint8 as the bytes of a file."""
+        if self.jpeg is None:
+            return _file(pixels, format="PNG")
+        return _file(pixels, format="JPEG", quality=self.jpeg, subsampling=0)
+
+
+def _file(pixels: np.ndarray, **options: Any) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, **options)
+    return file.getvalue()
+
+
+def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
+    """The frames of a scene in order, and whether each keeps its original bytes.
+
+    Every image is decoded, so that none is packed that cannot be read. Raises as the scene does.
+    """
+    for index in range(len(scene)):
+        if isinstance(scene, EncodedScene) and not encoding.resized:
+            yield _stored(scene, index, encoding)
+        else:
+            yield _delivered(scene, index, encoding), False
+
+
+def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[EncodedFrame, bool]:
+    frame = scene.encoded(index)
+    try:
+        pixels = np.array(decode_rgb(io.BytesIO(frame.data), frame.background))
+        mask = None if frame.mask is None else np.array(decode_gray(io.BytesIO(frame.mask)))
+    except OSError as error:
+        raise ValueError(
+            f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "
+            f"({error}): replace the file, or leave the scene out"
+        ) from error
+    with Image.open(io.BytesIO(frame.data)) as image:  # every reader gets three channels out of it
+        plain = image.mode == "RGB" and not image.has_transparency_data
+        stays = frame.lens is None and plain and image.format in _KEPT_FORMATS
+    if stays:
+        return frame, True
+    if frame.lens is not None:
+        pixels = undistorted(pixels, frame.intrinsics, frame.lens)
+        mask = None if mask is None else undistorted(mask, frame.intrinsics, frame.lens)
+    mask_file = None if mask is None else _file(mask, format="PNG")
+    return replace(frame, data=encoding.image(pixels), lens=None, mask=mask_file), False
+
+
+def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
+    cameras, masks = scene.cameras[index], scene.masks([index])
+    fx, fy, cx, cy = cameras.intrinsics.double().tolist()
+    pixels = scene.images([index])[0].permute(1, 2, 0).mul(255).round().byte().numpy()
+    mask = None if masks is None else masks[0, 0].mul(255).round().byte().numpy()
+    return EncodedFrame(
+        name=scene.frame_name(index),
+        data=encoding.image(np.ascontiguousarray(pixels)),
+        c2w=cameras.c2w.double().numpy(),
+        intrinsics=(fx, fy, cx, cy),
+        size=cameras.size,
+        mask=None if mask is None else _file(mask, format="PNG"),
+    )
+
+
+def chunk_entry(key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int]) -> ChunkEntry:
+    """The entry of a scene; see `qgs.data.chunks` for its keys."""
+    names = [frame.name for frame in frames]
+    entry = {
+        "key": key,
+        "url": "",
+        "timestamps": _timestamps(names),
+        "cameras": torch.from_numpy(np.stack([_camera(frame) for frame in frames])),
+        "images": [_bytes(frame.data) for frame in frames],
+        "names": names,
+        "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
+    }
+    if any(frame.mask is not None for frame in frames):
+        entry["masks"] = [_bytes(frame.mask or b"") for frame in frames]
+    if held_out:
+        entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)
+    return entry
+
+
+def stored_bytes(entry: ChunkEntry) -> int:
+    """What an entry adds to the size of its chunk, but for the container's own bytes."""
+    return sum(data.nbytes for key in ("images", "masks") for data in entry.get(key, ()))
+
+
+def _bytes(data: bytes) -> Tensor:
+    return torch.from_numpy(np.frombuffer(data, np.uint8).copy())
+
+
+def _camera(frame: EncodedFrame) -> np.ndarray:
+    """(18,) float32: normalised intrinsics, two zeros, rows of the world-to-camera matrix."""
+    height, width = frame.size
+    fx, fy, cx, cy = frame.intrinsics
+    w2c = np.linalg.inv(frame.c2w)[:3].flatten()
+    values = [fx / width, fy / height, cx / width, cy / height, 0.0, 0.0, *w2c]
+    return np.array(values, np.float32)
+
+
+def _timestamps(names: Sequence[str]) -> Tensor:
+    """The frames' names where all are whole numbers, as time stamps are; else their order."""
+    stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
+    return torch.tensor([int(n) for n in (names if stamps else range(len(names)))]).long()

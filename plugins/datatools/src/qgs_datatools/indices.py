@@ -1,0 +1,95 @@
+"""Evaluation indices, compared with the scenes that a data set holds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from upath import UPath
+
+from qgs.data.evaluation import GIVEN, IndexEntry, read_index
+from qgs_datatools.findings import Finding, spans
+
+
+@dataclass(frozen=True)
+class Held:
+    """A scene that is there. split: empty where the format has none. frames: None if unreadable."""
+
+    split: str
+    frames: int | None
+
+
+@dataclass(frozen=True)
+class IndexSummary:
+    """An index in numbers. null: scenes that it lists without frames, which are never judged."""
+
+    file: str
+    scenes: int
+    null: int
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.scenes} scenes, {self.null} of them without frames (null)"
+
+
+def found_indices(path: UPath) -> list[UPath]:
+    """The JSON files in the folder `path` that have the form of an evaluation index."""
+    files = path.iterdir() if path.is_dir() else ()
+    return sorted((file for file in files if file.suffix == ".json" and _is_index(file)), key=str)
+
+
+def _is_index(file: UPath) -> bool:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(data, dict) and any(
+        isinstance(entry, dict) and {"context", "target"} <= entry.keys() for entry in data.values()
+    )
+
+
+def index_findings(
+    file: UPath, scenes: Mapping[str, Sequence[Held]], told: Container[str] = ()
+) -> tuple[list[Finding], IndexSummary | None]:
+    """What the index names and is not there, less scenes whose absence is `told` already.
+
+    The summary is None for a file that is no index. Raises FileNotFoundError without a file.
+    """
+    try:
+        index = read_index(str(file))
+    except ValueError as error:
+        return [Finding(file.name, str(error), "correct the file, or get it again")], None
+    findings: list[Finding] = []
+    for name, entry in index.items():
+        if entry is not None and (name in scenes or name not in told):
+            findings += _entry_findings(file.name, name, entry, scenes.get(name, ()))
+    null = sum(entry is None for entry in index.values())
+    return findings, IndexSummary(str(file), len(index), null)
+
+
+def _entry_findings(
+    file: str, name: str, entry: IndexEntry, held: Sequence[Held]
+) -> Iterator[Finding]:
+    if not held:
+        fix = "add the scene, or take it out of the index; correct the name if it is spelled wrong"
+        yield Finding(name, f"the index {file} names the scene, which is not there", fix)
+        return
+    of_test = [scene for scene in held if scene.split != "train"]
+    if not of_test:
+        fix = "move it to the test split, or take it out of the index"
+        yield Finding(name, f"the index {file} names the scene, which is in train only", fix)
+    frames = (of_test or held)[0].frames
+    if frames is None:
+        return
+    for role, numbers in (("context", entry.context), ("target", entry.target)):
+        if outside := tuple(number for number in numbers if not 0 <= number < frames):
+            yield Finding(
+                name,
+                f"the index {file} has the {role} frame{'s' if len(outside) > 1 else ''} "
+                f"{spans(outside)}, but the scene's {frames} frames are 0 to {frames - 1}",
+                "correct the index, or add the missing frames to the scene",
+                outside,
+            )
+    if entry.both:
+        fix = "judge models on frames that they are not given"
+        yield Finding(name, f"the index {file} has {GIVEN}", fix, entry.both, severity="warning")

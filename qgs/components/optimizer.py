@@ -1,0 +1,101 @@
+"""AdamW with a one-cycle learning rate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, TypeAlias
+
+from pydantic import Field
+from torch.optim import AdamW
+
+from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup, TrainingConfig
+
+WARMUP_TIME = 0.1
+"""Largest part of a time budget that warm-up may take."""
+
+Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
+
+
+class OneCycleAdamW(Optimizer):
+    """AdamW; the learning rate rises along a cosine and falls along another (LocusGS release).
+
+    The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that
+    comes first. The fall follows the fraction of the budget that is used, the larger of steps and
+    seconds; with steps alone this is torch's `OneCycleLR` with pct_start = warmup / steps.
+    Raises ValueError when the warm-up fills all steps and no time budget shortens it.
+    """
+
+    name: ClassVar[str] = "adamw"
+
+    class Config(OptimizerConfig):
+        """The learning rate, and AdamW's own options."""
+
+        learning_rate: float = Field(default=4e-4, gt=0)
+        """Peak of the one-cycle cosine."""
+        warmup: int = Field(default=2000, ge=0)
+        """Optimiser steps up to the peak."""
+        initial_divisor: float = Field(default=25.0, ge=1)
+        """Peak over first rate."""
+        final_divisor: float = Field(default=1000.0, ge=1)
+        """First rate over last rate, as in torch's OneCycleLR."""
+        betas: tuple[Decay, Decay] = (0.9, 0.95)
+        """AdamW's decay rates of the averages of gradients and of their squares."""
+        weight_decay: float = Field(default=0.05, ge=0)
+        """AdamW's weight decay, on the parameters that decay; 0 for none."""
+
+    def __init__(self, config: Config, training: TrainingConfig | None = None) -> None:
+        super().__init__(config, training)
+        self.options = config
+        self.peak = config.learning_rate
+        self.first = config.learning_rate / config.initial_divisor
+        self.last = self.first / config.final_divisor
+        self._descent_starts: float | None = None
+        steps = self.training.steps
+        if self.training.seconds is None and config.warmup >= steps:
+            raise ValueError(
+                f"optimizer.warmup is {config.warmup}, but training.steps is {steps}: the learning "
+                "rate would never come down; lower warmup or train for longer"
+            )
+
+    def build(self, groups: Sequence[ParameterGroup]) -> AdamW:
+        """Fused AdamW; `weight_decay` where parameters decay, else none."""
+        decay = self.options.weight_decay
+        own = [{**group, "weight_decay": decay if group["decays"] else 0.0} for group in groups]
+        return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
+
+    def learning_rate(self, step: int, seconds: float) -> float:
+        """The one-cycle rate; where the fall starts is where the warm-up was first over."""
+        used = self._used(step, seconds)
+        if self._descent_starts is None:
+            warmed = self._warmed(step, seconds)
+            if warmed < 1:
+                return _cosine(self.first, self.peak, warmed)
+            self._descent_starts = used
+        left = 1 - self._descent_starts
+        part = (used - self._descent_starts) / left if left > 0 else 1.0
+        return _cosine(self.peak, self.last, min(part, 1.0))
+
+    def state(self) -> Mapping[str, float | None]:
+        """Where the fall started, as a fraction of the budget."""
+        return {"descent_starts": self._descent_starts}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Fall from where `state` started to."""
+        self._descent_starts = state["descent_starts"]
+
+    def _warmed(self, step: int, seconds: float) -> float:
+        """Fraction of the warm-up that is over; may exceed 1."""
+        top, budget = self.options.warmup - 1, self.training.seconds
+        of_seconds = seconds / (WARMUP_TIME * budget) if budget else 0.0
+        return max(step / top if top > 0 else 1.0, of_seconds)
+
+    def _used(self, step: int, seconds: float) -> float:
+        """Fraction of the budget that is used."""
+        budget = self.training.seconds
+        of_seconds = seconds / budget if budget else 0.0
+        return min(max(step / max(self.training.steps - 1, 1), of_seconds), 1.0)
+
+
+def _cosine(start: float, end: float, part: float) -> float:
+    return end + (start - end) / 2 * (1 + math.cos(math.pi * part))

@@ -1,0 +1,102 @@
+"""Slot `metrics`: how good a reconstruction is."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from qgs.contracts.component import Component, ComponentConfig
+from qgs.types import Gaussians, TensorContainer, Views
+
+Need: TypeAlias = Literal["masks", "gaussians", "depth", "true_depth"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a value is shown. digits: after the point; comparisons show one more.
+
+    heading: without unit and arrow. unit: "" for a number without one.
+    """
+
+    heading: str
+    better: Literal["higher", "lower"]
+    digits: int = 3
+    unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """The heading with an arrow that points to what is better."""
+        return f"{self.heading} {'↑' if self.better == 'higher' else '↓'}"
+
+    def shown(self, value: float | None) -> str:
+        """`value` in a table; a dash for None."""
+        return "–" if value is None else f"{value:.{self.digits}f}"
+
+    def best(self, values: Iterable[float | None]) -> float | None:
+        """The best of `values`, None if there is none."""
+        known = [value for value in values if value is not None]
+        return (max if self.better == "higher" else min)(known, default=None)
+
+
+@dataclass(frozen=True)
+class MetricInput(TensorContainer):
+    """One scene: the true views, and what a model or a baseline shows in their place.
+
+    images: (1, T, 3, H, W) as rendered, not clipped. targets: the true Views (1, T).
+    gaussians: (1, G), `gaussians_per_query` of each query in turn; None for a baseline.
+    depth: as `Rendering.depth` (1, T, 1, H, W); None for a baseline. true_depth: the same of the
+    data, in the model's units; None where the data has none, or no metric needs it.
+    """
+
+    images: Tensor
+    targets: Views
+    gaussians: Gaussians | None = None
+    gaussians_per_query: int = 1
+    depth: Tensor | None = None
+    true_depth: Tensor | None = None
+
+    @property
+    def masks(self) -> Tensor | None:
+        """Masks (1, T, 1, H, W) of the true views, None where they have none."""
+        return self.targets.masks
+
+
+class Metric(Component, torch.nn.Module):
+    """MetricInput -> values. Called without gradients, for every sample and every method.
+
+    definition: what is measured, in words. It is part of the evaluation protocol, as the options
+    are: change it when values change. not_in_protocol: options that change no value, such as where
+    a file lies. needs: parts of the input that must not be None; where one is, there is no value.
+    column: how the value is shown. unavailable: set by `__init__` to the reason why there are no
+    values on this machine, such as a missing file of weights; evaluations show it.
+    """
+
+    slot: ClassVar[str] = "metrics"
+    definition: ClassVar[str] = ""
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset()
+    needs: ClassVar[tuple[Need, ...]] = ()
+    column: ClassVar[Column]
+    unavailable: str = ""
+
+    def __init__(self, config: ComponentConfig) -> None:
+        torch.nn.Module.__init__(self)
+        self.config = config
+
+    def columns(self) -> Mapping[str, Column]:
+        """How values are shown, by key. Override it for several values, or headings by option.
+
+        A value is called as the recipe calls the metric, with `_KEY` behind unless the key is "".
+        """
+        return {"": self.column}
+
+    @abstractmethod
+    def forward(self, given: MetricInput) -> Tensor | Mapping[str, Tensor]:
+        """A tensor such as (1, T), one number for each view; several by the keys of `columns`.
+
+        The value of a sample is the mean of all numbers in float64, of a scene that of its samples.
+        """

@@ -1,0 +1,371 @@
+"""Files of RealEstate10K-style chunks: reading, checking, and which scenes a folder holds.
+
+The format is pixelSplat's (data release of RealEstate10K and ACID, and DepthSplat's of DL3DV):
+PATH/{train,test}/index.json maps a scene's key to a file such as 000000.torch, which is a list of
+mappings, one a scene, with `key`, `url`, `timestamps` (V,), `cameras` (V, 18) float32 and `images`,
+a list of V uint8 tensors with the bytes of JPEG or PNG files. A row of `cameras` is fx, fy, cx, cy
+divided by the image's width and height, two numbers without use, and the rows of the 3 x 4 OpenCV
+world-to-camera matrix.
+
+`qgs` adds keys that other readers ignore: `names` (V strings), `sizes` (V, 2), the height and width
+of every image, `masks`, a list of V uint8 tensors with the bytes of PNG files, empty where a frame
+has none, and `held_out`, the frames that training is not to see.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from upath import UPath
+
+from qgs.data.lenses import Intrinsics, Size
+from qgs.data.paths import is_local, stays_inside
+from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
+from qgs.data.scenes import warn_once
+
+INDEX = "index.json"
+SUFFIX = ".torch"
+_RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
+_IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
+_DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A scene as a chunk holds it (see the top of this file); nothing is decoded.
+
+    where: file and key, for messages. names: time stamps or numbers where the chunk has no names.
+    sizes, masks: None where the chunk has none.
+    """
+
+    where: str
+    key: str
+    cameras: Tensor
+    images: Sequence[Tensor]
+    names: Sequence[str]
+    sizes: Tensor | None
+    masks: Sequence[Tensor] | None
+    held_out: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def place(self, frame: int) -> str:
+        """File, key, frame number and name, for messages."""
+        return f"{self.where}, frame {frame} ({self.names[frame]})"
+
+    @cached_property
+    def w2c(self) -> Tensor:
+        """(V, 4, 4) float64 world-to-camera, OpenCV axes, as stored."""
+        matrix = torch.eye(4, dtype=torch.float64).repeat(len(self), 1, 1)
+        matrix[:, :3] = self.cameras[:, 6:].double().reshape(-1, 3, 4)
+        return matrix
+
+    @cached_property
+    def image_sizes(self) -> list[Size]:
+        """(H, W) of every image: as the chunk says, else all as the first image's header says.
+
+        Raises ValueError when that is no readable image.
+        """
+        if self.sizes is not None:
+            return [(int(height), int(width)) for height, width in self.sizes.tolist()]
+        return [self.stored_size(0)] * len(self)
+
+    def stored_size(self, frame: int) -> Size:
+        """(H, W) in the header of an image. Raises ValueError for no readable image."""
+        try:
+            with Image.open(io.BytesIO(self.images[frame].numpy().tobytes())) as image:
+                return image.height, image.width
+        except (OSError, SyntaxError, ValueError) as error:
+            raise ValueError(
+                f"{self.place(frame)}: the bytes are no readable image ({error}): pack the data "
+                "set again with `qgs data pack`, or remove the scene from index.json"
+            ) from error
+
+    def intrinsics(self, frame: int, size: Size) -> Intrinsics:
+        """fx, fy, cx, cy in pixels of an image of `size` (H, W)."""
+        fx, fy, cx, cy = self.cameras[frame, :4].double().tolist()
+        return fx * size[1], fy * size[0], cx * size[1], cy * size[0]
+
+
+def parse_record(file: str, data: Any) -> Record:
+    """The scene that `data`, an entry of the chunk `file`, describes.
+
+    Raises ValueError, naming key and entry, where its structure is not that of the format; numbers
+    are not judged.
+    """
+    if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
+        raise ValueError(
+            f"{file} holds {_described(data)}, expected a mapping with 'key', 'cameras' and "
+            "'images': is it a chunk of RealEstate10K's format?"
+        )
+    where = f"{file}: scene {data['key']!r}"
+    images, masks, sizes = (data.get(name) for name in ("images", "masks", "sizes"))
+    _expect_files(where, "images", images)
+    _expect(len(images) > 0, where, "there are no frames")
+    cameras = _tensor(where, "cameras", data.get("cameras"), (len(images), 18))
+    _expect(cameras.is_floating_point(), where, f"'cameras' are {cameras.dtype}, expected float32")
+    if sizes is not None:
+        sizes = _tensor(where, "sizes", sizes, (len(images), 2))
+    if masks is not None:
+        _expect_files(where, "masks", masks)
+    names, stamps = data.get("names"), data.get("timestamps")
+    if not isinstance(names, list):
+        stamped = isinstance(stamps, Tensor) and stamps.numel() == len(images)
+        names = stamps.flatten().tolist() if stamped else range(len(images))
+    for name, items in (("masks", images if masks is None else masks), ("names", names)):
+        counts = f"{len(items)} {name} for {len(images)} images"
+        _expect(len(items) == len(images), where, counts)
+    held_out = data.get("held_out", ())
+    held_out = tuple(held_out.tolist() if isinstance(held_out, Tensor) else held_out or ())
+    _expect(
+        all(isinstance(frame, int) and 0 <= frame < len(images) for frame in held_out),
+        where,
+        f"'held_out' must list frames from 0 to {len(images) - 1}, got {held_out}",
+    )
+    names = [str(name) for name in names]
+    return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
+
+
+def _expect(valid: bool, where: str, reason: str) -> None:
+    if not valid:
+        fix = "pack the data set again with `qgs data pack`, or remove the scene from index.json"
+        raise ValueError(f"{where}: {reason}: {fix}")
+
+
+def a_type(value: object) -> str:
+    """The type of `value` with its article, such as "an int"."""
+    name = type(value).__name__
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
+def _described(data: Any) -> str:
+    if isinstance(data, Mapping):
+        return f"a mapping with the keys {', '.join(map(repr, list(data)[:6])) or 'none'}"
+    return a_type(data)
+
+
+def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
+    data = torch.from_numpy(data) if isinstance(data, np.ndarray) else data
+    found = list(data.shape) if isinstance(data, Tensor) else _described(data)
+    wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
+    _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
+    return data
+
+
+def _expect_files(where: str, name: str, data: Any) -> None:
+    valid = isinstance(data, list | tuple) and all(
+        isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
+    )
+    wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
+    _expect(valid, where, f"{name!r} must be {wanted}, got {_described(data)}")
+
+
+def require_usable(record: Record) -> None:
+    """Raise ValueError for the first camera with a fatal problem, naming its frame."""
+    rotation = record.w2c[:, :3, :3]
+    error = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
+    focal = record.cameras[:, :2]
+    sound = (
+        torch.isfinite(record.cameras).all()
+        and error.abs().max() < _RIGID
+        and torch.linalg.det(rotation).min() > 0
+        and focal.min() > 0
+        and focal.max() < _IN_PIXELS
+    )
+    for frame in () if sound else range(len(record)):  # all frames at once are much faster
+        for problem in camera_problems(record, frame):
+            if problem.fatal:
+                raise ValueError(f"{record.place(frame)}: {problem}")
+
+
+def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
+    """What is wrong with the camera of a frame."""
+    yield from pose_problems(record.w2c[frame].numpy())
+    of_unit = list(unit_problems(record, frame))
+    yield from of_unit
+    if not of_unit:
+        size = record.image_sizes[frame]
+        yield from intrinsics_problems(record.intrinsics(frame, size), size)
+
+
+def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
+    """What is wrong with the unit of a frame's intrinsics, fractions of the image's sides."""
+    values = record.cameras[frame, :4].tolist()
+    focal = max(values[:2])
+    divided_twice = 0 < focal < _DIVIDED_TWICE
+    if divided_twice or focal >= _IN_PIXELS:
+        said = ", ".join(f"{value:.6g}" for value in values)
+        yield FrameProblem(
+            "intrinsics",
+            f"the intrinsics ({said}) look {'divided twice' if divided_twice else 'like pixels'}",
+            "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
+        )
+
+
+def load_chunk(path: UPath) -> list[Any]:
+    """The entries of a chunk, unpickled as tensors and plain containers only.
+
+    A local file of torch's zip format is memory-mapped, so that images are read when they are used;
+    others are read whole. Raises FileNotFoundError, and ValueError for a file that is no list.
+    """
+    try:
+        if is_local(path):
+            mapped = path.stat().st_size > 0 and zipfile.is_zipfile(str(path))
+            data = torch.load(str(path), map_location="cpu", weights_only=True, mmap=mapped)
+        else:
+            content = io.BytesIO(path.read_bytes())
+            data = torch.load(content, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"chunk {path} does not exist: download it, or take its scenes out of index.json"
+        ) from None
+    except Exception as error:
+        raise ValueError(
+            f"{path} cannot be read as a torch file of tensors and lists ({_why(error)}): copy or "
+            "pack it again"
+        ) from error
+    if not isinstance(data, list):
+        raise ValueError(
+            f"{path} holds {a_type(data)}, expected a list of mappings: is it a chunk of "
+            "RealEstate10K's format?"
+        )
+    return data
+
+
+def _why(error: Exception) -> str:
+    """Why torch refuses a file, without its advice to trust it and without its colours."""
+    said = str(error)
+    if "Unsupported" in said:
+        return "it holds Python objects, whose reading could run code"
+    if type(error).__name__ in ("UnpicklingError", "EOFError") or "central directory" in said:
+        return "it is cut off or no torch file"
+    return _COLOURS.sub("", said or type(error).__name__).splitlines()[0]
+
+
+class Chunk:
+    """An open chunk: its scenes by key, parsed when asked for."""
+
+    def __init__(self, path: UPath) -> None:
+        self.path = path
+        self._entries: dict[str, Any] = {}
+        self._parsed: dict[str, Record] = {}
+        for place, entry in enumerate(load_chunk(path)):
+            key = entry.get("key") if isinstance(entry, dict) else None
+            if not isinstance(key, str):
+                parse_record(f"{path}: entry {place}", entry)  # raises
+            elif key in self._entries:
+                raise ValueError(
+                    f"{path} holds the scene {key!r} twice: pack the data set again with "
+                    "`qgs data pack`"
+                )
+            else:
+                self._entries[key] = entry
+
+    @property
+    def keys(self) -> list[str]:
+        """Keys in the file's order."""
+        return list(self._entries)
+
+    def record(self, key: str) -> Record:
+        """A scene. Raises ValueError when it is not in this chunk or is malformed."""
+        if key not in self._entries:
+            raise ValueError(
+                f"{self.path} does not hold the scene {key!r}, which index.json places there: it "
+                f"holds {', '.join(self.keys[:5])}{', ...' if len(self.keys) > 5 else ''}. Remove "
+                "index.json to have the chunks read instead, or pack the data set again"
+            )
+        if key not in self._parsed:
+            self._parsed[key] = parse_record(str(self.path), self._entries[key])
+        return self._parsed[key]
+
+
+def has_chunks(folder: UPath) -> bool:
+    """Whether a folder looks like one of chunks: it holds an index.json or .torch files."""
+    return folder.is_dir() and (
+        (folder / INDEX).is_file() or any(item.suffix == SUFFIX for item in folder.iterdir())
+    )
+
+
+def read_chunk_index(path: UPath) -> dict[str, str]:
+    """An index.json: key to file name. Raises ValueError for what it cannot mean."""
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{path} is not valid JSON ({error}): copy it again, or remove it to have the chunks "
+            "read instead"
+        ) from error
+    if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
+        raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
+    inside = {name for name in set(index.values()) if stays_inside(name)}
+    for key, name in index.items():
+        if name not in inside:
+            raise ValueError(
+                f"{path} places the scene {key!r} in {name!r}, outside its own folder: such an "
+                "index is not read"
+            )
+    return index
+
+
+def list_scenes(folder: UPath) -> dict[str, UPath]:
+    """The scenes of a folder by key, in the index's order, with their chunk files.
+
+    They are read from index.json alone where there is one; else chunks are opened.
+    Scenes whose chunk does not exist are counted and named in a warning. Raises FileNotFoundError
+    when no scene is left, ValueError for an index or a chunk that cannot be read.
+    """
+    if not (folder / INDEX).is_file():
+        return _scanned(folder)
+    index = read_chunk_index(folder / INDEX)
+    present = {item.name for item in folder.iterdir()}
+    chunks = {name: folder / name for name in set(index.values())}
+    there = {name for name in chunks if name in present or chunks[name].is_file()}
+    here = {key: chunks[name] for key, name in index.items() if name in there}
+    missing = [f"{key} ({name})" for key, name in index.items() if name not in there]
+    if not here:
+        raise FileNotFoundError(
+            f"{folder / INDEX} names {len(index)} scenes, and none of their chunks exists: "
+            "download the chunks beside it"
+        )
+    if missing:
+        warn_once(
+            f"{len(missing)} of {len(index)} scenes of {folder / INDEX} are left out, because "
+            f"their chunks do not exist: {', '.join(missing)}"
+        )
+    return here
+
+
+def _scanned(folder: UPath) -> dict[str, UPath]:
+    paths = sorted((item for item in folder.iterdir() if item.suffix == SUFFIX), key=str)
+    if not paths:
+        raise FileNotFoundError(
+            f"{folder} holds neither {INDEX} nor chunks ({SUFFIX} files): give the folder that "
+            "holds train/ and test/"
+        )
+    files: dict[str, UPath] = {}
+    for path in paths:
+        for key in Chunk(path).keys:
+            if key in files:
+                raise ValueError(
+                    f"the scene {key!r} is in {files[key].name} and in {path.name} of {folder}: "
+                    f"remove one of the files, or write an {INDEX}"
+                )
+            files[key] = path
+    warn_once(
+        f"{folder} has no {INDEX}: all of its {len(paths)} chunks were opened to list {len(files)} "
+        "scenes, which happens at every start"
+    )
+    return files

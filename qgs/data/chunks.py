@@ -1,0 +1,251 @@
+"""`qgs/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from upath import UPath
+
+from qgs.contracts import Scene, SceneSource, Split
+from qgs.data.chunk_files import SUFFIX, Chunk, Record, has_chunks, list_scenes, require_usable
+from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
+from qgs.data.paths import opened_path
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, warn_once
+from qgs.types import Cameras
+
+_OPEN = 4  # chunks kept open
+_SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
+
+
+class ChunksConfig(SceneSource.Config):
+    """Options of `qgs/chunks`."""
+
+    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
+
+    path: str
+    """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
+    URL are read whole, by every process and worker: copy them to a local disk to train."""
+    holdout: int = Field(default=0, ge=0)
+    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 keeps those that
+    `qgs data pack` took over from its source, which other chunks have none of."""
+    max_scenes: int = Field(default=0, ge=0)
+    """Only the first scenes of each split; 0 for all."""
+    min_frames: int = Field(default=0, ge=0)
+    """Leave out scenes with fewer frames, which opens every chunk once at the start; 0 for none."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
+
+
+class ChunkScene(EncodedScene):
+    """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
+
+    def __init__(
+        self, chunks: BoundedCache[Chunk], file: UPath, key: str, config: ChunksConfig
+    ) -> None:
+        self.name = key
+        self._chunks, self._file, self._config = chunks, file, config
+
+    @property
+    def _record(self) -> Record:
+        return self._chunks.get(str(self._file), lambda: Chunk(self._file)).record(self.name)
+
+    @cached_property
+    def _length(self) -> int:
+        return len(self._record)
+
+    def __len__(self) -> int:
+        return self._length
+
+    @cached_property
+    def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
+        """See `Scene`: as the option says, else as the chunk does."""
+        every = self._config.holdout
+        return tuple(range(every // 2, len(self), every)) if every else self._record.held_out
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """See `Scene`; float64. Raises ValueError for cameras that cannot be used."""
+        record, target = self._record, self._config.image_size
+        require_usable(record)
+        intrinsics = record.cameras[:, :4].double()
+        sizes = torch.tensor(record.image_sizes)
+        for height, width in set(record.image_sizes):
+            alike = (sizes == torch.tensor([height, width])).all(1)
+            pixels = intrinsics[alike] * torch.tensor([width, height, width, height])
+            intrinsics[alike] = CropResize((height, width), target).intrinsics(pixels)
+        return Cameras(torch.linalg.inv(record.w2c), intrinsics, target)
+
+    def frame_name(self, frame: int) -> str:
+        """See `Scene`: the writer's name of a frame, else its time stamp."""
+        return self._record.names[frame]
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`. Raises ValueError for an image that cannot be decoded."""
+        record = self._record
+        return to_tensor(np.stack([self._pixels(record, frame) for frame in frames]))
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; a frame without a mask has one of ones."""
+        record = self._record
+        if record.masks is None:
+            return None
+        masks = np.stack([self._mask(record, record.masks[frame], frame) for frame in frames])
+        return torch.from_numpy(masks)[:, None].float().div_(255)
+
+    def encoded(self, frame: int) -> EncodedFrame:
+        """See `EncodedScene`."""
+        record = self._record
+        size = record.stored_size(frame)
+        mask = None if record.masks is None else record.masks[frame].numpy().tobytes()
+        return EncodedFrame(
+            name=record.names[frame],
+            data=record.images[frame].numpy().tobytes(),
+            c2w=torch.linalg.inv(record.w2c[frame]).numpy(),
+            intrinsics=record.intrinsics(frame, size),
+            size=size,
+            mask=mask or None,
+            background=self._config.background,
+        )
+
+    def _pixels(self, record: Record, frame: int) -> np.ndarray:
+        file = io.BytesIO(record.images[frame].numpy().tobytes())
+        try:
+            image = decode_rgb(file, self._config.background)
+        except OSError as error:
+            raise ValueError(
+                f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
+                "chunk again, or take the scene out of index.json"
+            ) from error
+        # intrinsics were cropped for the size that the scene gives
+        height, width = record.image_sizes[frame]
+        if abs(image.width * height / (image.height * width) - 1) > _SAME_ASPECT:
+            raise ValueError(
+                f"{record.place(frame)} is {image.width} x {image.height} pixels, and its scene's "
+                f"images are {width} x {height}, another aspect ratio: chunks of mixed sizes need "
+                "'sizes', which `qgs data pack` writes"
+            )
+        return CropResize((image.height, image.width), self._config.image_size).image(image)
+
+    def _mask(self, record: Record, data: Tensor, frame: int) -> np.ndarray:
+        if not len(data):
+            return np.full(self._config.image_size, 255, np.uint8)
+        try:
+            mask = decode_gray(io.BytesIO(data.numpy().tobytes()))
+        except OSError as error:
+            raise ValueError(
+                f"the mask of {record.place(frame)} cannot be read: {error}"
+            ) from error
+        return CropResize((mask.height, mask.width), self._config.image_size).image(mask)
+
+
+class ChunkScenes(LazyScenes):
+    """The scenes of a split, made when they are asked for."""
+
+    def __init__(
+        self, chunks: BoundedCache[Chunk], files: Mapping[str, UPath], config: ChunksConfig
+    ) -> None:
+        self._chunks, self._files, self._config = chunks, list(files.items()), config
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def scene(self, place: int) -> ChunkScene:
+        """See `LazyScenes`."""
+        key, file = self._files[place]
+        return ChunkScene(self._chunks, file, key, self._config)
+
+    def groups(self) -> list[list[int]]:
+        """Indices of the scenes of each file."""
+        by_file: dict[str, list[int]] = {}
+        for place, (_, file) in enumerate(self._files):
+            by_file.setdefault(str(file), []).append(place)
+        return list(by_file.values())
+
+
+class ChunksSource(SceneSource):
+    """Chunks under PATH/train and PATH/test; a folder without these is the training split.
+
+    A data set without test chunks is evaluated on the held-out frames of its training scenes,
+    where there are any. Scenes that an index.json names and whose chunks do not exist are left out,
+    counted and named in a warning.
+    """
+
+    name = "chunks"
+    Config = ChunksConfig
+
+    def __init__(self, config: ChunksConfig) -> None:
+        super().__init__(config)
+        chunks: BoundedCache[Chunk] = BoundedCache(_OPEN)
+        self._splits: dict[Split, ChunkScenes] = {
+            split: ChunkScenes(chunks, _chosen(chunks, folder, config), config)
+            for split, folder in _folders(opened_path(config.path)).items()
+        }
+        self._nothing = ChunkScenes(chunks, {}, config)
+
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """Chunk files or an index.json in train or test, or chunk files in the folder itself."""
+        inside = [path, *path.iterdir()] if path.is_dir() else []
+        splits = [item for item in inside if item.name in ("train", "test")]
+        return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
+
+    def scenes(self, split: Split) -> Sequence[Scene]:
+        """See `SceneSource`.
+
+        Without test chunks, the first training chunk is opened to see whether it holds out frames.
+        """
+        return self._split(split)
+
+    def _split(self, split: Split) -> ChunkScenes:
+        train = self._splits.get("train", self._nothing)
+        if split == "train" or split in self._splits:
+            return self._splits.get(split, train)
+        first = next(iter(train.groups()), [])
+        return train if any(train[index].held_out for index in first) else self._nothing
+
+    def groups(self, split: Split) -> Sequence[Sequence[int]]:
+        """See `SceneSource`: one group for each chunk file."""
+        return self._split(split).groups()
+
+
+def _folders(path: UPath) -> dict[Split, UPath]:
+    if not path.is_dir():
+        raise FileNotFoundError(
+            f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
+        )
+    folders: dict[Split, UPath] = {"train": path / "train", "test": path / "test"}
+    found = {split: folder for split, folder in folders.items() if has_chunks(folder)}
+    if not found and has_chunks(path):
+        return {"train": path}
+    if not found:
+        inside = ", ".join(sorted(item.name for item in path.iterdir())[:8]) or "nothing"
+        raise FileNotFoundError(
+            f"{path} holds no chunks: expected train/ or test/ with index.json and .torch files, "
+            f"found {inside}. `qgs data pack` makes chunks of other formats"
+        )
+    return found
+
+
+def _chosen(chunks: BoundedCache[Chunk], folder: UPath, config: ChunksConfig) -> dict[str, UPath]:
+    """The scenes that the options leave; those with too few frames are counted and named."""
+    files = list_scenes(folder)
+    if config.min_frames:
+        by_file = sorted(files.items(), key=lambda item: str(item[1]))
+        frames = {key: len(ChunkScene(chunks, file, key, config)) for key, file in by_file}
+        short = {key: count for key, count in frames.items() if count < config.min_frames}
+        if short:
+            names = ", ".join(f"{key} ({count})" for key, count in short.items())
+            warn_once(
+                f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
+                f"{config.min_frames} frames (min_frames) and are left out: {names}"
+            )
+        files = {key: file for key, file in files.items() if key not in short}
+    return dict(list(files.items())[: config.max_scenes or None])

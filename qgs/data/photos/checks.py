@@ -1,0 +1,147 @@
+"""What cannot be right about a listed photo: its pose, its intrinsics, its size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from qgs.contracts import Problem
+from qgs.data.lenses import Intrinsics, Size
+from qgs.data.scenes import warn_once
+
+if TYPE_CHECKING:
+    from qgs.data.photos.reader import PhotoFrame
+
+_RIGID = 1e-3  # of rotations against orthonormality
+_SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
+_SQUARE = 0.1  # relative difference of sides, or of fx and fy, that is none
+_NORMALISED = 5.0  # a focal length below is in units of the image, not of its pixels
+_FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
+
+
+@dataclass(frozen=True)
+class FrameProblem(Problem):
+    """Something wrong with a listed photo. option: the field of `PhotoFrame` that it is about.
+
+    fatal: whether `require_sound` refuses the frame for it.
+    """
+
+    fatal: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.fix}"
+
+
+def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
+    """What is wrong with a pose (4, 4): NaN, mirrored, sheared or scaled."""
+    if not np.isfinite(c2w).all():
+        yield FrameProblem("c2w", "the pose has NaN or infinite numbers", "remove the frame")
+        return
+    rotation = c2w[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(rotation))
+    if error <= _RIGID and determinant < 0:
+        yield FrameProblem(
+            "c2w",
+            f"the pose mirrors and so is not rigid (determinant {determinant:.3g})",
+            "negate one axis of the camera, or export the poses again",
+        )
+    elif error > _RIGID or np.abs(c2w[3] - [0, 0, 0, 1]).max() > _RIGID:
+        yield FrameProblem(
+            "c2w",
+            f"the pose is not rigid (rotation off by {error:.2g}, determinant {determinant:.3g}, "
+            f"last row {c2w[3].tolist()})",
+            "poses must rotate and translate only; divide the rotation by its scale",
+        )
+
+
+def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
+    """What is wrong with fx, fy, cx, cy in pixels of an image of `size` (H, W), where it is known.
+
+    Fatal where they cannot be pixels at all. A principal point off the image and a strange angle of
+    view may be right, and are not.
+    """
+
+    def problem(reason: str, fix: str, *, fatal: bool = True) -> FrameProblem:
+        said = f"fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}"
+        pixels = "" if size is None or fatal else f", {size[1]} x {size[0]} pixels"
+        return FrameProblem("intrinsics", f"{reason} ({said}{pixels})", fix, fatal)
+
+    fx, fy, cx, cy = intrinsics
+    if not all(map(math.isfinite, intrinsics)) or fx <= 0 or fy <= 0:
+        fix = "focal lengths must be positive; export the intrinsics again"
+        yield problem("intrinsics are no numbers of a camera", fix)
+        return
+    in_pixels = size is not None and max(size) > 20 * _NORMALISED
+    if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
+        fix = "they must be in pixels; multiply fx and cx by the width, fy and cy by the height"
+        yield problem("the intrinsics look normalised", fix)
+        return
+    if size is None:
+        return
+    height, width = size
+    if not (0 < cx < width and 0 < cy < height):
+        fix = "correct cx and cy, unless the photo is cut from a larger one"
+        yield problem("the principal point lies off the image", fix, fatal=False)
+    aspect, focal = width / height, [f / max(size) for f in (fx, fy)]
+    # fx / fy is the square of the aspect ratio where width and height of square pixels were swapped
+    if abs(aspect - 1) > _SQUARE and abs(fx / fy / aspect**2 - 1) < _SQUARE:
+        yield problem(
+            "fx and fy differ as if divided by the wrong side of the image",
+            "width and height are swapped; divide fx and cx by the width, fy and cy by the height",
+            fatal=False,
+        )
+    elif min(focal) < _FOCAL[0] or max(focal) > _FOCAL[1] or not 0.5 < fx / fy < 2:
+        fix = "correct them, or the size that goes with them"
+        yield problem("the focal lengths are implausible", fix, fatal=False)
+
+
+def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
+    """What is wrong with an image file of `size` (H, W) listed with another one.
+
+    A scaled copy is right: intrinsics follow its size.
+    """
+    if listed is None:
+        return
+    ratio = size[1] * listed[0] / (size[0] * listed[1])
+    if abs(ratio - 1) <= _SAME_ASPECT:
+        return
+    swapped = abs(size[1] * listed[1] / (size[0] * listed[0]) - 1) <= _SAME_ASPECT
+    yield FrameProblem(
+        "size",
+        f"the image is {size[1]} x {size[0]} pixels, but listed as {listed[1]} x {listed[0]}, "
+        "another aspect ratio, so that the intrinsics cannot be scaled",
+        "width and height are swapped; swap them back" if swapped
+        else "give the original image, or correct the listed size",
+    )  # fmt: skip
+
+
+def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
+    """Everything that is wrong with `frame` as listed, without opening its image."""
+    yield from frame.problems
+    if not frame.problems:
+        yield from pose_problems(frame.c2w)
+        yield from intrinsics_problems(frame.intrinsics, frame.size)
+
+
+def require_sound(listing: object, frames: Sequence[PhotoFrame]) -> None:
+    """Raise ValueError for the first frame of `listing` that has a fatal problem, naming both.
+
+    Of other problems, the first is logged, with the number of frames that have any.
+    """
+    doubtful: list[str] = []
+    for index, frame in enumerate(frames):
+        problems = list(frame_problems(frame))
+        where = f"frame {index} ({frame.name})" if frame.name else f"frame {index}"
+        for problem in problems:
+            if problem.fatal:
+                raise ValueError(f"{listing}: {where}: {problem}")
+        doubtful += [f"{where}: {problems[0]}"] if problems else []
+    if doubtful:
+        warn_once(
+            f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful, first {doubtful[0]}"
+        )

@@ -1,0 +1,136 @@
+"""What a reader of photos is and gives: frames with poses, intrinsics, lenses and files."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import ClassVar, Literal
+
+import numpy as np
+from upath import UPath
+
+from qgs.data.lenses import Intrinsics, Lens, Size
+from qgs.data.photos.checks import FrameProblem
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+_COPY = re.compile(r"images(_\d+)?")
+
+
+@dataclass(frozen=True)
+class PhotoFrame:
+    """One photo as listed; nothing of it is judged yet (see `qgs.data.photos.checks`).
+
+    name: the image file relative to the scene's folder. path: that file; mask, depth: those that go
+    with it. A mask that is the image itself is its alpha channel. c2w: (4, 4) float64 OpenCV
+    camera-to-world. intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the
+    file where the listing gives no size. lens: None for a pinhole. split: what the listing uses it
+    for; None where it says nothing. problems: what the listing says that cannot be read; a pose or
+    intrinsics concerned are NaN.
+    """
+
+    name: str
+    path: UPath
+    c2w: np.ndarray
+    intrinsics: Intrinsics
+    size: Size | None = None
+    lens: Lens | None = None
+    mask: UPath | None = None
+    depth: UPath | None = None
+    split: Literal["train", "test", "unused"] | None = None
+    problems: tuple[FrameProblem, ...] = ()
+
+    def at_size(self, size: Size) -> Intrinsics:
+        """Intrinsics in pixels of an image file of `size`, a scaled copy of what is listed."""
+        height, width = self.size or size
+        x, y = size[1] / width, size[0] / height
+        fx, fy, cx, cy = self.intrinsics
+        return fx * x, fy * y, cx * x, cy * y
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The photos of a folder. file: what lists them. frames: in the order of the listing."""
+
+    file: UPath
+    frames: Sequence[PhotoFrame]
+
+
+class PhotoReader(ABC):
+    """A format that lists the photos of a folder with their cameras.
+
+    A new one is a subclass in a file of its own, added to `qgs.data.photos.READERS`.
+    """
+
+    name: ClassVar[str]
+    """What the option `format` calls it."""
+
+    listing: ClassVar[str]
+    """The file that lists the photos, below the folder, for messages."""
+
+    poses: ClassVar[Literal["opengl", "opencv", "llff"]]
+    """How the files hold poses: as OpenGL or LLFF camera-to-world, or OpenCV world-to-camera.
+    `qgs data check` says by it what wrong poses may have been meant as."""
+
+    @classmethod
+    def recognises(cls, folder: UPath) -> bool:
+        """Whether `folder` holds photos in this format."""
+        return (folder / cls.listing).is_file()
+
+    @classmethod
+    @abstractmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """The photos that `folder` lists; neighbours in the list should be neighbours in space.
+
+        images: folder of photos to read instead of the listed one, such as images_4. Raises
+        FileNotFoundError where it does not exist, ValueError for a listing that cannot be read.
+        """
+
+
+def existing(paths: Iterable[UPath]) -> set[UPath]:
+    """Those of `paths` that exist; each folder is listed once, which object stores need."""
+    by_folder: dict[str, list[UPath]] = {}
+    for path in paths:
+        by_folder.setdefault(str(path.parent), []).append(path)
+    held: set[UPath] = set()
+    for inside in by_folder.values():
+        folder = inside[0].parent
+        names = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
+        held.update(path for path in inside if path.name in names)
+    return held
+
+
+def image_folder(folder: UPath, wanted: str | None) -> UPath:
+    """The folder of photos: `wanted`, else images, else its least reduced copy, such as images_4.
+
+    Raises FileNotFoundError when there is none.
+    """
+    if wanted is not None:
+        if not (folder / wanted).is_dir():
+            raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
+        return folder / wanted
+    copies = [item for item in folder.iterdir() if _COPY.fullmatch(item.name) and item.is_dir()]
+    if not copies:
+        raise FileNotFoundError(
+            f"{folder} has neither a folder `images` nor a scaled copy such as images_4: name the "
+            "folder of photos as `images`"
+        )
+    return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
+
+
+def with_images(frames: Sequence[PhotoFrame], folder: UPath, wanted: str) -> list[PhotoFrame]:
+    """`frames` with their photos taken from `folder`/`wanted` instead of their first folder.
+
+    Raises FileNotFoundError where that folder does not exist.
+    """
+    image_folder(folder, wanted)
+
+    def moved(frame: PhotoFrame) -> PhotoFrame:
+        parts = PurePosixPath(frame.name).parts
+        name = str(PurePosixPath(wanted, *(parts[1:] or parts)))
+        mask = folder / name if frame.mask == frame.path else frame.mask
+        return replace(frame, name=name, path=folder / name, mask=mask)
+
+    return [moved(frame) if frame.name else frame for frame in frames]

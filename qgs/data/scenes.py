@@ -1,0 +1,98 @@
+"""What sources of scenes share: lists opened on demand, stored photos, a cache, warnings."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from qgs.contracts import Scene
+from qgs.data.lenses import Intrinsics, Lens, Size
+
+Value = TypeVar("Value")
+_log = logging.getLogger(__name__)
+
+
+class LazyScenes(Sequence[Scene]):
+    """Scenes that are made or opened when they are indexed."""
+
+    @abstractmethod
+    def scene(self, place: int) -> Scene:
+        """The scene at `place`, from 0 to below the number of scenes."""
+
+    def __getitem__(self, index: Any) -> Any:
+        """The scene at an index, or scenes at a slice of them."""
+        places = range(len(self))[index]  # raises IndexError
+        return [self.scene(i) for i in places] if isinstance(places, range) else self.scene(places)
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """A photo as it is stored, and the camera that took it.
+
+    data, mask: bytes of image files; mask None for a frame without one. c2w: (4, 4) float64, OpenCV
+    axes. intrinsics: fx, fy, cx, cy in pixels of the stored photo, whose size is (H, W).
+    lens: None for a pinhole. background: RGB in [0, 1] behind transparent pixels.
+    """
+
+    name: str
+    data: bytes
+    c2w: np.ndarray
+    intrinsics: Intrinsics
+    size: Size
+    lens: Lens | None = None
+    mask: bytes | None = None
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+class EncodedScene(Scene):
+    """A scene that is stored as image files."""
+
+    @abstractmethod
+    def encoded(self, frame: int) -> EncodedFrame:
+        """A frame as it is stored. Raises ValueError for a file that cannot be read."""
+
+
+class BoundedCache(Generic[Value]):
+    """LRU cache, safe for threads; a copy made by pickling starts empty.
+
+    limit: what the costs of all values may add up to. cost: of a value, such as its bytes; 1 each
+    by default.
+    """
+
+    def __init__(self, limit: int, cost: Callable[[Value], int] | None = None) -> None:
+        self._limit, self._cost = limit, cost
+        self._kept: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
+        self._total, self._lock = 0, Lock()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (self._limit, self._cost)
+
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """The value kept for `key`, or what `make` returns, which is kept if it fits."""
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key][0]
+        value = make()
+        cost = self._cost(value) if self._cost else 1
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = value, cost
+                self._total += cost
+            while self._total > self._limit:
+                self._total -= self._kept.popitem(last=False)[1][1]
+        return value
+
+
+@lru_cache(maxsize=4096)
+def warn_once(message: str) -> None:
+    """Log `message`, unless this process has logged it before."""
+    _log.warning("%s", message)

@@ -1,0 +1,86 @@
+"""What the checks do with modules: seeds, modes, and everything that a module keeps."""
+
+from __future__ import annotations
+
+import inspect
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy
+import torch
+from torch import Tensor, nn
+
+TORCH_OWN = frozenset(vars(nn.Module()))
+"""Attributes in which torch keeps parameters, buffers, submodules, hooks and the mode."""
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Run under a fixed torch seed; the global random state is restored afterwards."""
+    with torch.random.fork_rng(devices=()):
+        torch.default_generator.manual_seed(seed)
+        yield
+
+
+def each_mode(module: Any) -> Iterator[str]:
+    """The names of the two modes, each while `module` is in it."""
+    for mode in ("evaluation", "training"):
+        module.train(mode == "training")
+        yield mode
+
+
+def tensors_of(module: nn.Module) -> dict[str, Tensor]:
+    """Parameters and buffers, including buffers that are not saved."""
+    return dict(module.named_parameters()) | dict(module.named_buffers())
+
+
+def is_torchs_own(part: nn.Module) -> bool:
+    """Whether the class of a module is defined by torch and not by a component's author."""
+    return type(part).__module__.partition(".")[0] == "torch"
+
+
+def attributes(module: nn.Module) -> dict[str, Any]:
+    """Comparable values of what a module keeps besides parameters, buffers and submodules.
+
+    Attributes of its submodules, and of the classes of all of them, are included.
+    """
+    found = {}
+    for name, part in module.named_modules():
+        own = {key: value for key, value in vars(part).items() if key not in TORCH_OWN}
+        found |= {f"{name}.{key}".lstrip("."): _comparable(own[key]) for key in own}
+        for owner in type(part).__mro__:
+            if owner.__module__.partition(".")[0] not in ("torch", "builtins", "abc", "typing"):
+                found |= {
+                    f"{owner.__name__}.{key}": _comparable(value)
+                    for key, value in vars(owner).items()
+                    if not key.startswith(("__", "_abc_")) and not _is_code(value)
+                }
+    return found
+
+
+def _is_code(value: Any) -> bool:
+    """Whether it is a function, a class or a descriptor such as a property."""
+    return inspect.isroutine(value) or inspect.isclass(value) or hasattr(value, "__get__")
+
+
+def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
+    """A value that equals a later one if nothing changed. inside: ids of what contains it."""
+    if id(value) in inside:
+        return None
+    inside = (*inside, id(value))
+    if isinstance(value, Tensor):
+        data = value.detach().cpu().contiguous().flatten().view(torch.uint8)
+        return str(value.dtype), tuple(value.shape), data.numpy().tobytes()
+    if isinstance(value, numpy.ndarray):
+        return value.tobytes()
+    if isinstance(value, Mapping):
+        return {repr(key): _comparable(item, inside) for key, item in value.items()}
+    if isinstance(value, list | tuple | deque):
+        return [_comparable(item, inside) for item in value]
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if hasattr(value, "__dict__") and not _is_code(value):
+        return type(value), _comparable(vars(value), inside)
+    return repr(value)

@@ -1,0 +1,138 @@
+"""Components whose gradients stop or are wrong, or that are not finite for extreme inputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from contract_mutants.fields import PLACE
+from contract_mutants.mutant import mutant
+from contract_mutants.slots import ChangedEncoder, OneTerm
+
+from qgs.components import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    FreeCenters,
+    MlpFeedForward,
+)
+from qgs.components.blocks import merge_heads
+from qgs.contracts import Loss
+
+
+@mutant("gradients_reach_inputs", "memory.keys, memory.values")
+class DetachesTheImages(ContentCrossAttention):
+    def forward(self, state, memory):
+        seen = super().forward(state, memory)
+        return self.core.out_proj(merge_heads(self.core.project(state.features))) + 0 * seen
+
+
+@mutant("gradients_reach_inputs", "state.fields.place.center")
+class MultipliesAFieldByZero(ContentSelfAttention):
+    @classmethod
+    def requires(cls, config):
+        return PLACE
+
+    def forward(self, state):
+        return super().forward(state) + 0 * state["place.center"].sum(-1, keepdim=True)
+
+
+@mutant("gradients_match_differences", "Jacobian")
+@mutant("gradients_reach_inputs", "reaches [0, 1], [1, 1]")
+class DetachesLaterGaussians(FreeCenters):
+    def forward(self, offsets, state):
+        first, later = offsets[:, :, :1], offsets[:, :, 1:]
+        return super().forward(torch.cat([first, later.detach()], 2), state)
+
+
+@mutant("terms_have_gradients", "from the term term")
+class DetachedLoss(OneTerm):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target):
+        return (rendering.rgb.detach() - target.images.detach()).square().mean()
+
+
+@mutant("terms_have_gradients", "from the term contrast")
+class HasATermOfTheTargetAlone(Loss):
+    renderings = "each"
+
+    def forward(self, prediction, rendering, target):
+        error = (rendering.rgb - target.images).square().mean()
+        return {"error": error, "contrast": target.images.square().mean()}
+
+
+@mutant("gradients_match_differences", "in evaluation: Jacobian")
+class DetachesASummand(MlpFeedForward):
+    def forward(self, features):
+        return super().forward(features) + features.square().detach()
+
+
+@mutant("gradients_match_differences", "in training: Jacobian")
+class DetachesASummandInTraining(MlpFeedForward):
+    """The same numbers in both modes."""
+
+    def forward(self, features):
+        update, squares = super().forward(features), features.square()
+        return update + squares.detach() - squares if self.training else update
+
+
+@mutant(
+    "unmet_requirement_fails_at_compose",
+    "gradients are not",
+    also="batch_independence gradients_match_differences zeros_stay_finite "
+    "large_numbers_stay_finite coincident_queries_stay_finite",
+)
+class TakesARootOfZeroInTraining(MlpFeedForward):
+    """Its outputs are finite, its gradients are not."""
+
+    def forward(self, features):
+        update = super().forward(features)
+        return update + (0 * features).sqrt() if self.training else update
+
+
+@mutant("zeros_stay_finite", "with zeros, output")
+class DividesByLength(MlpFeedForward):
+    def forward(self, features):
+        return super().forward(features / features.norm(dim=-1, keepdim=True))
+
+
+@mutant("large_numbers_stay_finite", "with inputs times 1e4, output")
+class Exponentiates(MlpFeedForward):
+    def forward(self, features):
+        return super().forward(features.exp())
+
+
+@mutant(
+    "coincident_queries_stay_finite",
+    "with coincident queries",
+    # The spread is that around the first query, and zeros coincide.
+    also="zeros_stay_finite query_permutation",
+)
+class DividesBySpread(ContentSelfAttention):
+    def forward(self, state):
+        features = state.features
+        spread = (features - features[:, :1]).norm(dim=(1, 2), keepdim=True)
+        return super().forward(state.replace(features / spread))
+
+
+@mutant("points_behind_cameras_stay_finite", "in the centre of a camera", also="zeros_stay_finite")
+class DividesByDepth(ContentSelfAttention):
+    @classmethod
+    def requires(cls, config):
+        return PLACE
+
+    def forward(self, state):
+        place = state["place.center"]
+        return super().forward(state) + place[..., :1] / place[..., 2:]
+
+
+@mutant(
+    "duplicated_view_stays_finite",
+    "with a duplicated view",
+    also="view_permutation",  # baselines are measured from the first view
+)
+class DividesByBaseline(ChangedEncoder):
+    def given(self, views):
+        eyes = views.cameras.c2w[..., :3, 3]
+        baseline = (eyes - eyes[:, :1]).norm(dim=-1).sum(1)
+        return replace(views, images=views.images / baseline[:, None, None, None, None])

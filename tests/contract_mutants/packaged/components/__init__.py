@@ -1,1 +1,0 @@
-"""Components of the package, in a package of their own."""

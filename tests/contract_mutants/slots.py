@@ -1,0 +1,195 @@
+"""Heads, queries, supervisions, losses, data, encoders and attention that break their contracts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count
+
+import torch
+from contract_mutants.mutant import mutant
+from qgs_rooms.source import RoomsSource
+from torch import Tensor, nn
+
+from qgs.components import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    GaussianHead,
+    LatentQueries,
+    LayerSupervision,
+    MultiViewViT,
+)
+from qgs.components.blocks import CrossAttentionCore, split_heads
+from qgs.contracts import MEMORY_FIELDS, AttentionWeights, CrossAttention, Loss
+from qgs.types import ImageMemory, LayerPrediction, Rendering, Views
+
+
+class OneTerm(Loss):
+    """A loss of one term, which mutants define."""
+
+    def term(self, prediction: LayerPrediction, rendering: Rendering, target: Views) -> Tensor:
+        raise NotImplementedError
+
+    def forward(self, prediction, rendering, target):
+        return {"term": self.term(prediction, rendering, target)}
+
+
+class ChangedEncoder(MultiViewViT):
+    """A sound encoder, whose input or output mutants change."""
+
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
+    def given(self, views: Views) -> Views:
+        return views
+
+    def result(self, memory: ImageMemory) -> ImageMemory:
+        return memory
+
+    def forward(self, views):
+        return self.result(super().forward(self.given(views)))
+
+
+@mutant("head_gives_gaussians", "quaternions are 2")
+class GivesLongQuaternions(GaussianHead):
+    def activate(self, raw):
+        good = super().activate(raw)
+        return replace(good, quats=2 * good.quats)
+
+
+@mutant("head_gives_gaussians", "with initial parameters")
+class StartsWithZeroQuaternions(GaussianHead):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        nn.init.zeros_(self.linear.weight)
+
+
+@mutant("queries_are_shared_by_scenes", "scene 1 of 3", options={"count": 6})
+class NumbersScenes(LatentQueries):
+    def forward(self, batch_size):
+        state = super().forward(batch_size)
+        scene = torch.arange(batch_size).to(state.features)[:, None, None]
+        return state.replace(state.features + scene)
+
+
+@mutant("queries_resize", "cannot be loaded", options={"count": 6})
+class NeverResizes(LatentQueries):
+    def resized(self, learned, generator):
+        return dict(learned)
+
+
+@mutant("supervision_weights", "weights sum to 2", options={"layers": (1, 2)})
+class WeighsTwice(LayerSupervision):
+    def weights(self):
+        return {layer: 2 * weight for layer, weight in super().weights().items()}
+
+
+_opened = count()
+
+
+@mutant("scenes_repeat", "scene 0 is", case={"image_size": (16, 24)})
+class StartsAtAnotherScene(RoomsSource):
+    def scenes(self, split):
+        return super().scenes(split)[next(_opened) :]
+
+
+@mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
+class SumsOverScenes(OneTerm):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target):
+        return (rendering.rgb - target.images).square().mean((1, 2, 3, 4)).sum()
+
+
+@mutant("renderings_as_declared", "against the mean over views")
+class TakesTheWorstView(OneTerm):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target):
+        return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
+
+
+@mutant("patch_rays_are_those_of_the_grid", "differ by up to 0.9")
+class GivesZerosAsRays(ChangedEncoder):
+    def result(self, memory):
+        return replace(memory, patch_rays=torch.zeros_like(memory.patch_rays))
+
+
+@mutant("patch_rays_are_those_of_the_grid", "of patches of 8 pixels")
+class RoundsItsRays(ChangedEncoder):
+    def result(self, memory):
+        return replace(memory, patch_rays=memory.patch_rays.bfloat16().to(memory.patch_rays))
+
+
+@mutant(
+    "patch_rays_are_those_of_the_grid",
+    "`grid` is (2, 3, 2), whi",
+    also="tokens_are_those_of_the_grid",
+)
+class SwapsRowsAndColumns(ChangedEncoder):
+    def result(self, memory):
+        views, rows, columns = memory.grid
+        return replace(memory, grid=(views, columns, rows))
+
+
+@mutant("tokens_are_those_of_the_grid", "token of `keys` at (1, 1, 1)")
+class OrdersTokensByColumn(ChangedEncoder):
+    def result(self, memory):
+        def turned(x: Tensor, tokens: int) -> Tensor:
+            x = x.unflatten(tokens, memory.grid).transpose(tokens + 1, tokens + 2)
+            return x.flatten(tokens, tokens + 2)
+
+        keys, values = turned(memory.keys, 2), turned(memory.values, 2)
+        return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
+
+
+@mutant("tokens_are_those_of_the_grid", "`values` at (0, 0, 2)", also="view_permutation")
+class ReversesItsViews(ChangedEncoder):
+    def result(self, memory):
+        values = memory.values.unflatten(2, (memory.grid[0], -1)).flip(2)
+        return replace(memory, values=values.flatten(2, 3))
+
+
+@mutant("tokens_are_those_of_the_grid", "with images of 24 x 16, a")
+class FlipsTallImages(ChangedEncoder):
+    def given(self, views):
+        height, width = views.cameras.size
+        return replace(views, images=views.images.flip(-2)) if height > width else views
+
+
+@mutant("tokens_are_those_of_the_grid", "`values` stays as it is")
+class IgnoresImages(ChangedEncoder):
+    def given(self, views):
+        return replace(views, images=0 * views.images)
+
+
+@mutant("memo_is_of_the_memory_alone", "depends on a weight")
+class SharesItsProjection(CrossAttention):
+    """Keys and values by the weights of whichever layer comes first."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.core = CrossAttentionCore(dims.width, dims.heads)
+        self.kv = nn.Linear(dims.width, 2 * dims.width)
+
+    @classmethod
+    def requires(cls, config):
+        return {"memory.features": MEMORY_FIELDS["memory.features"]}
+
+    def forward(self, state, memory):
+        both = memory.once("mutants.kv", lambda: self.kv(memory.features))
+        keys, values = (split_heads(x, self.dims.heads) for x in both.chunk(2, -1))
+        return self.core(state.features, keys, values)
+
+
+@mutant("memo_is_of_the_memory_alone", "depends on the state")
+class KeepsTheFirstState(ContentCrossAttention):
+    def forward(self, state, memory):
+        mean = memory.once("mutants.mean", lambda: state.features.mean(1, keepdim=True))
+        return super().forward(state, memory) + mean
+
+
+@mutant("explanation_is_a_softmax", "off the softmax")
+class ExplainsBySigmoid(ContentSelfAttention):
+    def explain(self, state, queries):
+        content = super().explain(state, queries).content
+        return AttentionWeights(content, None, torch.sigmoid(content))

@@ -1,0 +1,232 @@
+"""A metric that a plugin adds is shown wherever the built-in ones are."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from qgs.analysis.report import Contender
+from qgs.cli.contest import Entry, report_of, table_of
+from qgs.composer import Recipe, RecipeError, resolve
+from qgs.contracts import (
+    CONTRACT_VERSION,
+    Column,
+    ComponentConfig,
+    Metric,
+    MetricInput,
+    Plugin,
+)
+from qgs.data.evaluation import evaluation_samples, true_depth
+from qgs.drawing.figures import Curves
+from qgs.engine import Evaluation, evaluate
+from qgs.engine.comparison import compare
+from qgs.engine.distributed import make_accelerator
+from qgs.engine.periodic import PeriodicEvaluation
+from qgs.engine.protocol import protocol_of
+from qgs.engine.results import read_results
+from qgs.engine.tracking import Trackers
+
+
+class MeanAbsoluteError(Metric):
+    """Mean absolute error of a view."""
+
+    name: ClassVar[str] = "mae"
+    definition: ClassVar[str] = "mean absolute error"
+    column: ClassVar[Column] = Column("MAE", "lower", digits=5)
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"log"})
+
+    class Config(ComponentConfig):
+        """Options of the error."""
+
+        power: float = 1.0
+        """Exponent of the error."""
+        log: str | None = None
+        """File that changes no value."""
+
+    def forward(self, given: MetricInput) -> Tensor:
+        error = (given.images - given.targets.images).abs() ** self.config.power
+        return error.mean((-3, -2, -1))
+
+
+class DepthError(Metric):
+    """Mean error of depth, in the model's units."""
+
+    name: ClassVar[str] = "depth"
+    needs = ("depth", "true_depth")
+    column: ClassVar[Column] = Column("depth error", "lower")
+
+    def forward(self, given: MetricInput) -> Tensor:
+        assert given.depth is not None
+        assert given.true_depth is not None
+        return given.depth - given.true_depth
+
+
+class Masked(Metric):
+    """Share of masked pixels."""
+
+    name: ClassVar[str] = "masked"
+    needs = ("masks",)
+
+    def columns(self) -> Mapping[str, Column]:
+        return {"mean": Column("masked", "higher")}
+
+    def forward(self, given: MetricInput) -> Mapping[str, Tensor]:
+        return {"mean": given.masks}
+
+
+PLUGIN = Plugin("mine", CONTRACT_VERSION, (MeanAbsoluteError, DepthError, Masked))
+
+
+@pytest.fixture
+def mine(tiny: Callable[..., Recipe]) -> Callable[..., Recipe]:
+    """`mine("metrics.mae={type: mine/mae}")`: a small TokenGS with the plugin above."""
+    return lambda *more: resolve(
+        tiny("tokengs").tree, ["plugins=[rooms, mine]", *more], plugins=[PLUGIN]
+    )
+
+
+@pytest.fixture
+def judged(mine: Callable[..., Recipe]) -> tuple[Recipe, Evaluation]:
+    recipe = mine("metrics.error={type: mine/mae}")
+    return recipe, evaluate(recipe.build_model(), recipe)
+
+
+def shown(thing: object) -> str:
+    console = Console(record=True, width=120, file=io.StringIO())
+    thing.show(console) if hasattr(thing, "show") else console.print(thing)
+    return console.export_text()
+
+
+def test_evaluations_and_their_files(judged: tuple[Recipe, Evaluation], tmp_path: Path) -> None:
+    recipe, evaluation = judged
+    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
+    grey = sample.inputs.images.mean((1, 3, 4))[0, :, None, None]
+    expected = float((grey - sample.targets.images).abs().mean())
+    assert evaluation.scores[0].values["mean_colour_error"] == pytest.approx(expected, rel=1e-5)
+    text = shown(evaluation)
+    assert "MAE ↓" in text
+    assert f" {evaluation.mean('error'):.5f} " in text
+    evaluation.write(tmp_path)
+    rows = list(csv.DictReader((tmp_path / "scenes.csv").open()))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    mean = sum(float(row["model_error"]) for row in rows) / len(rows)
+    assert summary["model"]["error"] == pytest.approx(mean)
+    assert summary["nearest_input"]["error"] == evaluation.mean("error", "nearest_input")
+    assert summary["columns"]["error"]["better"] == "lower"
+    assert "   MAE ↓ |" in (tmp_path / "table.md").read_text()
+
+
+def test_comparisons_need_no_plugin_and_know_which_way_is_better(
+    mine: Callable[..., Recipe], judged: tuple[Recipe, Evaluation], tmp_path: Path
+) -> None:
+    judged[1].write(tmp_path / "a")
+    other = mine("metrics.error={type: mine/mae}", "seed=1")
+    evaluate(other.build_model(), other).write(tmp_path / "b")
+    stored = [read_results(tmp_path / name) for name in "ab"]
+    comparisons = compare(stored)
+    (found,) = [d for d in comparisons.pairs[0].differences if d.metric == "error"]
+    ours, theirs = ([s["model_error"] for s in result.scenes.values()] for result in stored)
+    assert found.wins == sum(a < b for a, b in zip(ours, theirs, strict=True))
+    assert found.wins + found.losses == found.scenes == 2
+    assert f"{found.difference:+.6f}" in shown(comparisons)
+
+
+def test_the_protocol_has_its_definition_and_options(mine: Callable[..., Recipe]) -> None:
+    def protocol(options: str) -> object:
+        return protocol_of(mine(f"metrics.error={{type: mine/mae{options}}}"), None, ["x"])
+
+    plain, same, other = protocol(""), protocol(", log: there"), protocol(", power: 2.0")
+    told = {"type": "mine/mae", "definition": "mean absolute error", "power": 1.0}
+    assert plain.content["metrics"]["error"] == told
+    assert plain.sha256 == same.sha256 != other.sha256
+
+
+def test_training_records_and_tracks_it(mine: Callable[..., Recipe], tmp_path: Path) -> None:
+    told: dict[str, float] = {}
+
+    class Told(Trackers):
+        def log(self, values: Mapping[str, float], step: int) -> None:
+            told.update(values)
+
+    recipe = mine("metrics.error={type: mine/mae}")
+    model = recipe.build_model()
+    accelerator = make_accelerator("cpu")
+    PeriodicEvaluation(accelerator, recipe, model, None, tmp_path, Told(())).run(3)
+    record = json.loads((tmp_path / "evaluations.jsonl").read_text())
+    assert record["scores"]["error"] == evaluate(model, recipe).mean("error")
+    assert told["evaluation/raw/error"] == record["scores"]["error"]
+
+
+def test_contests_and_their_report_show_it(judged: tuple[Recipe, Evaluation]) -> None:
+    recipe, evaluation = judged
+    scores = evaluation.means()
+    contender = Contender(
+        "one", recipe.build_model(), scores, 96, 1000, 1.0, Curves([], [], []), "recipe: 1"
+    )
+    entry = Entry(recipe, contender, evaluation)
+    table = shown(table_of([entry]))
+    assert "MAE ↓" in table
+    assert table.count(f"{scores['error']:.5f}") == 1
+    report = report_of([entry], 1.0, 0)
+    assert report.columns["error"].heading == "MAE"
+    assert report.contenders[0].scores["error"] == scores["error"]
+
+
+def test_what_a_metric_needs(mine: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = mine("metrics={depth: {type: mine/depth}, mask: {type: mine/masked}}")
+    source = recipe.build_data()
+    second = source.names("test")[1]
+    monkeypatch.setattr(
+        type(source.scenes("test")[0]),
+        "masks",
+        lambda self, frames: None if self.name == second else torch.ones(len(frames), 1, 16, 16),
+    )
+    model = recipe.build_model().eval()
+    evaluation = evaluate(model, recipe)
+    sample = evaluation_samples(source, recipe.views, recipe.evaluation)[0]
+    with torch.no_grad():
+        rendering = model.render(model(sample.inputs).gaussians, sample.targets.cameras)
+    expected = float((rendering.depth[0] - true_depth(source, sample)).mean())
+    assert evaluation.scores[0].values["model_depth"] == pytest.approx(expected, rel=1e-5)
+    assert evaluation.mean("depth", "nearest_input") is None
+    assert evaluation.mean("mask_mean") == evaluation.mean("mask_mean", "mean_colour") == 1.0
+    assert set(evaluation.incomplete) == {"mask_mean"}
+    assert "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes" in shown(
+        evaluation
+    )
+
+
+def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(
+    mine: Callable[..., Recipe], tmp_path: Path
+) -> None:
+    drop = "psnr: null, ssim: null, dispersion: null"
+    recipe = mine(f"metrics={{{drop}, mask: {{type: mine/masked}}}}")
+    evaluation = evaluate(recipe.build_model(), recipe)
+    assert evaluation.statement == "over 2 scenes"
+    assert "masked is empty: it needs masks, not known for 2 of 2 scenes" in shown(evaluation)
+    evaluation.write(tmp_path)
+    assert read_results(tmp_path).scenes.keys() == {"test/000000", "test/000001"}
+
+
+def test_two_values_of_one_name_are_refused(mine: Callable[..., Recipe]) -> None:
+    recipe = mine("metrics={mask_mean: {type: mine/mae}, mask: {type: mine/masked}}")
+    with pytest.raises(ValueError, match="two values of the metrics are called mask_mean"):
+        evaluate(recipe.build_model(), recipe)
+
+
+def test_written_metrics_lie_over_the_default_ones(tiny: Callable[..., Recipe]) -> None:
+    recipe = tiny("tokengs", "metrics={lpips: {type: qgs/lpips}, psnr: null}")
+    assert list(recipe.build_metrics()) == ["ssim", "dispersion", "lpips"]
+    assert recipe.tree["metrics"]["psnr"] is None
+    assert resolve(recipe.tree).tree == recipe.tree
+    with pytest.raises(RecipeError, match=r"metrics\.psnr"):
+        tiny("tokengs", "metrics.psnr.covariance=sample")

@@ -1,0 +1,74 @@
+"""A plugin with a data source of its own, `tapes/tape`, as a stranger would write it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from qgs.contracts import Plugin, Scene, SceneSource
+from qgs.types import Cameras
+
+
+class Tape(Scene):
+    """A file of images (F, H, W, 3) uint8 and poses (F, 4, 4); one in three is held out."""
+
+    def __init__(self, file: Path) -> None:
+        with np.load(file) as arrays:
+            self._images, self._c2w = arrays["images"], arrays["c2w"]
+        self.name = file.stem
+        self.held_out = tuple(range(1, len(self._images), 3))
+
+    @property
+    def cameras(self) -> Cameras:
+        height, width = self._images.shape[1:3]
+        intrinsics = torch.tensor([width, width, width / 2, height / 2]).expand(len(self._c2w), 4)
+        return Cameras(torch.from_numpy(self._c2w), intrinsics.double(), (height, width))
+
+    def images(self, frames):
+        return torch.from_numpy(self._images[list(frames)]).permute(0, 3, 1, 2).float() / 255
+
+
+class TapeSource(SceneSource):
+    """A folder of tapes, all of them for training."""
+
+    name = "tape"
+
+    class Config(SceneSource.Config):
+        path: str
+        """The folder."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._tapes = [Tape(file) for file in sorted(Path(config.path).glob("*.tape"))]
+
+    @classmethod
+    def recognises(cls, path):
+        return path.is_dir() and any(item.suffix == ".tape" for item in path.iterdir())
+
+    def scenes(self, split):
+        return self._tapes
+
+
+plugin = Plugin("tapes", 1, (TapeSource,))
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install the plugin for a test; `folder` gets the metadata of its distribution."""
+    info = folder / "qgs_tapes-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: qgs-tapes\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[qgs.plugins]\ntapes = tape_source:plugin\n")
+    monkeypatch.syspath_prepend(folder)
+
+
+def write_tape(file: Path, frames: int = 6, size: tuple[int, int] = (16, 16)) -> None:
+    """Noise, seen by cameras a step apart."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    images = np.random.default_rng(0).integers(0, 256, (frames, *size, 3), np.uint8)
+    c2w = np.tile(np.eye(4), (frames, 1, 1))
+    c2w[:, 0, 3] = 0.1 * np.arange(frames)
+    with file.open("wb") as opened:
+        np.savez(opened, images=images, c2w=c2w)
