@@ -7,7 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from qgs.cli import app
+from qgs.cli import COMMANDS
+from qgs.cli.plugin_commands import GROUP
 from qgs.composer.slots import SECTIONS, SLOTS
 
 ROOT = Path(__file__).parents[1]

@@ -94,22 +94,12 @@ TARGETS = 2
 """Target views of each scene that are shown."""
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A contender and what it predicts for the first sample, which most sections picture."""
-
-    contender: Contender
-    prediction: Prediction
-    sample: Sample
-
-    @property
-    def model(self) -> QueryGaussianModel:
-        """The contender's."""
-        return self.contender.model
+Shown = Sequence[tuple[Contender, Prediction]]
+"""Every contender with what it predicts for the sample that most sections picture."""
 
 
 @dataclass(frozen=True)
-class Figure:
+class Tile:
     """A picture, or the frames of an animation. legend: tokens in it, in their colours."""
 
     image: Picture | list[Picture]
@@ -118,7 +108,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportSection:
     """A heading, a paragraph, and figures below the name of their model.
 
     width: least width of a figure on the page, CSS pixels.
@@ -126,7 +116,7 @@ class Section:
 
     title: str
     text: str
-    figures: Mapping[str, Sequence[Figure]]
+    figures: Mapping[str, Sequence[Tile]]
     width: int = 300
 
 
@@ -134,16 +124,13 @@ class Section:
 def report_html(report: Report) -> str:
     """The whole page; it needs no other file and no network."""
     first = report.samples[0]
-    shown = [Shown(c, c.model(first.inputs), first) for c in report.contenders]
-    depths = zip(report.samples, report.depths, strict=True)
-    content: dict[str, Any] = {
-        "report": report,
-        "scenes": [scene_columns(report.contenders, sample, depth) for sample, depth in depths],
-        # A new section of figures: a function that returns a Section, and its name here.
-        "sections": [
-            section(shown) for section in (orbit, tokens, anchors, attention, training_curves)
-        ],
-    }
+    shown = [(c, c.model(first.inputs)) for c in report.contenders]
+    # A new section of figures is a function that returns a ReportSection, and its name here.
+    sections = [make(shown, first) for make in (orbit, tokens, anchors, attention, training_curves)]
+    scenes = [
+        scene_columns(report.contenders, sample, depth)
+        for sample, depth in zip(report.samples, report.depths, strict=True)
+    ]
     environment = Environment(
         loader=PackageLoader("qgs.analysis", "template"),
         autoescape=True,
@@ -152,7 +139,9 @@ def report_html(report: Report) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(uri=_uri, hex=hex_color)
-    return environment.get_template("report.html").render(content)
+    return environment.get_template("report.html").render(
+        report=report, scenes=scenes, sections=sections
+    )
 
 
 def _uri(image: Picture | list[Picture]) -> str:
@@ -182,40 +171,40 @@ def scene_columns(
         depths[f"{contender.name}, depth"] = rendering.depth[0]
     near, far = depth_range(torch.cat(list(depths.values())))
     for name, maps in depths.items():
-        columns[name] = [Figure(depth_picture(depth, near, far)) for depth in maps]
+        columns[name] = [Tile(depth_picture(depth, near, far)) for depth in maps]
     photos = _photos(sample.inputs.images[0], frames[:inputs])
     return {"name": sample.scene, "inputs": photos, "columns": columns}
 
 
-def _photos(images: Tensor, captions: Sequence[str]) -> list[Figure]:
-    return [Figure(rgb_picture(i), caption) for i, caption in zip(images, captions, strict=False)]
+def _photos(images: Tensor, captions: Sequence[str]) -> list[Tile]:
+    return [Tile(rgb_picture(i), caption) for i, caption in zip(images, captions, strict=False)]
 
 
-def orbit(shown: Sequence[Shown]) -> Section:
+def orbit(shown: Shown, sample: Sample) -> ReportSection:
     """A loop past the input cameras, around what they see."""
     figures = []
-    for one in shown:
-        cameras, gaussians = one.sample.inputs.cameras, one.prediction.gaussians
-        depths = one.model.render(gaussians, cameras).depth
+    for contender, prediction in shown:
+        cameras, render = sample.inputs.cameras, contender.model.render
+        depths = render(prediction.gaussians, cameras).depth
         path = orbit_path(cameras, depths, ORBIT_FRAMES, SIDE)
-        frames = [rgb_picture(image) for image in one.model.render(gaussians, path).rgb[0]]
-        figures.append(Figure(frames, one.contender.name))
-    return Section(
+        frames = [rgb_picture(image) for image in render(prediction.gaussians, path).rgb[0]]
+        figures.append(Tile(frames, contender.name))
+    return ReportSection(
         "A walk through the reconstruction",
         "The first scene above from a loop past its input cameras. Nothing here is a photo.",
         {"": figures},
     )
 
 
-def tokens(shown: Sequence[Shown]) -> Section:
+def tokens(shown: Shown, sample: Sample) -> ReportSection:
     """The most notable tokens of each model, seen from the first target view."""
     figures = []
-    for one in shown:
-        cameras = finer(one.sample.targets.cameras[:, :1], SIDE)
-        chosen = notable_tokens(one.model, one.prediction.gaussians, cameras, TOKENS)
-        picture = token_picture(one.model, one.prediction.gaussians, chosen, cameras)
-        figures.append(Figure(picture, one.contender.name, chosen))
-    return Section(
+    cameras = finer(sample.targets.cameras[:, :1], SIDE)
+    for contender, prediction in shown:
+        chosen = notable_tokens(contender.model, prediction.gaussians, cameras, TOKENS)
+        picture = token_picture(contender.model, prediction.gaussians, chosen, cameras)
+        figures.append(Tile(picture, contender.name, chosen))
+    return ReportSection(
         "What single tokens stand for",
         "All Gaussians of five tokens in colour, over the scene in grey. Lines lead from each "
         "Gaussian to the centroid of its token. The tokens are the heaviest in this view that also "
@@ -224,19 +213,19 @@ def tokens(shown: Sequence[Shown]) -> Section:
     )
 
 
-def anchors(shown: Sequence[Shown]) -> Section:
+def anchors(shown: Shown, sample: Sample) -> ReportSection:
     """Supports on the first input view, before the decoder and after each layer.
 
     Queries without a place in space have none.
     """
-    figures: dict[str, list[Figure]] = {}
-    for one in shown:
-        model, inputs = one.model, one.sample.inputs
-        prediction = model(inputs, layers=range(1, model.depth + 1))
-        camera = inputs.cameras[:, :1]
+    figures: dict[str, list[Tile]] = {}
+    camera = sample.inputs.cameras[:, :1]
+    photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE, smooth=True)
+    for contender, _ in shown:
+        model = contender.model
+        prediction = model(sample.inputs, layers=range(1, model.depth + 1))
         chosen = notable_tokens(model, prediction.gaussians, camera, ANCHORS)
         colors = {token.query: token.color for token in chosen}
-        photo = enlarged(rgb_picture(inputs.images[0, 0]), SIDE, smooth=True)
         states = {"learned start": model.queries(1)} | {
             f"after layer {number}": layer.state for number, layer in prediction.layers.items()
         }
@@ -244,8 +233,8 @@ def anchors(shown: Sequence[Shown]) -> Section:
             support = model.queries.support(state)
             if support is not None:
                 picture = support_picture(photo, support, camera, colors)
-                figures.setdefault(one.contender.name, []).append(Figure(picture, caption))
-    return Section(
+                figures.setdefault(contender.name, []).append(Tile(picture, caption))
+    return ReportSection(
         "Where queries look",
         "Every query’s anchor on the first input view, as a dot; twelve that matter to this view "
         "with their support, where all of it lies before the camera. Photos move the anchors from "
@@ -255,35 +244,30 @@ def anchors(shown: Sequence[Shown]) -> Section:
     )
 
 
-def attention(shown: Sequence[Shown]) -> Section:
+def attention(shown: Shown, sample: Sample) -> ReportSection:
     """Where the heaviest token looks in the input views: content, geometry, both; mean of heads."""
-    figures: dict[str, list[Figure]] = {}
-    for one in shown:
-        model, sample = one.model, one.sample
-        view = sample.targets.cameras[:, :1]
-        (token,) = notable_tokens(model, one.prediction.gaussians, view, 1)
+    figures: dict[str, list[Tile]] = {}
+    photos = [enlarged(rgb_picture(i), SIDE // 2, smooth=True) for i in sample.inputs.images[0]]
+    view = sample.targets.cameras[:, :1]
+    for contender, prediction in shown:
+        model = contender.model
+        (token,) = notable_tokens(model, prediction.gaussians, view, 1)
         with trace(model, layers=[model.depth], queries=[token.query]) as record:
             model(sample.inputs)
         weights = record.layers[model.depth].cross_attention
         if weights is None or record.grid is None:
             continue
-        parts = {"content logits": weights.content, "geometry bias": weights.geometry}
-        parts["attention"] = weights.weights
-        photos = [
-            enlarged(rgb_picture(image), SIDE // 2, smooth=True)
-            for image in sample.inputs.images[0]
-        ]
-        figures[one.contender.name] = [
-            Figure(
-                side_by_side(
-                    attention_pictures(photos, patch_maps(part[0, :, 0].mean(0), record.grid))
-                ),
-                caption,
-            )
-            for caption, part in parts.items()
-            if part is not None
-        ]
-    return Section(
+        parts = {
+            "content logits": weights.content,
+            "geometry bias": weights.geometry,
+            "attention": weights.weights,
+        }
+        for caption, part in parts.items():
+            if part is not None:
+                maps = patch_maps(part[0, :, 0].mean(0), record.grid)
+                picture = side_by_side(attention_pictures(photos, maps))
+                figures.setdefault(contender.name, []).append(Tile(picture, caption))
+    return ReportSection(
         "What one query reads",
         "Cross-attention of the heaviest token over the patches of both input views in the last "
         "layer, averaged over heads, dark to bright within each picture. A geometry bias, where "
@@ -293,8 +277,8 @@ def attention(shown: Sequence[Shown]) -> Section:
     )
 
 
-def training_curves(shown: Sequence[Shown]) -> Section:
+def training_curves(shown: Shown, sample: Sample) -> ReportSection:
     """Loss and PSNR against seconds for every model."""
-    curves = {one.contender.name: one.contender.curves for one in shown}
+    curves = {contender.name: contender.curves for contender, _ in shown}
     picture = figure_picture(curves_figure(curves), dpi=144)
-    return Section("Training", "", {"": [Figure(picture)]}, width=600)
+    return ReportSection("Training", "", {"": [Tile(picture)]}, width=600)

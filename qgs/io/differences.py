@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -35,6 +35,12 @@ def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()
         for name, shape in recipe.items()
         if name in file and file[name] != shape
     ]
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """The first `most` of `names` with commas, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def one_line(value: Any) -> str:

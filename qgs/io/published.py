@@ -125,7 +125,7 @@ def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
         types.setdefault(slot, set()).add(chosen.type)
         if chosen.type not in known:
             has = f"{layout.name} has {' or '.join(known)}"
-            found[f"{chosen.written_at} is {chosen.type}; {has}"] = None
+            found[f"{chosen.path} is {chosen.type}; {has}"] = None
     return list(found) + [
         f"decoder layers differ in their {slot} ({', '.join(sorted(several))})"
         for slot, several in types.items()
@@ -219,11 +219,12 @@ def advice(recipe: Recipe, expected: WeightLayout | None, shapes: Shapes) -> lis
     except (LayoutError, RecipeError) as error:
         return [*lines, f"no recipe fits the shapes: {error}"]
     differing = differing_options(recipe.tree, fitting.tree)
-    options = [
-        f"  {path}: {wanted} ({f'the recipe has {has}' if has else 'not in it'})"
-        for path, (has, wanted) in ((p, differing.get(p, (None, None))) for p in layout.read_options)
-        if wanted is not None
-    ]
+    options = []
+    for path in layout.read_options:
+        has, wanted = differing.get(path, (None, None))
+        if wanted is not None:
+            found = f"the recipe has {has}" if has else "not in it"
+            options.append(f"  {path}: {wanted} ({found})")
     if options:
         lines += ["options that would fit, by names and shapes:", *options]
         lines += ["names and shapes cannot tell:", *(f"  {line}" for line in layout.undecided)]

@@ -15,7 +15,7 @@ from qgs.composer import Recipe, resolve
 from qgs.contracts import WeightLayout
 from qgs.contracts.weights import Shapes
 from qgs.io.checkpoint import CheckpointError, load_recipe, read_tensors, write_checkpoint
-from qgs.io.differences import options_beside_weights, shapes_of
+from qgs.io.differences import listed, options_beside_weights, shapes_of
 from qgs.io.files import refuse_existing, replacing, write_text
 from qgs.io.published import (
     Names,
@@ -158,7 +158,7 @@ def _as_float32(
     strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
     if strange:
         raise PublishedError(
-            f"{file.path} holds weights that are no real numbers: {_first(strange)} ({told})"
+            f"{file.path} holds weights that are no real numbers: {listed(strange)} ({told})"
         )
     if others and not allowed:
         fix = "--to-float32 rounds them to the float32 that models here compute in"
@@ -178,7 +178,7 @@ def _as_float32(
     broken = [names.published[name] for name, t in tensors.items() if not t.isfinite().all()]
     if broken:
         raise PublishedError(
-            f"{file.path} holds NaN or infinite values in {len(broken)} tensors: {_first(broken)}; "
+            f"{file.path} holds NaN or infinite values in {len(broken)} tensors: {listed(broken)}; "
             "the training that wrote it had diverged, or the file is damaged"
         )
     return tensors, [f"converted to float32: {told}"] if others else []
@@ -190,8 +190,3 @@ def _settings(recipe: Recipe, layout: WeightLayout, shapes: Shapes) -> tuple[str
     return tuple(
         f"{path}: {own} ({layout.name}: {theirs})" for path, (own, theirs) in apart.items()
     )
-
-
-def _first(names: Sequence[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -82,6 +82,8 @@ def test_queries_without_a_place_have_no_anchor_section():
     assert "geometry bias</figcaption>" not in page
     assert "content logits" in page
     assert "Truth, depth" in page
+    assert page.count('src="data:image/webp;base64,') == 1
+    assert page.count("<h2>") == 7
     assert '<td class="best">12.34</td>' in page
     assert '<td class="best">0.500</td>' in page
     assert "<th>my metric ↓<small>" in page

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
-from torch import Tensor
+from golden_weights import published
+from safetensors.torch import save, save_file
 
 import qgs
 from qgs.cli import main
 
-GOLDEN = Path(__file__).parents[1] / "golden"
+LOCUS = published("locus_full_a")
+HALF = save({name: tensor.half() for name, tensor in LOCUS.items()})
 
 
 @pytest.fixture
@@ -33,15 +34,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return call
 
 
-def weights_of(name: str) -> dict[str, Tensor]:
-    with safe_open(GOLDEN / f"{name}.safetensors", "pt") as file:
-        names = [name for name in file.keys() if name.startswith("weights.")]  # noqa: SIM118
-        return {name.removeprefix("weights."): file.get_tensor(name) for name in names}
-
-
 @pytest.fixture
 def locus(tmp_path: Path) -> Path:
-    save_file(weights_of("locus_full_a"), tmp_path / "locus.safetensors")
+    save_file(LOCUS, tmp_path / "locus.safetensors")
     return tmp_path / "locus.safetensors"
 
 
@@ -77,57 +72,38 @@ def test_set_changes_the_recipe(run: Callable[..., str], locus: Path, tmp_path: 
     assert recipe["model"]["head"]["scale_cap"] == 0.1
 
 
-def half(path: Path) -> None:
-    save_file({name: tensor.half() for name, tensor in weights_of("locus_full_a").items()}, path)
-
-
-def tokengs(path: Path) -> None:
-    save_file(weights_of("tokengs_a"), path)
-
-
-def extra(path: Path) -> None:
-    save_file(weights_of("locus_full_a") | {"extra.bias": torch.zeros(4)}, path)
-
-
-def renamed_pickle(path: Path) -> None:
-    torch.save(weights_of("locus_full_a"), path)
-
-
-def truncated(path: Path) -> None:
-    save_file(weights_of("locus_full_a"), path)
-    path.write_bytes(path.read_bytes()[:-1000])
+def torch_file() -> bytes:
+    buffer = BytesIO()
+    torch.save(LOCUS, buffer)
+    return buffer.getvalue()
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("content", "words"),
     [
-        (half, "float16"),
-        (tokengs, "weights of TokenGS"),
-        (extra, "unexpected: extra.bias"),
-        (renamed_pickle, "PyTorch (zip) file"),
-        (truncated, "not a whole safetensors file"),
-        (Path.touch, "is empty"),
-        (Path.mkdir, "is a folder"),
+        (HALF, "float16"),
+        (save(published("tokengs_a")), "weights of TokenGS"),
+        (save(LOCUS | {"extra.bias": torch.zeros(4)}), "unexpected: extra.bias"),
+        (torch_file(), "PyTorch (zip) file"),
+        (save(LOCUS)[:-1000], "not a whole safetensors file"),
     ],
+    ids=["half", "TokenGS", "extra", "pickle", "cut off"],
 )
 def test_wrong_files_end_with_one_error_and_leave_nothing(
-    run: Callable[..., str], locus: Path, tmp_path: Path, make: Callable[[Path], None], words: str
+    run: Callable[..., str], locus: Path, tmp_path: Path, content: bytes, words: str
 ) -> None:
     run("import", locus, "--recipe", "auto", "--out", tmp_path / "c.safetensors")
-    make(tmp_path / "wrong.safetensors")
+    wrong, out = tmp_path / "wrong.safetensors", tmp_path / "new" / "x.safetensors"
+    wrong.write_bytes(content)
     before = sorted(tmp_path.iterdir())
-    out = tmp_path / "new" / "x.safetensors"
-    told = run(
-        "import", tmp_path / "wrong.safetensors", "--recipe", tmp_path / "c.yaml", "--out", out,
-        code=2,
-    )  # fmt: skip
+    told = run("import", wrong, "--recipe", tmp_path / "c.yaml", "--out", out, code=2)
     assert told.count("error:") == 1
     assert words in told
     assert sorted(tmp_path.iterdir()) == before
 
 
 def test_half_precision_on_demand(run: Callable[..., str], tmp_path: Path) -> None:
-    half(tmp_path / "h.safetensors")
+    (tmp_path / "h.safetensors").write_bytes(HALF)
     told = run(
         "import", tmp_path / "h.safetensors", "--recipe", "auto", "--to-float32",
         "--out", tmp_path / "c.safetensors",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from golden_weights import published
 
 from qgs.components import TOKENGS
 from qgs.composer import Recipe, resolve
@@ -36,14 +35,12 @@ LOCUS_MODEL: dict[str, Any] = {
     },
 }
 
-Published = Callable[[str], dict[str, Tensor]]
-
 
 def small(tree: dict[str, Any], *overrides: str) -> Recipe:
     return resolve(tree, [*SMALL, "model.supervision.layers=[2]", *overrides])
 
 
-def test_names_survive_both_ways(published: Published) -> None:
+def test_names_survive_both_ways() -> None:
     weights = published("tokengs_a")
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
     ours = names_of(recipe).from_published(weights)
@@ -71,7 +68,7 @@ def test_the_published_size_counts_its_unused_parameters() -> None:
     assert unused == layers * (2 * 2 * width + 2 * 2 * head + 1) == 52_236
 
 
-def test_every_difference_is_listed_at_once(published: Published) -> None:
+def test_every_difference_is_listed_at_once() -> None:
     weights = published("tokengs_a")
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
     del weights["gs_tokens"], weights["patch_embed.norm.bias"]
@@ -89,7 +86,7 @@ def test_every_difference_is_listed_at_once(published: Published) -> None:
         assert words in str(caught.value)
 
 
-def test_a_tokengs_recipe_accepts_no_key_of_an_anchor(published: Published) -> None:
+def test_a_tokengs_recipe_accepts_no_key_of_an_anchor() -> None:
     weights = published("tokengs_a")
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
     stray = ("gs_anchor_xyz_raw", "enc_dec_backbone.decoder_blocks.0.gs_cross_attn.tau_sample")

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from golden_weights import published
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -17,13 +18,11 @@ from qgs.io.checkpoint import load_extra
 from qgs.io.published import PublishedError
 from qgs.io.transfer import export_weights, import_weights
 
-Published = Callable[[str], dict[str, Tensor]]
-
 MODELS = ("tokengs_a", "locus_full_a", "locus_no_radius_state_a", "locus_content_cross_attn_a")
 
 
 @pytest.fixture
-def imported(published: Published, tmp_path: Path) -> Callable[..., Path]:
+def imported(tmp_path: Path) -> Callable[..., Path]:
     """`imported("tokengs_a", recipe=None)`: the checkpoint that its weights make."""
 
     def make(name: str, recipe: Any = None, **changed: Tensor) -> Path:
@@ -45,7 +44,7 @@ def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_import_export_import_is_bit_equal(
-    imported: Callable[..., Path], published: Published, tmp_path: Path, name: str
+    imported: Callable[..., Path], tmp_path: Path, name: str
 ) -> None:
     checkpoint = imported(name)
     done = export_weights(checkpoint, tmp_path / "back.safetensors")
@@ -58,9 +57,7 @@ def test_import_export_import_is_bit_equal(
     assert_same(load_file(checkpoint), load_file(tmp_path / "again.safetensors"))
 
 
-def test_an_imported_checkpoint_is_like_any_other(
-    imported: Callable[..., Path], published: Published
-) -> None:
+def test_an_imported_checkpoint_is_like_any_other(imported: Callable[..., Path]) -> None:
     path = imported("locus_full_a")
     model = qgs.load(path)
     assert torch.equal(
@@ -70,7 +67,7 @@ def test_an_imported_checkpoint_is_like_any_other(
     assert model.recipe == resolve(path.with_suffix(".yaml")).tree
 
 
-def test_what_is_dropped_is_what_the_file_has(published: Published, tmp_path: Path) -> None:
+def test_what_is_dropped_is_what_the_file_has(tmp_path: Path) -> None:
     weights = published("locus_full_a")
     unused = sorted(name for name in weights if "_norm." in name and "anchor" in name)
     save_file({k: v for k, v in weights.items() if k not in unused}, tmp_path / "w.safetensors")
@@ -82,9 +79,7 @@ def test_what_is_dropped_is_what_the_file_has(published: Published, tmp_path: Pa
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_other_precisions_are_converted_only_on_demand(
-    published: Published, tmp_path: Path, dtype: torch.dtype
-) -> None:
+def test_other_precisions_are_converted_only_on_demand(tmp_path: Path, dtype: torch.dtype) -> None:
     weights = {name: tensor.to(dtype) for name, tensor in published("tokengs_a").items()}
     path, out = tmp_path / "w.safetensors", tmp_path / "o.safetensors"
     save_file(weights, path)
@@ -99,9 +94,7 @@ def test_other_precisions_are_converted_only_on_demand(
     assert torch.equal(features, weights["gs_tokens"].float())
 
 
-def test_parameters_that_share_memory_or_lie_in_strides(
-    published: Published, tmp_path: Path
-) -> None:
+def test_parameters_that_share_memory_or_lie_in_strides(tmp_path: Path) -> None:
     weights = published("tokengs_a")
     tied = [name for name in weights if name.endswith("q_norm.weight")]
     weights |= dict.fromkeys(tied, weights[tied[0]])
@@ -116,7 +109,7 @@ def test_parameters_that_share_memory_or_lie_in_strides(
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_weights_that_are_no_numbers_are_refused(
-    imported: Callable[..., Path], published: Published, tmp_path: Path, value: float
+    imported: Callable[..., Path], tmp_path: Path, value: float
 ) -> None:
     broken = published("tokengs_a")["gs_tokens"].clone()
     broken[3, 5] = value
@@ -247,7 +240,7 @@ def test_models_without_a_published_form_are_not_exported(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["bla.yaml", "bla.pth", "bla"])
-def test_a_checkpoint_is_named_safetensors(published: Published, tmp_path: Path, name: str) -> None:
+def test_a_checkpoint_is_named_safetensors(tmp_path: Path, name: str) -> None:
     save_file(published("tokengs_a"), tmp_path / "w.safetensors")
     with pytest.raises(ValueError, match=r"name it \.safetensors"):
         import_weights(tmp_path / "w.safetensors", None, tmp_path / name)
@@ -255,7 +248,7 @@ def test_a_checkpoint_is_named_safetensors(published: Published, tmp_path: Path,
 
 
 def test_no_checkpoint_stays_without_its_recipe(
-    published: Published, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, text: str) -> None:
         raise OSError("no space left")
@@ -267,7 +260,7 @@ def test_no_checkpoint_stays_without_its_recipe(
     assert [path.name for path in tmp_path.iterdir()] == ["w.safetensors"]
 
 
-def test_the_recipe_that_fits_takes_overrides(published: Published, tmp_path: Path) -> None:
+def test_the_recipe_that_fits_takes_overrides(tmp_path: Path) -> None:
     save_file(published("tokengs_a"), tmp_path / "w.safetensors")
     out = tmp_path / "c.safetensors"
     options = ["data={type: qgs/photos, path: photos, image_size: [16, 24]}", "views.inputs=3"]
@@ -290,9 +283,7 @@ def test_options_that_no_weight_shows_are_told_on_import(
 
 
 @pytest.mark.parametrize("prefix", ["model.", "ema_model.module.", "net._orig_mod."])
-def test_one_prefix_of_all_names_is_taken_off(
-    published: Published, tmp_path: Path, prefix: str
-) -> None:
+def test_one_prefix_of_all_names_is_taken_off(tmp_path: Path, prefix: str) -> None:
     weights = {prefix + name: tensor for name, tensor in published("locus_full_a").items()}
     save_file(weights, tmp_path / "w.safetensors")
     done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save, save_file
 from torch import Tensor
 
 from qgs.io.checkpoint import CheckpointError
@@ -62,71 +63,39 @@ def test_a_prefix_that_only_some_names_have_stays(tmp_path: Path) -> None:
     assert read_weight_file(tmp_path / "w.safetensors").tensors.keys() == mixed.keys()
 
 
-def cut(path: Path) -> Path:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    return path
-
-
-def make_cut_safetensors(folder: Path) -> Path:
-    save_file({"a": torch.zeros(100)}, folder / "w.safetensors")
-    return cut(folder / "w.safetensors")
-
-
-def make_cut_torch(folder: Path) -> Path:
-    torch.save(WEIGHTS, folder / "w.pt")
-    return cut(folder / "w.pt")
-
-
-def make_pickle_called_safetensors(folder: Path, zipped: bool = True) -> Path:
-    path = folder / "w.safetensors"
-    torch.save(WEIGHTS, path, _use_new_zipfile_serialization=zipped)
-    return path
-
-
-def make_safetensors_called_torch(folder: Path) -> Path:
-    save_file(WEIGHTS, folder / "w.pt")
-    return folder / "w.pt"
-
-
-def make_folder(folder: Path) -> Path:
-    (folder / "w.safetensors").mkdir()
-    return folder / "w.safetensors"
-
-
-def saved(folder: Path, content: Any) -> Path:
-    torch.save(content, folder / "w.pt")
-    return folder / "w.pt"
-
-
-def written(folder: Path, name: str, content: bytes) -> Path:
-    (folder / name).write_bytes(content)
-    return folder / name
+def torch_bytes(content: Any, zipped: bool = True) -> bytes:
+    buffer = BytesIO()
+    torch.save(content, buffer, _use_new_zipfile_serialization=zipped)
+    return buffer.getvalue()
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("name", "content", "words"),
     [
-        (make_cut_safetensors, ["not a whole safetensors file", "cut off"]),
-        (make_cut_torch, ["not a whole torch file"]),
-        (make_pickle_called_safetensors, ["PyTorch (zip) file", "whatever its name says", ".pt"]),
-        (lambda f: make_pickle_called_safetensors(f, False), ["a Python pickle"]),
-        (make_safetensors_called_torch, ["is a safetensors file", "name it .safetensors"]),
-        (make_folder, ["is a folder"]),
-        (lambda f: written(f, "w.safetensors", b""), ["is empty"]),
-        (lambda f: written(f, "w.pt", b""), ["is empty"]),
-        (lambda f: written(f, "w.safetensors", b"0123456789"), ["not a whole safetensors"]),
-        (lambda f: written(f, "w.npz", b"0123456789"), ["suffix '.npz'", ".safetensors", ".ckpt"]),
-        (lambda f: saved(f, torch.nn.Linear(2, 2)), ["could run code"]),
-        (lambda f: saved(f, torch.zeros(2)), ["Tensor, no state dict"]),
-        (lambda f: saved(f, {}), ["holds nothing"]),
-        (lambda f: saved(f, {"a": torch.zeros(1), "n": 3}), ["no tensors (n)", "none of them"]),
-        (lambda f: saved(f, {"model": WEIGHTS, "module": WEIGHTS}), ["more than one"]),
+        ("w.safetensors", save(WEIGHTS)[:-5], ["not a whole safetensors file", "cut off"]),
+        ("w.pt", torch_bytes(WEIGHTS)[:500], ["not a whole torch file"]),
+        ("w.safetensors", torch_bytes(WEIGHTS), ["PyTorch (zip) file", "whatever", "name it .pt"]),
+        ("w.safetensors", torch_bytes(WEIGHTS, False), ["a Python pickle"]),
+        ("w.pt", save(WEIGHTS), ["is a safetensors file", "name it .safetensors"]),
+        ("w.safetensors", None, ["is a folder"]),
+        ("w.safetensors", b"", ["is empty"]),
+        ("w.pt", b"", ["is empty"]),
+        ("w.safetensors", b"0123456789", ["not a whole safetensors"]),
+        ("w.safetensors", save({}), ["holds no tensors"]),
+        ("w.safetensors", save(WEIGHTS, {"qgs.recipe": "{}"}), ["is a qgs checkpoint"]),
+        ("w.npz", b"0123456789", ["suffix '.npz'", ".safetensors", ".ckpt"]),
+        ("w.pt", torch_bytes(torch.nn.Linear(2, 2)), ["could run code"]),
+        ("w.pt", torch_bytes(torch.zeros(2)), ["Tensor, no state dict"]),
+        ("w.pt", torch_bytes({}), ["holds nothing"]),
+        ("w.pt", torch_bytes({"a": torch.zeros(1), "n": 3}), ["no tensors (n)", "none of them"]),
+        ("w.pt", torch_bytes({"model": WEIGHTS, "module": WEIGHTS}), ["more than one"]),
     ],
 )
 def test_what_cannot_be_read_gets_a_reason(
-    tmp_path: Path, make: Callable[[Path], Path], words: list[str]
+    tmp_path: Path, name: str, content: bytes | None, words: list[str]
 ) -> None:
-    path = make(tmp_path)
+    path = tmp_path / name
+    path.mkdir() if content is None else path.write_bytes(content)
     with pytest.raises(CheckpointError) as caught:
         read_weight_file(path)
     for part in (str(path), *words):

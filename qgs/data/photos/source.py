@@ -205,8 +205,7 @@ class PhotosSource(SceneSource):
     """Photos of one scene or of many; both splits are the same scenes, with held-out frames.
 
     Only where the folder has scenes in `train` and `test`, the splits are those. A single scene is
-    opened at once; of many, each is when it is asked for. Poses and intrinsics that cannot be meant
-    are refused, photos that do not exist are left out, counted and named in a warning.
+    opened at once; of many, each is when it is asked for. Raises as `present_frames`.
     """
 
     name = "photos"
@@ -290,11 +289,10 @@ def folder_name(folder: UPath) -> str:
 def present_frames(
     folder: UPath, format: Format = "auto", images: str | None = None
 ) -> tuple[list[PhotoFrame], list[str]]:
-    """The frames whose image files exist, and the paths of the others, which are also logged.
+    """The frames of the listing's splits whose image files exist, and the paths of the others.
 
-    Frames that belong to none of the listing's splits are left out, which is logged too.
-    Raises FileNotFoundError when fewer than two images or a mask do not exist, ValueError for
-    poses and intrinsics that cannot be meant.
+    What is left out is logged. Raises FileNotFoundError when fewer than two images or a mask do not
+    exist, ValueError for poses and intrinsics that cannot be right.
     """
     listing = read_listing(folder, format, images)
     require_sound(listing.file, listing.frames)
