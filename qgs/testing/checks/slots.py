@@ -433,8 +433,9 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
 def _lengths(update: Tensor, values: Tensor) -> Tensor:
     """(B, h, M) of the gradients of a query's `update` (B, D) in `values` (B, h, M, d)."""
     direction = torch.randn(update.shape, generator=torch.Generator().manual_seed(0))
-    (gradient,) = torch.autograd.grad(update, values, direction.to(update), retain_graph=True)
-    return gradient.norm(dim=-1)
+    total = (direction.to(update) * update).sum()
+    (found,) = torch.autograd.grad(total, values, retain_graph=True, allow_unused=True)
+    return values.new_zeros(values.shape[:-1]) if found is None else found.norm(dim=-1)
 
 
 def _explanation(module: Any, inputs: Inputs) -> AttentionWeights | None:
