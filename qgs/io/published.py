@@ -125,7 +125,7 @@ def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
         types.setdefault(slot, set()).add(chosen.type)
         if chosen.type not in known:
             has = f"{layout.name} has {' or '.join(known)}"
-            found[f"{chosen.written_at} is {chosen.type}; {has}"] = None
+            found[f"{chosen.path} is {chosen.type}; {has}"] = None
     return list(found) + [
         f"decoder layers differ in their {slot} ({', '.join(sorted(several))})"
         for slot, several in types.items()
