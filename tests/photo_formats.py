@@ -1,12 +1,13 @@
-"""One set of photos written in every format that `qgs/photos` reads, for tests.
+"""One set of photos written in every format that `qgs/photos` reads, and read again, for tests.
 
-Nothing here shares code with the readers: the formats are written from their descriptions.
+The writers share no code with the readers: they follow the descriptions of the formats.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import struct
 from dataclasses import dataclass
@@ -14,7 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
+
+from qgs.data import PhotosSource
+from qgs.data.photos.source import PhotoScene
+
+PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[2] / "shared" / "photos"))
+"""Real photos, which are not in the repository."""
 
 Camera = tuple[str, int, tuple[float, ...]]
 """A COLMAP camera model: its name, number and parameters."""
@@ -48,6 +56,23 @@ def synthetic(
     c2w = np.tile(np.eye(4), (count, 1, 1))
     c2w[:, :3, :3], c2w[:, :3, 3] = rotations, rng.normal(size=(count, 3)) * 5
     return PhotoSet(files, c2w, (50.0, 52.0, 19.0, 16.0), size)
+
+
+def real_folder(name: str) -> Path:
+    """The folder of real photos called `name`; the test is skipped without it."""
+    if not (PHOTOS / name).is_dir():
+        pytest.skip(f"{PHOTOS / name} is missing; set QGS_PHOTOS to the folder of real photos")
+    return PHOTOS / name
+
+
+def opened(path: Path | str, size=(30, 40), **options: Any) -> PhotosSource:
+    config = {"path": str(path), "image_size": size, **options}
+    return PhotosSource(PhotosSource.Config.model_validate(config))
+
+
+def scene(path: Path | str, size=(30, 40), **options: Any) -> PhotoScene:
+    """The first training scene of what is `opened`."""
+    return opened(path, size, **options).scenes("train")[0]  # pyright: ignore[reportReturnType]
 
 
 def centred(photos: PhotoSet) -> PhotoSet:

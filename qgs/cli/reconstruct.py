@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Component, Scene, SceneSource
+    from qgs.contracts import Component, Scene, SceneSource, Split
     from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
     from qgs.types import Gaussians
@@ -146,10 +146,9 @@ def chosen_scene(
 
 def scene_of(source: SceneSource, path: str, name: str | None) -> Scene:
     """The scene called `name`, of either split, or the only one. Raises ValueError otherwise."""
-    places = {
-        known: (split, place)
-        for split in ("train", "test")
-        for place, known in enumerate(source.names(split))
+    splits: tuple[Split, ...] = ("train", "test")
+    places: dict[str, tuple[Split, int]] = {
+        known: (split, place) for split in splits for place, known in enumerate(source.names(split))
     }
     if name is None and len(places) == 1:
         (name,) = places

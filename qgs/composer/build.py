@@ -42,13 +42,40 @@ def build_model(
     device, and the global random state stays as it was. On "meta" nothing is allocated.
     """
     on_meta = device is not None and torch.device(device).type == "meta"
+    shared: list[tuple[Chosen, nn.Module]] = []
+
+    def at(*path: str) -> Any:
+        chosen = parts["model", *path]
+        for known, built in shared:
+            if known.component is chosen.component and known.config == chosen.config:
+                return built
+        built = build(chosen, *(dims,) if issubclass(chosen.component, ModelComponent) else ())
+        if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
+            shared.append((chosen, built))
+        return built
+
     with (
         torch.random.fork_rng(devices=()),
         torch.device("meta" if on_meta else "cpu"),
         _ShapesAlone() if on_meta else nullcontext(),
     ):
         torch.default_generator.manual_seed(seed)
-        model = _assemble(parts, dims, layer_scale, tree)
+        encoder, queries = at("encoder"), at("queries")
+        decoder, refinements = [], []
+        for index in map(str, range(dims.depth)):
+            slots = ("cross_attention", "self_attention", "feed_forward")
+            sublayers = {slot: at("decoder", "layers", index, slot) for slot in slots}
+            decoder.append(DecoderLayer(**sublayers, layer_scale=layer_scale))
+            refinements.append(at("decoder", "layers", index, "refinement"))
+        others = {slot: at(slot) for slot in ("head", "centers", "supervision", "renderer")}
+        model = QueryGaussianModel(
+            encoder=encoder,
+            queries=queries,
+            decoder=decoder,
+            refinements=refinements,
+            recipe=tree,
+            **others,
+        )
     return model if on_meta or device is None else model.to(device)
 
 
@@ -79,47 +106,6 @@ class _ShapesAlone(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def _assemble(
-    parts: Mapping[KeyPath, Chosen], dims: ModelDims, layer_scale: float, tree: Mapping[str, Any]
-) -> QueryGaussianModel:
-    shared: list[tuple[Chosen, nn.Module]] = []
-
-    def at(*path: str) -> Any:
-        chosen = parts["model", *path]
-        for known, built in shared:
-            if known.component is chosen.component and known.config == chosen.config:
-                return built
-        built = build(chosen, *(dims,) if issubclass(chosen.component, ModelComponent) else ())
-        if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
-            shared.append((chosen, built))
-        return built
-
-    encoder, queries = at("encoder"), at("queries")
-    decoder, refinements = [], []
-    for index in map(str, range(dims.depth)):
-        layer = ("decoder", "layers", index)
-        decoder.append(
-            DecoderLayer(
-                cross_attention=at(*layer, "cross_attention"),
-                self_attention=at(*layer, "self_attention"),
-                feed_forward=at(*layer, "feed_forward"),
-                layer_scale=layer_scale,
-            )
-        )
-        refinements.append(at(*layer, "refinement"))
-    return QueryGaussianModel(
-        encoder=encoder,
-        queries=queries,
-        decoder=decoder,
-        refinements=refinements,
-        head=at("head"),
-        centers=at("centers"),
-        supervision=at("supervision"),
-        renderer=at("renderer"),
-        recipe=tree,
-    )
-
-
 def build(chosen: Chosen, *arguments: Any) -> Any:
     """The component itself. arguments: what its constructor takes besides its Config.
 
@@ -138,24 +124,22 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         if ours or (for_users and isinstance(error, ValueError | OSError)):
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
-        origin = chosen.place.origin
-        raise RecipeError(
-            [RecipeProblem(chosen.path, failure.reason, failure.fix, origin.file, origin.line)]
-        ) from error
+        where = chosen.place.origin.file, chosen.place.origin.line
+        problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
+        raise RecipeError([problem]) from error
     if issubclass(component, Queries | Refinement):
         _check_first_state(built, chosen)
     return built
 
 
 def _check_first_state(module: nn.Module, chosen: Chosen) -> None:
-    """Make the first forward pass raise PluginError if it does not return the state that it must.
+    """Make `module` raise PluginError until it has once returned the state that it must.
 
     That has the fields that the component provides, and those of the state that it was given.
     """
-    provided = dict(chosen.component.provides(chosen.config))
 
     def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
-        fault = _state_fault(provided, arguments, state)
+        fault = _state_fault(chosen, arguments, state)
         if fault:
             place = place_of(chosen.component.forward)  # type: ignore[attr-defined]
             raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
@@ -164,23 +148,19 @@ def _check_first_state(module: nn.Module, chosen: Chosen) -> None:
     hook = module.register_forward_hook(check)
 
 
-def _state_fault(provided: Mapping[str, Any], arguments: tuple[Any, ...], state: Any) -> str:
+def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:
     """What is wrong with a state that a component returned; "" if nothing is."""
     if not isinstance(state, QueryState):
         return f"returns {type(state).__name__}, not a QueryState"
     found = ", ".join(state.fields) or "no field at all"
-    for name, spec in provided.items():
+    for name, spec in chosen.component.provides(chosen.config).items():
         says = f"says that it provides {name} ({spec}), but"
         if name not in state.fields:
             return f"{says} the state that it returns has {found}"
         shape = tuple(state.fields[name].shape[2:])
         if not fits(shape, spec.shape):
             return f"{says} it returns one of trailing shape {shape}"
-    for given in arguments:
-        lost = [name for name in getattr(given, "fields", ()) if name not in state.fields]
-        if lost:
-            return (
-                f"loses {', '.join(lost)}: the state that it returns has {found}; "
-                "`state.replace(...)` keeps what it does not change"
-            )
-    return ""
+    given = {name for argument in arguments for name in getattr(argument, "fields", ())}
+    lost = ", ".join(sorted(given - state.fields.keys()))
+    advice = "`state.replace(...)` keeps what it does not change"
+    return f"loses {lost}: the state that it returns has {found}; {advice}" if lost else ""

@@ -175,7 +175,7 @@ def _explain(
     if kind == "string_type":
         return reason, f"put it in quotes{default}"
     if kind == "literal_error":
-        expected = error["ctx"]["expected"]
+        expected = error.get("ctx", {})["expected"]
         near = nearest(written, re.findall(r"'([^']*)'", expected))
         return reason, f"did you mean `{near}`?" if near else f"choose {expected}{default}"
     return reason, f"give a value that fits{default}"

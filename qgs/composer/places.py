@@ -71,13 +71,14 @@ def _check_layers(written: MapNode, depth: int, problems: Problems) -> None:
         if key not in map(str, range(depth)):
             reason = f"there is no layer `{key}` in a decoder of depth {depth}"
             problems.add(origin, path, reason, f"name layers by their index, 0 to {depth - 1}")
-        elif node is not None and not isinstance(node, MapNode):
+        elif isinstance(node, MapNode):
+            for name, _, place in node.without(*LAYER_SLOTS).entries():
+                reason = f"`{name}` is no slot of a decoder layer"
+                fix = did_you_mean(name, LAYER_SLOTS, "slots")
+                problems.add(place, f"{path}.{name}", reason, fix)
+        elif node is not None:
             reason = "a layer's overrides are a mapping from slot to component"
             problems.add(origin, path, reason, "write `SLOT: {type: NAME}` below it")
-        for name in set(node) - set(LAYER_SLOTS) if isinstance(node, MapNode) else ():
-            reason = f"`{name}` is no slot of a decoder layer"
-            fix = did_you_mean(name, LAYER_SLOTS, "slots")
-            problems.add(node.origins[name], f"{path}.{name}", reason, fix)
 
 
 def apply_swaps(

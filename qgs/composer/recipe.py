@@ -118,10 +118,10 @@ def resolve(
         _check_components(parts, dims, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
-    resolved = _resolved(tree, settings, registry, chosen)
+    spelled_out, provenance = _spell_out(tree, settings, registry, chosen)
     return Recipe(
-        tree=resolved.tree,
-        provenance=resolved.provenance,
+        tree=spelled_out,
+        provenance=provenance,
         parts=chosen,
         dims=dims,
         layer_scale=decoder.layer_scale,
@@ -162,83 +162,73 @@ def _check_components(
     check_flow(sound, dims.depth, registry, problems)
 
 
-class _Resolved:
-    """The tree of a resolved recipe and its provenance (see `Recipe`), filled value by value."""
-
-    def __init__(self) -> None:
-        self.tree: dict[str, Any] = {}
-        self.provenance: dict[str, str] = {}
-
-    def put(self, path: KeyPath, values: Mapping[str, Any], written: Any, default: str) -> None:
-        """Put `values` at `path`. written: what the recipe has there, the rest is by `default`."""
-        written = written if isinstance(written, MapNode) else MapNode(Origin(""))
-        below = self.tree
-        for key in path:
-            below = below.setdefault(key, {})
-        for name, value in values.items():
-            if isinstance(value, dict) and value and isinstance(written.get(name), MapNode):
-                self.put((*path, name), value, written[name], default)
-            else:
-                below[name] = value
-                origin = str(written.origins.get(name, default))
-                self.provenance |= dict.fromkeys(flat({name: value}, path), origin)
-
-    def put_component(self, path: KeyPath, chosen: Chosen) -> None:
-        self.put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
-        options = chosen.config.model_dump(mode="json")
-        self.put(path, options, chosen.place.node, f"default of {chosen.type}")
-
-
-def _resolved(
+def _spell_out(
     source: MapNode,
     settings: Mapping[KeyPath, ComponentConfig],
     registry: Registry,
     parts: Mapping[KeyPath, Chosen],
-) -> _Resolved:
-    resolved = _Resolved()
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The tree of a resolved recipe, every default spelled out, and its provenance."""
+    tree: dict[str, Any] = {}
+    provenance: dict[str, str] = {}
+
+    def put(path: KeyPath, values: Mapping[str, Any], written: Any, default: str) -> None:
+        """Put `values` at `path`. written: what the recipe has there, the rest is by `default`."""
+        origins = written.origins if isinstance(written, MapNode) else {}
+        below = tree
+        for key in path:
+            below = below.setdefault(key, {})
+        for name, value in values.items():
+            inner = written.get(name) if origins else None
+            if isinstance(value, dict) and value and isinstance(inner, MapNode):
+                put((*path, name), value, inner, default)
+            else:
+                below[name] = value
+                origin = str(origins.get(name, default))
+                provenance.update(dict.fromkeys(flat({name: value}, path), origin))
 
     def put_settings(*path: str) -> None:
-        values = settings[path].model_dump(mode="json")
-        resolved.put(path, values, source.child(*path), "default")
+        put(path, settings[path].model_dump(mode="json"), source.child(*path), "default")
+
+    def put_component(path: KeyPath, chosen: Chosen) -> None:
+        put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
+        options = chosen.config.model_dump(mode="json")
+        put(path, options, chosen.place.node, f"default of {chosen.type}")
 
     put_settings()
-    plugins = [name for name in registry.plugins if name != "qgs"]
-    resolved.put((), {"plugins": plugins}, source, "default")
+    put((), {"plugins": [name for name in registry.plugins if name != "qgs"]}, source, "default")
     written = source.get("plugins")
     if isinstance(written, ListNode) and written:
-        resolved.provenance["plugins"] = ", ".join(dict.fromkeys(map(str, written.origins)))
+        provenance["plugins"] = ", ".join(dict.fromkeys(map(str, written.origins)))
     put_settings("model")
     for name in MODEL_SLOTS[:2]:
-        resolved.put_component(("model", name), parts["model", name])
+        put_component(("model", name), parts["model", name])
     put_settings("model", "decoder")
-    _put_layers(resolved, parts)
-    for name in MODEL_SLOTS[2:]:
-        resolved.put_component(("model", name), parts["model", name])
-    for name, section in SECTIONS.items():
-        if section.named:
-            resolved.tree[name] = {}
-        for path in [path for path in parts if path[0] == name]:
-            resolved.put_component(path, parts[path])
-        if section.defaults_stay:
-            dropped = {key: None for key in section.defaults if (name, key) not in parts}
-            resolved.put((name,), dropped, source.child(name), "default")
-    for name in ("views", "training", "evaluation"):
-        put_settings(name)
-    return resolved
-
-
-def _put_layers(resolved: _Resolved, parts: Mapping[KeyPath, Chosen]) -> None:
-    """The template, then every layer that differs; a template that no layer uses gives way."""
-    decoder = ("model", "decoder")
+    # The template, then every layer that differs; a template that no layer uses gives way.
+    layers = {path: part for path, part in parts.items() if len(path) == 5}
     templates = {}
     for name in LAYER_SLOTS:
-        layers = [part for path, part in parts.items() if len(path) == 5 and path[-1] == name]
-        same = all(_same(layer, layers[0]) for layer in layers)
-        templates[name] = layers[0] if same else parts[*decoder, name]
-        resolved.put_component((*decoder, name), templates[name])
-    for path, part in parts.items():
-        if len(path) == 5 and not _same(part, templates[path[-1]]):
-            resolved.put_component(path, part)
+        first, *others = [part for path, part in layers.items() if path[-1] == name]
+        same = all(_same(first, other) for other in others)
+        templates[name] = first if same else parts["model", "decoder", name]
+        put_component(("model", "decoder", name), templates[name])
+    for path, part in layers.items():
+        if not _same(part, templates[path[-1]]):
+            put_component(path, part)
+    for name in MODEL_SLOTS[2:]:
+        put_component(("model", name), parts["model", name])
+    for name, section in SECTIONS.items():
+        if section.named:
+            tree[name] = {}
+        for path, part in parts.items():
+            if path[0] == name:
+                put_component(path, part)
+        dropped = [key for key in section.defaults if (name, key) not in parts]
+        if section.defaults_stay:
+            put((name,), dict.fromkeys(dropped), source.child(name), "default")
+    for name in ("views", "training", "evaluation"):
+        put_settings(name)
+    return tree, provenance
 
 
 def _same(a: Chosen, b: Chosen) -> bool:

@@ -75,10 +75,7 @@ class Record:
 
     @cached_property
     def image_sizes(self) -> list[Size]:
-        """(H, W) of every image: as the chunk says, else all as the first image's header says.
-
-        Raises ValueError when that is no readable image.
-        """
+        """(H, W) of every image: as the chunk says, else all as `stored_size` of the first."""
         if self.sizes is not None:
             return [(int(height), int(width)) for height, width in self.sizes.tolist()]
         return [self.stored_size(0)] * len(self)
@@ -101,10 +98,9 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """The scene that `data`, an entry of the chunk `file`, describes.
+    """The scene that `data`, an entry of the chunk `file`, describes; numbers are not judged.
 
-    Raises ValueError, naming key and entry, where its structure is not that of the format; numbers
-    are not judged.
+    Raises ValueError, naming key and entry, where its structure is not that of the format.
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
@@ -112,29 +108,28 @@ def parse_record(file: str, data: Any) -> Record:
             "'images': is it a chunk of RealEstate10K's format?"
         )
     where = f"{file}: scene {data['key']!r}"
-    images, masks, sizes = (data.get(name) for name in ("images", "masks", "sizes"))
-    _expect_files(where, "images", images)
-    _expect(len(images) > 0, where, "there are no frames")
-    cameras = _tensor(where, "cameras", data.get("cameras"), (len(images), 18))
-    _expect(cameras.is_floating_point(), where, f"'cameras' are {cameras.dtype}, expected float32")
+    images = _files(where, "images", data.get("images"))
+    count = len(images)
+    _expect(count > 0, where, "there are no frames")
+    cameras = _tensor(where, "cameras", data.get("cameras"), (count, 18))
+    of_floats = cameras.is_floating_point()
+    _expect(of_floats, where, f"'cameras' are {cameras.dtype}, expected float32")
+    sizes, masks, names = data.get("sizes"), data.get("masks"), data.get("names")
     if sizes is not None:
-        sizes = _tensor(where, "sizes", sizes, (len(images), 2))
+        sizes = _tensor(where, "sizes", sizes, (count, 2))
     if masks is not None:
-        _expect_files(where, "masks", masks)
-    names, stamps = data.get("names"), data.get("timestamps")
+        masks = _files(where, "masks", masks)
+        _expect(len(masks) == count, where, f"{len(masks)} masks for {count} images")
     if not isinstance(names, list):
-        stamped = isinstance(stamps, Tensor) and stamps.numel() == len(images)
-        names = stamps.flatten().tolist() if stamped else range(len(images))
-    for name, items in (("masks", images if masks is None else masks), ("names", names)):
-        counts = f"{len(items)} {name} for {len(images)} images"
-        _expect(len(items) == len(images), where, counts)
-    held_out = data.get("held_out", ())
-    held_out = tuple(held_out.tolist() if isinstance(held_out, Tensor) else held_out or ())
-    _expect(
-        all(isinstance(frame, int) and 0 <= frame < len(images) for frame in held_out),
-        where,
-        f"'held_out' must list frames from 0 to {len(images) - 1}, got {held_out}",
-    )
+        stamps = data.get("timestamps")
+        names = stamps.flatten().tolist() if isinstance(stamps, Tensor) else ()
+        names = names if len(names) == count else range(count)
+    _expect(len(names) == count, where, f"{len(names)} names for {count} images")
+    given = data.get("held_out")
+    held_out = tuple(given.tolist() if isinstance(given, Tensor) else given or ())
+    of_frames = all(isinstance(frame, int) and 0 <= frame < count for frame in held_out)
+    wanted = f"'held_out' must list frames from 0 to {count - 1}"
+    _expect(of_frames, where, f"{wanted}, got {list(held_out)}")
     names = [str(name) for name in names]
     return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
 
@@ -165,12 +160,13 @@ def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
     return data
 
 
-def _expect_files(where: str, name: str, data: Any) -> None:
+def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
     valid = isinstance(data, list | tuple) and all(
         isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
     )
     wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
     _expect(valid, where, f"{name!r} must be {wanted}, got {_described(data)}")
+    return data
 
 
 def require_usable(record: Record) -> None:
@@ -324,8 +320,8 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
     """The scenes of a folder by key, in the index's order, with their chunk files.
 
     They are read from index.json alone where there is one; else chunks are opened.
-    Scenes whose chunk does not exist are counted and named in a warning. Raises FileNotFoundError
-    when no scene is left, ValueError for an index or a chunk that cannot be read.
+    Scenes whose chunk does not exist are left out and logged. Raises FileNotFoundError when no
+    scene is left, ValueError for an index or a chunk that cannot be read.
     """
     if not (folder / INDEX).is_file():
         return _scanned(folder)

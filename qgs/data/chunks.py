@@ -222,7 +222,7 @@ def _folders(path: UPath) -> dict[Split, UPath]:
             f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
         )
     folders: dict[Split, UPath] = {"train": path / "train", "test": path / "test"}
-    found = {split: folder for split, folder in folders.items() if has_chunks(folder)}
+    found: dict[Split, UPath] = {s: inside for s, inside in folders.items() if has_chunks(inside)}
     if not found and has_chunks(path):
         return {"train": path}
     if not found:

@@ -67,8 +67,7 @@ class Dl3dvSource(SceneSource):
 
     Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
     `holdout` asks for any. Intrinsics are those of transforms.json, scaled to the photos' size.
-    Images that do not exist are left out, counted and named in a warning; so are scenes of
-    `test_scenes` that are not there.
+    Images and test scenes that do not exist are left out, counted and named in a warning.
     """
 
     name = "dl3dv"
@@ -113,8 +112,7 @@ def find_scenes(path: UPath) -> dict[str, Place]:
     """The scenes below `path` by name, sorted; archives are not opened.
 
     `path` may be a scene itself. A scene that is there as a folder and as an archive is read from
-    the folder; such scenes are counted and named in a warning. Raises FileNotFoundError when there
-    is none.
+    the folder, which is logged. Raises FileNotFoundError when there is none.
     """
     if not path.exists():
         raise FileNotFoundError(

@@ -49,7 +49,7 @@ class CropResize:
         self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
     ) -> np.ndarray:
         """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel."""
-        return np.array(image.resize(self.target[::-1], kernel, box=self.box))
+        return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
 
 
 @contextmanager
@@ -63,16 +63,13 @@ def _readable(path: Path | UPath, kind: str) -> Iterator[None]:
 
 
 def image_size(path: UPath) -> tuple[int, int]:
-    """(H, W) of an image file, of which only the header is read.
-
-    Raises ValueError for a file that is no image.
-    """
+    """(H, W) in the header of an image file. Raises ValueError for a file that is no image."""
     with _readable(path, "an image"), path.open("rb") as file, Image.open(file) as image:
         return image.height, image.width
 
 
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
-    """The image file as RGB, composited over `background` (in [0, 1]) where it is transparent.
+    """The image file as RGB, over `background` (in [0, 1]) where it is transparent.
 
     Raises ValueError for a file that is no readable image.
     """

@@ -44,10 +44,7 @@ class RadialTangential:
 
 @dataclass(frozen=True)
 class Fisheye:
-    """OpenCV's fisheye model (Kannala and Brandt, 2006), COLMAP's OPENCV_FISHEYE.
-
-    Without coefficients it is the equidistant fisheye, which still bends rays.
-    """
+    """OpenCV's fisheye model (Kannala and Brandt, 2006); equidistant without coefficients."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -78,7 +75,7 @@ def bending(lens: Lens) -> Lens | None:
 def _turn(*coefficients: float) -> float:
     """The least t > 0 at which r (1 + k1 t + k2 t^2 + ...), t = r^2, stops growing with r, or inf.
 
-    Beyond it the polynomial would show the same photo again, mirrored.
+    Beyond it the polynomial shows the same photo again, mirrored.
     """
     slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
     roots = np.roots(slope[::-1])

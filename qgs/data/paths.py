@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Literal
 
 from upath import UPath
 
@@ -27,10 +27,9 @@ _PROTOCOLS = {
 
 
 def opened_path(path: str | Path | UPath) -> UPath:
-    """`path` as a UPath: an fsspec URL such as s3://bucket/folder, or a local path with ~ expanded.
+    """`path` as a UPath: an fsspec URL such as s3://bucket/folder, or a local path without ~.
 
-    A file: URL becomes the plain path it names. Raises ValueError for a URL of an unknown file
-    system or of one whose package is missing.
+    Raises ValueError for a URL of an unknown file system or of one whose package is missing.
     """
     try:
         url = UPath(path)
@@ -106,8 +105,7 @@ open_archive = lru_cache(maxsize=8)(Archive)
 class ArchivePath:
     """A file or folder inside a zip archive, with the part of pathlib's interface readers use.
 
-    archive: the zip file. member: name inside it, "" for its top. Nothing stays open in a copy made
-    by pickling: processes open archives by name.
+    archive: the zip file. member: name inside it, "" for its top.
     """
 
     archive: UPath
@@ -154,12 +152,6 @@ class ArchivePath:
         """The file's bytes. Raises OSError for one that is absent or damaged."""
         return open_archive(self.archive).read(self.member)
 
-    def read_text(self, encoding: str = "utf-8") -> str:
-        """The file's text."""
-        return self.read_bytes().decode(encoding)
-
-    def open(self, mode: str = "rb") -> IO[bytes]:
+    def open(self, mode: Literal["rb"]) -> IO[bytes]:
         """The file, open for reading bytes."""
-        if mode != "rb":
-            raise ValueError(f"files of archives open with mode 'rb', not {mode!r}")
         return io.BytesIO(self.read_bytes())

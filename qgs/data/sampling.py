@@ -43,10 +43,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Batch:
-    """B samples: inputs (B, V_in) and targets (B, V_out), float32 and contiguous.
-
-    scenes, input_frames, target_frames: what they show, sample by sample.
-    """
+    """B samples: inputs (B, V_in) and targets (B, V_out), float32, contiguous; what they show."""
 
     inputs: Views
     targets: Views
@@ -57,14 +54,12 @@ class Batch:
 
 def training_frames(scene: Scene) -> list[int]:
     """The frames that training may see: all but the held-out ones."""
-    held_out = set(scene.held_out)
-    return [frame for frame in range(len(scene)) if frame not in held_out]
+    return sorted({*range(len(scene))} - {*scene.held_out})
 
 
 def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
-    """Smallest and largest gap that `count` frames of `scene` allow.
+    """Smallest and largest gap that `count` frames of `scene` allow; below views.gap is logged.
 
-    Where both lie below views.gap, that is logged once for each scene.
     Raises ValueError when the inputs do not fit into the gap, or the scene has too few frames.
     """
     low, high = views.gap
@@ -73,12 +68,11 @@ def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
             f"views.inputs is {views.inputs}, but views.gap [{low}, {high}] spans only {high + 1} "
             f"frames: raise the upper gap to {views.inputs - 1} or more, or ask for fewer inputs"
         )
-    needed = max(views.inputs, 2)
-    if count < needed:
+    if count < max(views.inputs, 2):
         raise ValueError(
             f"scene {scene!r} has {count} frames for inputs, but views.inputs is {views.inputs} "
-            f"and at least {needed} are needed: use fewer inputs, hold out fewer frames, or drop "
-            "the scene"
+            f"and at least {max(views.inputs, 2)} are needed: use fewer inputs, hold out fewer "
+            "frames, or drop the scene"
         )
     if count - 1 < low:
         warn_once(

@@ -37,9 +37,9 @@ class LazyScenes(Sequence[Scene]):
 class EncodedFrame:
     """A photo as it is stored, and the camera that took it.
 
-    data, mask: bytes of image files; mask None for a frame without one. c2w: (4, 4) float64, OpenCV
-    axes. intrinsics: fx, fy, cx, cy in pixels of the stored photo, whose size is (H, W).
-    lens: None for a pinhole. background: RGB in [0, 1] behind transparent pixels.
+    data, mask: bytes of image files. c2w: (4, 4) float64, OpenCV axes. intrinsics: fx, fy, cx, cy
+    in pixels of the photo, whose size is (H, W). lens: None for a pinhole. background: RGB in
+    [0, 1] behind transparent pixels.
     """
 
     name: str

@@ -1,8 +1,4 @@
-"""Endless training batches by number: order of scenes, samples, processes that decode.
-
-`training_batches` is the way in: it makes batch after batch of a `SampleStream`, in a thread or in
-worker processes.
-"""
+"""Endless training batches by number: order of scenes, samples, processes that decode."""
 
 from __future__ import annotations
 
@@ -56,11 +52,10 @@ def training_batches(
 ) -> Generator[Batch, None, None]:
     """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
-    Each epoch visits every training scene once, in an order of its own that respects
-    `SceneSource.groups`. Sample k of the whole sequence depends on (seed, k) alone. Global batch n
-    is the samples from n * batch_size * processes on, and every process gets its slice: so W
-    processes see together what one with W times the batch size sees, `start` resumes exactly, and
-    the number of workers changes nothing.
+    Each epoch visits every training scene once (see `SceneOrder`). Sample k of the whole sequence
+    depends on (seed, k) alone. Global batch n is the samples from n * batch_size * processes on,
+    and every process gets its slice: so W processes see together what one with W times the batch
+    size sees, `start` resumes exactly, and the number of workers changes nothing.
 
     workers: processes that decode; with 0 the next batch is made in a thread while the caller uses
     this one. Closing the generator ends them.
@@ -130,8 +125,7 @@ class SampleStream:
     def batch(self, numbers: Sequence[int]) -> Batch:
         """The samples of these numbers, counted from 0 over all epochs.
 
-        Raises ValueError for a scene with too few frames, SampleError for frames that cannot be
-        decoded or normalised.
+        Raises ValueError for a scene with too few frames, else SampleError.
         """
         return collate([self._sample(number) for number in numbers])
 
@@ -248,10 +242,7 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
 
 
 def _prepare_worker(number: int) -> None:
-    """Leave stopping to the training process, which closes its workers in an orderly way.
-
-    Terminals and schedulers send their signals to all processes of a job.
-    """
+    """Leave stopping to the training process, though signals go to all processes of a job."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     logging.getLogger("qgs").setLevel(logging.ERROR)  # opening the data has been reported before

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from qgs.composer import RecipeError, resolve
+from qgs.composer.sections import SETTINGS
+from qgs.composer.slots import MOVED
 
 
 def test_overrides_given_as_one_string():
@@ -49,6 +51,38 @@ def test_cycle_is_named_with_its_whole_chain(write):
     assert (problem.file, problem.line, problem.option) == ("c.yaml", 2, "extends")
     assert "a.yaml -> b.yaml -> c.yaml -> a.yaml" in problem.reason
     assert "remove" in problem.fix
+
+
+def test_an_unmet_requirement_names_the_line_of_the_overlay_that_caused_it(write, spatial):
+    write(
+        """
+        recipe: 1
+        plugins: [spatial]
+        model:
+          queries: {type: spatial/placed}
+          decoder: {cross_attention: {type: spatial/near}}
+        """,
+        "base.yaml",
+    )
+    overlay = write("recipe: 1\nextends: base.yaml\nmodel: {queries: {type: qgs/latent}}\n")
+    with pytest.raises(RecipeError) as caught:
+        resolve(overlay)
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line) == ("base.yaml", 5)
+    assert problem.reason.endswith("; model.queries is `qgs/latent` (recipe.yaml:3)")
+    assert problem.fix == "use `spatial/placed` in the slot `queries`"
+
+
+@pytest.mark.parametrize("path", [path for path in MOVED if "." in path])
+def test_keys_that_moved_are_told_where_they_went(path, write):
+    section, key = path.split(".")
+    if key in SETTINGS[section,].model_fields:
+        pytest.skip("it has not moved yet")
+    with pytest.raises(RecipeError) as caught:
+        resolve(write(f"recipe: 1\n{section}: {{{key}: 1}}\n"))
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.option) == (2, path)
+    assert problem.fix == f"write `{MOVED[path]}`"
 
 
 def test_mistake_in_an_extended_file_is_found_there(write):

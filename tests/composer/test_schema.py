@@ -13,7 +13,7 @@ from qgs.composer.registry import available_plugins, load_registry
 from qgs.composer.schema import recipe_schema
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-SHIPPED = ["ellipsoid", "locus"]
+SHIPPED = ["ellipsoid", "locus", "rooms"]
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +26,21 @@ def schema():
 def test_committed_schema_is_fresh(schema):
     committed = json.loads((RECIPES / "recipe.schema.json").read_text())
     assert committed == schema, "run `qgs schema --out recipes/recipe.schema.json`"
+
+
+def undescribed(schema, path=()):
+    """Paths of the properties in `schema` that have no description."""
+    if not isinstance(schema, dict | list):
+        return
+    for key, value in schema.items() if isinstance(schema, dict) else enumerate(schema):
+        below = (*path, str(key))
+        if path and path[-1] == "properties" and not value.get("description"):
+            yield ".".join(below)
+        yield from undescribed(value, below)
+
+
+def test_every_key_is_described(schema):
+    assert list(undescribed(schema)) == []
 
 
 def test_schema_is_a_schema(schema):

@@ -19,7 +19,8 @@ from qgs.components import (
     MultiViewViT,
 )
 from qgs.components.blocks import CrossAttentionCore, split_heads
-from qgs.contracts import MEMORY_FIELDS, AttentionWeights, CrossAttention, Loss
+from qgs.contracts import MEMORY_FIELDS, AttentionWeights, Column, CrossAttention, Loss
+from qgs.metrics import Psnr
 from qgs.types import ImageMemory, LayerPrediction, Rendering, Views
 
 
@@ -106,6 +107,23 @@ class TakesTheWorstView(OneTerm):
 
     def term(self, prediction, rendering, target):
         return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
+
+
+@mutant("metric_gives_its_columns", "the value of '' is not finite")
+class DividesByTheError(Psnr):
+    def forward(self, given):
+        return 1 / (given.images - given.targets.images).square().mean((2, 3, 4))
+
+
+@mutant("metric_gives_its_columns", "it has values for ['', 'lost'], columns for ['']")
+class GivesAValueWithoutColumn(Psnr):
+    def forward(self, given):
+        return {"": super().forward(given), "lost": given.images.mean()}
+
+
+@mutant("truth_scores_best", "lower is better, but PSNR is 100 for the truth")
+class ReversesItsDirection(Psnr):
+    column = Column("PSNR", "lower")
 
 
 @mutant("patch_rays_are_those_of_the_grid", "differ by up to 0.9")

@@ -2,21 +2,13 @@
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from photo_formats import PhotoSet, centred, synthetic, write_blender, write_llff
+from photo_formats import scene as read
 from PIL import Image
-
-from qgs.data import PhotosSource
-from qgs.data.photos.source import PhotoScene
-
-
-def read(folder: Path, size=(30, 40), **options) -> PhotoScene:
-    config = {"path": str(folder), "image_size": size, **options}
-    return PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
 
 
 @pytest.fixture

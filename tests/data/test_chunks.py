@@ -4,7 +4,6 @@ import os
 import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from upath import UPath
 
 from qgs.data.chunk_files import camera_problems, load_chunk, parse_record
 from qgs.data.chunks import ChunksSource
-
-PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 
 
 def encoded(color, size=(64, 36), kind="PNG", **options) -> torch.Tensor:

@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap, write_nerfstudio
 from PIL import Image
 
 from qgs.contracts.component import MissingExtraError
-from qgs.data import PhotosSource
 from qgs.data.paths import opened_path
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import frame_problems
 from qgs.data.photos.reader import PhotoFrame
-from qgs.data.photos.source import PhotoScene
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -32,11 +31,6 @@ CAMERAS = [
     ("SIMPLE_RADIAL_FISHEYE", 8, (50.0, 41.0, 29.0, 0.05)),
     ("RADIAL_FISHEYE", 9, (50.0, 41.0, 29.0, 0.05, -0.02)),
 ]
-
-
-def read(folder: Path, size=SIZE, **options) -> PhotoScene:
-    config = {"path": str(folder), "image_size": size, **options}
-    return PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
 
 
 def frames(folder: Path) -> list[PhotoFrame]:
@@ -65,7 +59,7 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera, kind):
     photos = synthetic(tmp_path / "photos", 2, SIZE)
     for file in photos.files:
         Image.fromarray(colours(directions)).save(file)
-    scene = read(write_colmap(tmp_path, photos, kind, camera))
+    scene = read(write_colmap(tmp_path, photos, kind, camera), SIZE)
     fx, fy, cx, cy = scene.cameras.intrinsics[0].tolist()
     assert [fx, fy, cx, cy] == [lens.focal_length_x, lens.focal_length_y, 41, 29]
     pixels = scene.images([1])[0].mul(255).permute(1, 2, 0).numpy()
@@ -111,7 +105,7 @@ def test_names_in_folders_are_read_in_their_order(tmp_path, kind, model):
             file.rename(tmp_path / file.name)
     else:
         write_colmap(tmp_path, photos, kind, model=model, names=names)
-    scene = read(tmp_path, (30, 40))
+    scene = read(tmp_path)
     ordered = ["left/10.png", "left/2.png", "right/1 a.png"]
     assert [scene.frame_name(i) for i in range(3)] == [f"images/{name}" for name in ordered]
     np.testing.assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)

@@ -1,6 +1,5 @@
 """The same photos through every format: the same pixels, intrinsics and poses."""
 
-import os
 import zipfile
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -9,8 +8,12 @@ import numpy as np
 import pytest
 import torch
 from photo_formats import (
+    PHOTOS,
     PhotoSet,
     centred,
+    opened,
+    real_folder,
+    scene,
     synthetic,
     write_blender,
     write_colmap,
@@ -21,23 +24,17 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data import PhotosSource, read_photos
+from qgs.data import photos as formats
+from qgs.data.photos.reader import Listing, PhotoReader
 from qgs.data.photos.source import PhotoScene
 from qgs.data.scenes import warn_once
 
-PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 REAL = ("mary_rose", "office_walk", "desk")
 
 
 @pytest.fixture(autouse=True)
 def _warnings_are_told_again():
     warn_once.cache_clear()
-
-
-def scene(path: Path, size=(30, 40), **options) -> PhotoScene:
-    config = {"path": str(path), "image_size": size, **options}
-    opened = PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
-    assert isinstance(opened, PhotoScene)
-    return opened
 
 
 def variants(folder: Path, photos: PhotoSet) -> dict[str, PhotoScene]:
@@ -75,9 +72,7 @@ def test_a_synthetic_set(tmp_path):
 
 
 def real(name: str) -> PhotoScene:
-    path = PHOTOS / name
-    if not path.is_dir():
-        pytest.skip(f"{path} is missing; set QGS_PHOTOS to the folder of real photos")
+    path = real_folder(name)
     with Image.open(next((path / "images").iterdir())) as image:
         return scene(path, (image.height, image.width))
 
@@ -101,7 +96,7 @@ def test_real_photos_in_both_of_their_formats(caplog):
     given = real("mary_rose")
     assert "2 formats (nerfstudio: transforms.json, llff: poses_bounds.npy)" in caplog.text
     other = scene(PHOTOS / "mary_rose", given.cameras.size, format="llff")
-    torch.testing.assert_close(other.cameras.c2w, given.cameras.c2w, rtol=0, atol=1e-9)
+    assert torch.equal(other.cameras.c2w, given.cameras.c2w)
     torch.testing.assert_close(
         other.cameras.intrinsics, given.cameras.intrinsics, rtol=0, atol=1e-9
     )
@@ -152,7 +147,7 @@ def test_a_folder_of_scenes(tmp_path, caplog):
     for i, name in enumerate(("b", "a")):
         write_nerfstudio(tmp_path / name, synthetic(tmp_path / "photos" / name, seed=i))
     (tmp_path / "notes").mkdir()
-    source = PhotosSource(PhotosSource.Config.model_validate({"path": str(tmp_path)}))
+    source = opened(tmp_path)
     assert [s.name for s in source.scenes("train")] == ["a", "b"]
     assert [s.name for s in source.scenes("test")[1:]] == ["b"]
     assert "left out: notes, photos" in caplog.text
@@ -164,7 +159,7 @@ def test_scenes_split_by_folder(tmp_path):
     for part, name in (("train", "a"), ("train", "b"), ("test", "c")):
         write_llff(tmp_path / part / name, synthetic(tmp_path / "photos"))
     (tmp_path / "train" / "b" / "images" / "view_001.png").unlink()
-    source = PhotosSource(PhotosSource.Config.model_validate({"path": str(tmp_path)}))
+    source = opened(tmp_path)
     assert [len(source.scenes(split)) for split in ("train", "test")] == [2, 1]
     assert source.scenes("test")[0].name == "c"
     with pytest.raises(ValueError, match=r"6 poses, but .* has 5 images"):
@@ -172,16 +167,30 @@ def test_scenes_split_by_folder(tmp_path):
 
 
 def test_sources_travel_to_workers_without_their_cache(tmp_path):
-    source = PhotosSource(
-        PhotosSource.Config.model_validate(
-            {"path": str(write_llff(tmp_path / "a", synthetic(tmp_path, size=(200, 300))))}
-        )
-    )
+    source = opened(write_llff(tmp_path / "a", synthetic(tmp_path, size=(200, 300))))
     images = source.scenes("train")[0].images(range(6))
     content = ForkingPickler.dumps(source)
     assert len(content) < 20_000
     again = ForkingPickler.loads(content).scenes("train")[0]
     assert torch.equal(again.images(range(6)), images)
+
+
+def test_another_format_is_one_class(tmp_path, monkeypatch):
+    class Csv(PhotoReader):
+        name, listing, poses = "csv", "poses.csv", "opencv"
+
+        @classmethod
+        def read(cls, folder, images):
+            return Listing(folder / cls.listing, [])
+
+    choices = PhotosSource.Config.model_json_schema()["properties"]["format"]["enum"]
+    assert choices == ["auto", *(reader.name for reader in formats.READERS)]
+    monkeypatch.setattr(formats, "READERS", (*formats.READERS, Csv))
+    with pytest.raises(FileNotFoundError, match=r"one of transforms\.json.*poses\.csv \(csv\)"):
+        formats.read_listing(UPath(tmp_path))
+    (tmp_path / "poses.csv").touch()
+    assert formats.formats_of(UPath(tmp_path)) == ["csv"]
+    assert formats.read_listing(UPath(tmp_path)).file.name == "poses.csv"
 
 
 def test_photos_in_memory_and_in_archives(tmp_path):

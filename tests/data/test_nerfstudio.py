@@ -7,27 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from photo_formats import scene as read
 from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
 
 from qgs.contracts import ViewsConfig
-from qgs.data import PhotosSource, read_photos
+from qgs.data import read_photos
 from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
-from qgs.data.photos.checks import (
-    frame_problems,
-    intrinsics_problems,
-    pose_problems,
-    size_problems,
-)
+from qgs.data.photos.checks import frame_problems, intrinsics_problems, pose_problems, size_problems
 from qgs.data.photos.nerfstudio import image_name, read_transforms
-from qgs.data.photos.source import PhotoScene
 from qgs.data.sampling import make_sample
-
-
-def read(folder: Path, size=(30, 40), **options) -> PhotoScene:
-    config = {"path": str(folder), "image_size": size, **options}
-    return PhotosSource(PhotosSource.Config.model_validate(config)).scenes("train")[0]
 
 
 @pytest.fixture

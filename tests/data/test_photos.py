@@ -1,18 +1,17 @@
 import json
 import math
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from photo_formats import real_folder
 from PIL import Image
 
 from qgs.data import PhotosSource, read_photos
 from qgs.data.images import CropResize
 from qgs.data.lenses import RadialTangential
 
-PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
 
@@ -177,11 +176,7 @@ def test_read_photos(tmp_path):
 
 @pytest.mark.parametrize(("name", "count"), [("mary_rose", 69), ("office_walk", 186), ("desk", 7)])
 def test_real_photos(name, count):
-    path = PHOTOS / name
-    if not path.is_dir():
-        pytest.skip(f"{path} is missing; set QGS_PHOTOS to the folder of real photos")
-    source = opened(path)
-    scene = source.scenes("train")[0]
+    scene = opened(real_folder(name)).scenes("train")[0]
     assert len(scene) == count
     assert scene.missing == []
     assert scene.images([0]).shape == (1, 3, 24, 24)

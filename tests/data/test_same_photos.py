@@ -1,13 +1,13 @@
 """The same photos through every format that holds them."""
 
 import io
-import os
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from photo_formats import PHOTOS
 from PIL import Image
 from qgs_datatools import packing
 from upath import UPath
@@ -17,7 +17,6 @@ from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
 from qgs.data.images import to_tensor
 from qgs.data.scenes import EncodedScene
 
-PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[3] / "shared" / "photos"))
 pytestmark = pytest.mark.skipif(
     not (PHOTOS / "desk").is_dir(), reason=f"no photos in {PHOTOS}; QGS_PHOTOS names their folder"
 )
@@ -57,19 +56,6 @@ def test_pixels_masks_intrinsics_and_poses(tmp_path, name, read):
     difference = (before.cameras.intrinsics - after.cameras.intrinsics).abs().max()
     assert difference <= 1e-4  # pixels
     assert (before.cameras.c2w - after.cameras.c2w).abs().max() <= 1e-5
-
-
-def test_a_photo_sets_own_llff_poses():
-    one, other = (
-        PhotosSource(
-            PhotosSource.Config(path=str(PHOTOS / "mary_rose"), format=kind, image_size=SIZE)
-        ).scenes("train")[0]
-        for kind in ("nerfstudio", "llff")
-    )
-    places = {other.frame_name(frame): frame for frame in range(len(other))}
-    order = [places[one.frame_name(frame)] for frame in range(len(one))]
-    assert sorted(order) == list(range(len(other)))
-    assert torch.equal(one.cameras.c2w, other.cameras[order].c2w)
 
 
 @pytest.mark.parametrize(

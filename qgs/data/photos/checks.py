@@ -62,8 +62,7 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
     """What is wrong with fx, fy, cx, cy in pixels of an image of `size` (H, W), where it is known.
 
-    Fatal where they cannot be pixels at all. A principal point off the image and a strange angle of
-    view may be right, and are not.
+    Not fatal are a principal point off the image and a strange angle of view: they may be right.
     """
 
     def problem(reason: str, fix: str, *, fatal: bool = True) -> FrameProblem:
@@ -101,10 +100,7 @@ def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[F
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
-    """What is wrong with an image file of `size` (H, W) listed with another one.
-
-    A scaled copy is right: intrinsics follow its size.
-    """
+    """What is wrong with an image file of `size` (H, W); one scaled to it is right."""
     if listed is None:
         return
     ratio = size[1] * listed[0] / (size[0] * listed[1])
@@ -129,10 +125,7 @@ def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
 
 
 def require_sound(listing: object, frames: Sequence[PhotoFrame]) -> None:
-    """Raise ValueError for the first frame of `listing` that has a fatal problem, naming both.
-
-    Of other problems, the first is logged, with the number of frames that have any.
-    """
+    """Raise ValueError for the first fatal problem, with its frame; log the first other one."""
     doubtful: list[str] = []
     for index, frame in enumerate(frames):
         problems = list(frame_problems(frame))

@@ -61,7 +61,7 @@ class Colmap(PhotoReader):
             )
         read_cameras, read_images = _READ[suffix]
         try:
-            cameras = {number: _camera(*rest) for number, *rest in read_cameras(model)}
+            cameras = {number: _camera(*camera) for number, camera in read_cameras(model)}
             posed = list(read_images(model))
             unknown = {camera for *_, camera in posed} - cameras.keys()
             if unknown:
@@ -90,8 +90,8 @@ def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
                 yield folder / place, suffix
 
 
-Camera: TypeAlias = tuple[int, str, int, int, Sequence[float]]
-"""Number, name of the model, width, height, parameters."""
+Camera: TypeAlias = tuple[int, tuple[str, int, int, Sequence[float]]]
+"""Number, and the name of the model, width, height and parameters."""
 Image: TypeAlias = tuple[str, list[float], int]
 """Name, quaternion (w, x, y, z) with translation (x, y, z), number of the camera."""
 
@@ -99,7 +99,7 @@ Image: TypeAlias = tuple[str, list[float], int]
 def _text_cameras(model: UPath) -> Iterator[Camera]:
     for line in _lines(model / "cameras.txt"):
         number, name, width, height, *parameters = line.split()
-        yield int(number), name, int(width), int(height), [*map(float, parameters)]
+        yield int(number), (name, int(width), int(height), [*map(float, parameters)])
 
 
 def _text_images(model: UPath) -> Iterator[Image]:
@@ -130,7 +130,8 @@ def _binary_cameras(model: UPath) -> Iterator[Camera]:
         for _ in range(_unpacked("<Q", file)[0]):
             number, kind, width, height = _unpacked("<IiQQ", file)
             name = pycolmap.CameraModelId(kind).name
-            yield number, name, width, height, _unpacked(f"<{len(_parameters(name))}d", file)
+            parameters = _unpacked(f"<{len(_parameters(name))}d", file)
+            yield number, (name, width, height, parameters)
 
 
 def _binary_images(model: UPath) -> Iterator[Image]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import PurePosixPath
 from typing import Any, TypeVar
 
@@ -65,7 +65,7 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
     that is no JSON or lists no frames, and for a split that names a file that no frame has.
     """
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        data = json.loads(file.read_bytes())  # with or without a byte order mark
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} is not valid JSON: {error}; export it again") from error
     entries = data.get("frames") if isinstance(data, Mapping) else None
@@ -192,10 +192,8 @@ def _lens(values: Mapping[str, Any]) -> Lens | None:
             reason = f"{key!r} is set, which belongs to another camera model"
             fix = "undistort the photos first, or export without it"
             raise _UnreadableError("lens", reason, fix)
-    if fisheye:
-        return Fisheye(*(_coefficient(values, key) for key in ("k1", "k2", "k3", "k4")))
-    keys = ("k1", "k2", "p1", "p2", "k3")
-    return bending(RadialTangential(*(_coefficient(values, key) for key in keys)))
+    kind = Fisheye if fisheye else RadialTangential
+    return bending(kind(**{field.name: _coefficient(values, field.name) for field in fields(kind)}))
 
 
 def _coefficient(values: Mapping[str, Any], key: str) -> float:

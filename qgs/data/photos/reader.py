@@ -23,12 +23,11 @@ _COPY = re.compile(r"images(_\d+)?")
 class PhotoFrame:
     """One photo as listed; nothing of it is judged yet (see `qgs.data.photos.checks`).
 
-    name: the image file relative to the scene's folder. path: that file; mask, depth: those that go
-    with it. A mask that is the image itself is its alpha channel. c2w: (4, 4) float64 OpenCV
-    camera-to-world. intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the
-    file where the listing gives no size. lens: None for a pinhole. split: what the listing uses it
-    for; None where it says nothing. problems: what the listing says that cannot be read; a pose or
-    intrinsics concerned are NaN.
+    name: the image file relative to the scene's folder. path: that file. mask: its mask; the image
+    itself for its alpha channel. depth: its depth map. c2w: (4, 4) float64 OpenCV camera-to-world.
+    intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the file where the
+    listing gives no size. lens: None for a pinhole. split: as listed, None without splits.
+    problems: what the listing says that cannot be read; a pose or intrinsics concerned are NaN.
     """
 
     name: str

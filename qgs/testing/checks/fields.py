@@ -10,13 +10,13 @@ from torch import Tensor
 from qgs.components import LatentQueries
 from qgs.composer import RecipeError
 from qgs.composer.recipe import Recipe, resolve
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, slot_at
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Fields, Loss, Plugin
 from qgs.testing.case import Case, expect
 from qgs.testing.inputs import Maker, Sizes, inputs_of, required_fields
 from qgs.testing.modules import each_mode, seeded
 from qgs.testing.recording import Reads, recorded
-from qgs.testing.registry import MODULES, STATEFUL, check
+from qgs.testing.registry import ALL_SLOTS, MODULES, STATEFUL, check
 from qgs.testing.trees import described, not_finite, scalar
 from qgs.types import QueryState, map_tensors
 
@@ -120,7 +120,7 @@ def _same(one: Tensor, other: Tensor) -> bool:
     return one is other or (one.data_ptr() == other.data_ptr() and one.shape == other.shape)
 
 
-@check(MODULES - {"renderer"})
+@check(ALL_SLOTS)
 def check_unmet_requirement_fails_at_compose(case: Case) -> None:
     """A recipe that lacks one thing a component needs is refused by name; one with all runs."""
     needed = required_fields(case)
@@ -130,7 +130,8 @@ def check_unmet_requirement_fails_at_compose(case: Case) -> None:
         expect(missing in refusal, f"the refusal does not name the missing {missing}: {refusal}")
     refusal = _refusal(case, needed)
     expect(not refusal, f"a recipe that gives it all it requires is refused: {refusal}")
-    run_training_step(_resolved(case, needed), case)
+    if case.slot in MODULES - {"renderer"}:
+        run_training_step(_resolved(case, needed), case)
 
 
 def _refusal(case: Case, given: Fields) -> str:
@@ -191,10 +192,10 @@ def _recipe_with(case: Case) -> dict[str, Any]:
         model["decoder"][slot] = chosen
     elif slot in MODEL_SLOTS:
         model[slot] = chosen
-    elif slot_at((slot,)):
-        recipe[slot] = chosen
-    else:  # a section of components by name, such as losses
+    elif SECTIONS[slot].named:
         recipe[slot] = {**recipe.get(slot, {}), "case": chosen}
+    else:
+        recipe[slot] = chosen
     return recipe
 
 

@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.contracts import AttentionWeights, Loss
+from qgs.contracts import AttentionWeights, Loss, Metric, MetricInput
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.testing.case import CannotCheck, Case, expect
-from qgs.testing.inputs import Inputs, Sizes, inputs_of
+from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of
 from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import check
-from qgs.testing.trees import described, difference, mapped
+from qgs.testing.trees import cloned, described, difference, mapped, not_finite
 from qgs.types import GaussianAttributes, ImageMemory, Views, map_tensors
 
 FACTORS = (0.0, 1.0, 100.0)
@@ -158,6 +158,66 @@ def check_renderings_as_declared(case: Case) -> None:
 
 def _mean(one: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: (one[name] + other[name]) / 2 for name in one}
+
+
+@check({"metrics"})
+def check_metric_gives_its_columns(case: Case) -> None:
+    """Given what it `needs` and no more, a metric has a finite value for each of its columns.
+
+    The same each time; it changes nothing that it is given.
+    """
+    module = _metric(case)
+    for noise in (0.0, 0.2):
+        given = _metric_input(case, noise)
+        before = cloned(given)
+        values, again = (_values(module, given) for _ in range(2))
+        keys = sorted(module.columns())
+        expect(sorted(values) == keys, f"it has values for {sorted(values)}, columns for {keys}")
+        broken = not_finite(values)
+        expect(not broken, f"the value of {', '.join(map(repr, broken))} is not finite")
+        expect(not difference(values, again), f"the second time {difference(values, again)}")
+        found = difference(before, given)
+        expect(not found, f"it changes what it is given: {found}")
+
+
+@check({"metrics"})
+def check_truth_scores_best(case: Case) -> None:
+    """What equals the true images scores no worse than what does not, as `better` says."""
+    module = _metric(case)
+    true, false = (_values(module, _metric_input(case, noise)) for noise in (0.0, 0.2))
+    for key, column in module.columns().items():
+        pair = true[key].mean().item(), false[key].mean().item()
+        seen = f"{column.heading} is {pair[0]:.4g} for the truth, {pair[1]:.4g} for a noisy image"
+        expect(column.best(pair) == pair[0], f"{column.better} is better, but {seen}")
+
+
+def _metric(case: Case) -> Metric:
+    module = case.build()
+    if module.unavailable:
+        raise CannotCheck(module.unavailable)
+    return module.eval()
+
+
+def _metric_input(case: Case, noise: float) -> MetricInput:
+    """True views, and images and depth that are off by `noise`; only what the metric needs."""
+    maker = Maker(case, Sizes(batch=1), torch.Generator().manual_seed(0))
+    needs, target = case.component.needs, maker.target()
+    depth = maker.uniform(1, 2, 1, 2, 1, *maker.image)
+    off = noise * maker.normal(*target.images.shape)
+    return MetricInput(
+        images=target.images + off,
+        targets=target if "masks" in needs else replace(target, masks=None),
+        gaussians=maker.gaussians() if "gaussians" in needs else None,
+        gaussians_per_query=2,
+        depth=depth + off[:, :, :1] if "depth" in needs else None,
+        true_depth=depth if "true_depth" in needs else None,
+    )
+
+
+def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
+    with torch.no_grad():
+        values = module(given)
+    return {"": values} if isinstance(values, Tensor) else dict(values)
 
 
 @check({"encoder"})
