@@ -36,7 +36,7 @@ def test_slots_and_their_defaults() -> None:
 
 def test_commands() -> None:
     shown = re.findall(r"^\| `qgs ([\w-]+)", section("On the command line"), re.MULTILINE)
-    assert set(shown) == {*COMMANDS, *(entry.name for entry in entry_points(group=GROUP))}
+    assert set(shown) == {*COMMANDS, *entry_points(group=GROUP).names}
 
 
 def test_paths_exist() -> None:
