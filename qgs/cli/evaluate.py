@@ -107,7 +107,7 @@ def evaluate(
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
         console.print(hint, soft_wrap=True, markup=False)
-    if strict and not evaluation.is_complete:
+    if strict and evaluation.missing:
         raise typer.Exit(1)
 
 

@@ -7,6 +7,7 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from operator import truediv
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ KIND = "qgs bench"
 
 @dataclass(frozen=True)
 class Spread:
-    """Samples, their median and their lower and upper quartile (linear interpolation)."""
+    """Samples and their quartiles (linear interpolation)."""
 
     samples: tuple[float, ...]
 
@@ -36,13 +37,13 @@ class Spread:
 
     def over(self, base: Spread) -> Spread:
         """Ratios to the samples that `base` has of the same rounds."""
-        pairs = zip(self.samples, base.samples, strict=True)
-        return Spread(tuple(ours / theirs for ours, theirs in pairs))
+        return Spread(tuple(map(truediv, self.samples, base.samples)))
 
     def as_json(self) -> dict[str, float]:
         """The quartiles by name."""
-        lower, median, upper = self.quartiles
-        return {"lower_quartile": lower, "median": median, "upper_quartile": upper}
+        return dict(
+            zip(("lower_quartile", "median", "upper_quartile"), self.quartiles, strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -69,14 +70,16 @@ class Result:
 
     def as_json(self, base: Result) -> dict[str, Any]:
         """Everything, each sample included; seconds, bytes, and ratios to `base`."""
-        ratio = self.parameters / base.parameters
-        sizes = {"count": self.parameters, "weight_bytes": self.weight_bytes, "ratio": ratio}
         return {
             "recipe": self.recipe,
             **asdict(self.workload),
             "queries": self.queries,
             "gaussians": self.gaussians,
-            "parameters": sizes,
+            "parameters": {
+                "count": self.parameters,
+                "weight_bytes": self.weight_bytes,
+                "ratio": self.parameters / base.parameters,
+            },
             "seconds": {
                 operation: {
                     **spread.as_json(),
@@ -94,7 +97,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Report:
-    """All results, the first of which the others are compared with. machine: see `describe`."""
+    """All results, the first of which the others are compared with. machine: names, versions."""
 
     results: Sequence[Result]
     machine: Mapping[str, str | int]
@@ -104,18 +107,23 @@ class Report:
 
     def write(self, path: str | Path) -> None:
         """Write the report as JSON, whole or not at all."""
-        settings = {"overrides": [*self.overrides], "rounds": self.rounds, "warmup": self.warmup}
-        recipes = [result.as_json(self.results[0]) for result in self.results]
-        report = {"report": KIND, "machine": dict(self.machine), **settings, "recipes": recipes}
+        report = {
+            "report": KIND,
+            "machine": dict(self.machine),
+            "overrides": list(self.overrides),
+            "rounds": self.rounds,
+            "warmup": self.warmup,
+            "recipes": [result.as_json(self.results[0]) for result in self.results],
+        }
         write_text(path, json.dumps(report, indent=2) + "\n")
 
 
 def refuse_other_file(path: Path) -> None:
     """Raise FileExistsError when `path` holds anything but an earlier report."""
-    if not path.exists():
-        return
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return
     except (OSError, ValueError):
         found = None
     if not isinstance(found, dict) or found.get("report") != KIND:
@@ -137,31 +145,29 @@ def bench(
 ) -> Report:
     """Measure size and forward latency of all `subjects`, which share device and precision.
 
-    All models are in memory while latencies are measured, so that each round has all of them. They
-    have their initial weights. step, memory, renderer: what is measured besides. rounds: samples of
-    each latency. warmup: calls before the first sample. overrides: what the report says of them.
-    `say` hears what is under way. Raises ValueError as the models, losses and renderers do,
+    All models, with initial weights, are in memory while latencies are measured, so that each round
+    has all of them. step, memory, renderer: what is measured besides. rounds: samples of each
+    latency. warmup: calls before the first sample. overrides: what the report says of them. `say`
+    hears what is under way. Raises ValueError as the models, losses and renderers do,
     ChildProcessError as `peak_memory`.
     """
     threads = torch.get_num_threads()
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
     peaks: list[dict[Operation, Peak]] = [{} for _ in subjects]
-    for subject, found in zip(subjects, peaks, strict=True):
+    for s, found in zip(subjects, peaks, strict=True):
         for operation in operations if memory else ():
-            say(f"{subject.name}: memory of the {operation}")
-            found[operation] = peak_memory(subject.recipe, operation, subject.workload, threads)
+            say(f"{s.name}: memory of the {operation}")
+            found[operation] = peak_memory(s.recipe, operation, s.workload, threads)
     if renderer:
         operations.insert(1, "render")  # the step is last, because it changes weights
     models = [subject.recipe.build_model(subject.workload.device) for subject in subjects]
     times: list[dict[Operation, Spread]] = [{} for _ in subjects]
     for operation in operations:
-        tasks = [
-            make_task(operation, subject.recipe, model, subject.workload)
-            for subject, model in zip(subjects, models, strict=True)
-        ]
+        pairs = zip(subjects, models, strict=True)
+        tasks = [make_task(operation, s.recipe, model, s.workload) for s, model in pairs]
         spreads = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
-        for column, spread in zip(times, spreads, strict=True):
-            column[operation] = spread
+        for found, spread in zip(times, spreads, strict=True):
+            found[operation] = spread
     results = [
         Result(
             recipe=subject.name,
@@ -175,7 +181,17 @@ def bench(
         )
         for subject, model, seconds, peak in zip(subjects, models, times, peaks, strict=True)
     ]
-    machine = describe(subjects[0].workload.device, threads)
+    device = subjects[0].workload.device
+    machine = {
+        "device": device,
+        "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
+        "cores": os.cpu_count() or 0,
+        "threads": threads,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "qgs": qgs.__version__,
+    }
     return Report(results, machine, overrides, rounds, warmup)
 
 
@@ -188,8 +204,7 @@ def in_turn(
 ) -> list[Spread]:
     """Seconds of each task: `warmup` calls of each unmeasured, then all of them in every round.
 
-    The clock is that of torch.utils.benchmark, which waits for a GPU. `say` hears of each round,
-    with `label` before.
+    torch.utils.benchmark's clock waits for a GPU. `say` hears of each round, after `label`.
     """
     for number in range(warmup):
         say(f"{label}warm-up {number + 1} of {warmup}")
@@ -205,22 +220,7 @@ def in_turn(
     return [Spread(tuple(column)) for column in columns]
 
 
-def describe(device: str, threads: int) -> dict[str, str | int]:
-    """Names and versions without which a number says nothing."""
-    return {
-        "device": device,
-        "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
-        "cores": os.cpu_count() or 0,
-        "threads": threads,
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "qgs": qgs.__version__,
-    }
-
-
 def _processor() -> str:
-    """The CPU's name, where the system gives it."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -68,9 +68,8 @@ def workload_of(
             "the recipe has no data.image_size, so the size of the photos is not known; "
             "give one with --size HxW, such as --size 256x256"
         )
-    return Workload(
-        views or recipe.views.inputs, recipe.views.targets, size, batch, device, precision
-    )
+    inputs = views or recipe.views.inputs
+    return Workload(inputs, recipe.views.targets, size, batch, device, precision)
 
 
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
@@ -106,7 +105,19 @@ def make_task(
     """
     inputs, targets = workload.inputs(), workload.supervision()
     if operation == "step":
-        return _step(recipe, model.train(), inputs, targets, workload)
+        losses, render_views = recipe.build_losses(), recipe.training.render_views
+        objective = Objective(model.train(), losses, render_views).to(workload.device)
+        optimizer = make_optimizer(objective, recipe.build_optimizer())
+
+        def step() -> None:
+            optimizer.zero_grad(set_to_none=True)
+            with workload.autocast():
+                outcome = objective(inputs, targets)
+            outcome.total.backward()
+            nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
+            optimizer.step()
+
+        return step
     model.eval()
 
     @torch.inference_mode()
@@ -118,21 +129,3 @@ def make_task(
         return forward
     gaussians = forward()
     return torch.inference_mode()(lambda: model.render(gaussians, targets.cameras))
-
-
-def _step(
-    recipe: Recipe, model: QueryGaussianModel, inputs: Views, targets: Views, workload: Workload
-) -> Task:
-    losses, render_views = recipe.build_losses(), recipe.training.render_views
-    objective = Objective(model, losses, render_views).to(workload.device)
-    optimizer = make_optimizer(objective, recipe.build_optimizer())
-
-    def step() -> None:
-        optimizer.zero_grad(set_to_none=True)
-        with workload.autocast():
-            outcome = objective(inputs, targets)
-        outcome.total.backward()
-        nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
-        optimizer.step()
-
-    return step
