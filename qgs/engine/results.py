@@ -275,7 +275,7 @@ def print_table(
     """Print rows, headers first; numbers to the right. options: of rich's Table."""
     table = Table(title=escape(title) or None, title_justify="left", **options)
     for place, header in enumerate(rows[0]):
-        table.add_column(header, justify="right" if place else "left")
+        table.add_column(header, justify="right" if place else "left", overflow="fold")
     for row in rows[1:]:
         table.add_row(*row)
     console.print(table)
