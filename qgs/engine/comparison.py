@@ -60,22 +60,13 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The first results against others. shared: the scenes that both judged."""
+    """Two results. shared: the scenes that both judged. moved: those on different frames."""
 
     first: StoredResults
     second: StoredResults
     shared: Sequence[str]
+    moved: Sequence[str]
     differences: Sequence[Difference]
-
-    @property
-    def same_protocol(self) -> bool:
-        """Whether both were judged alike."""
-        return self.first.sha256 == self.second.sha256
-
-    @property
-    def other_frames(self) -> list[str]:
-        """Shared scenes that were judged on different frames."""
-        return [name for name in self.shared if self.first.frames[name] != self.second.frames[name]]
 
     def record(self) -> dict[str, Any]:
         """Plain values for JSON. empty: headings of metrics that have no scene in both."""
@@ -85,8 +76,8 @@ class Comparison:
         return {
             "first": first.name,
             "second": second.name,
-            "same_protocol": self.same_protocol,
-            "other_frames": self.other_frames,
+            "same_protocol": first.sha256 == second.sha256,
+            "other_frames": list(self.moved),
             "differences": [asdict(difference) for difference in self.differences],
             "wanted": max(first.wanted, second.wanted),
             "missing_first": list(first.missing),
@@ -110,8 +101,7 @@ class Comparison:
 
     def rows(self) -> list[list[str]]:
         """The table, headers first."""
-        interval = f"{100 * CONFIDENCE:.0f} % interval"
-        header = ["metric", "first", "second", "difference", interval, "won : lost"]
+        header = ["metric", "first", "second", "difference", "95 % interval", "won : lost"]
         return [header, *(difference.cells() for difference in self.differences)]
 
     def notes(self) -> Iterator[str]:
@@ -138,15 +128,15 @@ class Comparison:
                 yield f"{d.column.heading} in {first.name} is {other} in {second.name}"
         if facts["empty"]:
             yield f"not in both, left out: {', '.join(facts['empty'])}"
-        if not self.same_protocol:
+        if not facts["same_protocol"]:
             yield "the protocols differ: the scores do not measure the same"
-        if moved := self.other_frames:
-            yield f"{len(moved)} scenes judged on different frames: {listed(moved)}"
+        if self.moved:
+            yield f"{len(self.moved)} scenes judged on different frames: {listed(self.moved)}"
 
 
 @dataclass(frozen=True)
 class Comparisons:
-    """Results against each of others. protocols: result to the name and hash of its protocol."""
+    """The first results against each other. protocols: result to its protocol's name and hash."""
 
     protocols: Mapping[str, str]
     pairs: Sequence[Comparison]
@@ -185,9 +175,8 @@ class Comparisons:
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Comparisons:
     """Compare the first of `results` with each of the others.
 
-    Raises ValueError for fewer than two, for one folder twice, for results without a scene in
-    common, and unless `across_protocols` for results of different protocols and for scenes that
-    were judged on different frames.
+    Raises ValueError for fewer than two, one folder twice and no scene in common, and unless
+    `across_protocols` for different protocols and scenes judged on different frames.
     """
     names = [result.name for result in results]
     if len(names) < 2 or len(set(names)) < len(names):
@@ -207,17 +196,16 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         shared = [name for name in first.scenes if name in other.scenes]
         if not shared:
             raise ValueError(f"{first.name} and {other.name} have no scene in common")
+        moved = [name for name in shared if first.frames[name] != other.frames[name]]
+        if moved and not across_protocols:
+            raise ValueError(
+                f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, "
+                f"although their protocols agree: {listed(moved)}. The data, or how views are "
+                "drawn, changed between them: evaluate both again, or add --across-protocols"
+            )
         metrics = [name for name in first.columns if name in other.columns]
         found = (_difference(metric, first, other, shared) for metric in metrics)
-        pair = Comparison(first, other, shared, [d for d in found if d])
-        if pair.other_frames and not across_protocols:
-            raise ValueError(
-                f"{first.name} and {other.name} judged {len(pair.other_frames)} scenes on "
-                f"different frames, although their protocols agree: {listed(pair.other_frames)}. "
-                "The data, or how views are drawn, changed between them: evaluate both again, or "
-                "add --across-protocols"
-            )
-        pairs.append(pair)
+        pairs.append(Comparison(first, other, shared, moved, [d for d in found if d]))
     protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
     return Comparisons(protocols, pairs)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -17,7 +18,8 @@ from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
-from qgs.metrics import gaussians_used, mean_colour, nearest_input
+from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.dispersion import gaussians_used
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
@@ -125,12 +127,9 @@ class _Judge:
     @torch.no_grad()
     def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
         if len(samples) > 1 and not self._tune:
-            try:
+            with suppress(Exception):  # otherwise each runs by itself, to see which one fails
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
                 gaussians = self._model(inputs).gaussians
-            except Exception:  # run each by itself, to see which one fails
-                pass
-            else:
                 return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
         return [self._score(sample) for sample in samples]
 

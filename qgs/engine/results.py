@@ -21,7 +21,7 @@ from qgs.data.sampling import Frames
 from qgs.engine.protocol import Protocol
 from qgs.io.differences import listed
 from qgs.io.files import write_text
-from qgs.metrics import OPACITY_USED
+from qgs.metrics.dispersion import OPACITY_USED
 
 METHODS = ("model", "nearest_input", "mean_colour")
 TUNING = ("tuning_loss_before", "tuning_loss_after")
@@ -104,12 +104,9 @@ class Evaluation:
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
         values = {name: self._values(f"model_{name}") for name in self.columns}
+        p = self.protocol
         return {
-            "protocol": {
-                "name": self.protocol.name,
-                "sha256": self.protocol.sha256,
-                "settings": self.protocol.settings(),
-            },
+            "protocol": {"name": p.name, "sha256": p.sha256, "settings": p.settings()},
             "step": self.step,
             "statement": self.statement,
             "scenes": len(self.scores),
@@ -216,12 +213,10 @@ class Evaluation:
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_MOST_MISSING])
         if len(self.missing) > _MOST_MISSING:
             yield f"{len(self.missing) - _MOST_MISSING} more missing scenes are in scenes.csv"
-        for names, what in (
-            (self.null, "null entries of the index"),
-            (self.unlisted, "scenes of the data that the index lacks"),
-        ):
-            if names:
-                yield f"{what}, not judged ({len(names)}): {listed(names)}"
+        if null := self.null:
+            yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
+        if names := self.unlisted:
+            yield f"scenes that the index lacks, not judged ({len(names)}): {listed(names)}"
         if given := [score for score in self.scores if score.given]:
             named = [f"{score.scene} ({' '.join(map(str, score.given))})" for score in given]
             yield (
