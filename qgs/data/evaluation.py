@@ -194,10 +194,8 @@ def one_line(error: Exception) -> str:
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
     """Input and target frames such that every held-out frame is a target once.
 
-    For the first held-out frame not yet covered, a window of the largest gap (counted in training
-    frames) is centred on it and shifted to lie within the scene; the inputs are evenly spaced in
-    it. Its targets are the held-out frames of the window's span that are not yet covered, and the
-    frame itself.
+    A window of the largest gap (in training frames) is centred on the first held-out frame not yet
+    covered and shifted into the scene, inputs evenly spaced; all such frames within are targets.
     """
     usable = np.array(training_frames(scene))
     gap = gap_range(len(usable), views, scene.name)[1]

@@ -19,7 +19,7 @@ from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
 from qgs.metrics.baselines import mean_colour, nearest_input
-from qgs.metrics.dispersion import gaussians_used
+from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
@@ -98,7 +98,6 @@ class _Judge:
                 self.columns[name], self._owners[name] = column, metric
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
-        """Values that some scenes or all lack, and why."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:
@@ -136,7 +135,6 @@ class _Judge:
     def _score(
         self, sample: Sample, gaussians: Gaussians | None = None
     ) -> SceneScore | SceneFailure:
-        """The score of `sample`. gaussians: (1, G), None to predict or tune them here."""
         values: dict[str, float] = {}
         try:
             inputs = sample.inputs.to(self._device)
@@ -155,7 +153,6 @@ class _Judge:
         return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
 
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
-        """Everything measured on the Gaussians (1, G) of `sample`."""
         targets = sample.targets.to(self._device)
         rendering = self._model.render(gaussians, targets.cameras)
         depth = true_depth(self._source, sample) if "true_depth" in self._needed else None
@@ -177,7 +174,7 @@ class _Judge:
             found = found if isinstance(found, Mapping) else {"": found}
             for key in metric.columns():
                 values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
-        return {**values, "gaussians_used": float(gaussians_used(gaussians.opacities))}
+        return {**values, "gaussians_used": float((gaussians.opacities > OPACITY_USED).sum())}
 
 
 def _name(metric: str, key: str) -> str:

@@ -66,8 +66,7 @@ def workload_of(
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
     """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point.
 
-    The first camera is the identity, as pose normalisation leaves it; the field of view is some 53
-    degrees across the longer side.
+    The first is the identity; the field of view is some 53 degrees across the longer side.
     """
     generator = torch.Generator().manual_seed(seed)
     images = torch.rand(batch, count, 3, *size, generator=generator)
@@ -90,9 +89,8 @@ def make_task(
 ) -> Task:
     """`operation` as a call without arguments that leaves nothing behind but changed weights.
 
-    forward: photos to the Gaussians of the last layer, no gradients. render: those Gaussians from
-    the cameras of the targets, no gradients. step: forward, every supervised layer rendered,
-    losses, backward, clipped gradients, an optimiser step.
+    forward: photos to the last layer's Gaussians, no gradients. render: those Gaussians at the
+    targets' cameras, no gradients. step: a whole training step.
     """
     inputs, targets = workload.inputs(), workload.supervision()
     if operation == "step":
