@@ -138,12 +138,11 @@ class _Judge:
         values: dict[str, float] = {}
         try:
             inputs = sample.inputs.to(self._device)
-            if gaussians is None and self._tune:
+            if self._tune:
                 tuning = self._tune(inputs)
                 gaussians = tuning.prediction.gaussians
                 values = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            elif gaussians is None:
-                gaussians = self._model(inputs).gaussians
+            gaussians = gaussians or self._model(inputs).gaussians
             values = {**self._values(sample, inputs, gaussians), **values}
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
