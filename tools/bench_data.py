@@ -33,16 +33,17 @@ import numpy as np
 import torch
 from PIL import Image
 from process_memory import megabytes
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from qgs_datatools.entries import chunk_entry
 from upath import UPath
 
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene
+from qgs.data.scenes import EncodedFrame, EncodedScene
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.objective import Gradients, Objective
+from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
+from qgs.engine.training import compute_gradients
 from qgs.io.files import opened_replacing, write_bytes
 
 TINY = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
@@ -162,14 +163,14 @@ def loaded_over_consumed(recipe: Recipe, workers: int) -> float:
 def _training_step(recipe: Recipe) -> Callable[[], None]:
     torch.set_num_threads(2)
     objective = Objective(recipe.build_model().train(), recipe.build_losses(), 0)
-    optimizer = make_optimizer(objective, recipe.training)
-    gradients = Gradients(make_accelerator("cpu"), objective, recipe.training)
+    optimizer = make_optimizer(objective, recipe.build_optimizer())
+    accelerator = make_accelerator("cpu")
     with closing(training_batches(recipe.build_data(), recipe.views, 2, 0)) as stream:
         batch = next(stream)
 
     def step() -> None:
         optimizer.zero_grad()
-        gradients.compute([batch])
+        compute_gradients(accelerator, objective, recipe.training, [batch])
         optimizer.step()
 
     step()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from inspect import cleandoc
 from typing import Any
 
 from rich.console import Group
@@ -13,12 +12,12 @@ from rich.table import Table
 from qgs.composer.errors import did_you_mean
 from qgs.composer.registry import Registry, default_config
 from qgs.composer.schema import recipe_schema
+from qgs.composer.sections import SETTINGS
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
+from qgs.composer.yaml_text import inline
 from qgs.contracts import Component, ComponentConfig, Fields
-from qgs.io.differences import one_line
 
-SETTINGS = ("recipe", "model", "model.decoder", "views", "training", "evaluation")
-"""Sections of a recipe that hold options besides components; `recipe` stands for its top level."""
+Schema = Mapping[str, Any]
 
 _WORDS = {"string": "text", "boolean": "true or false", "object": "mapping"}
 _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
@@ -26,30 +25,31 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 
 def overview(registry: Registry) -> Iterator[Table]:
     """One table per slot: installed components, what they are, where they come from."""
-    for slot in SLOTS:
-        default = f" (default {SLOTS[slot].default})" if SLOTS[slot].default else ""
-        table = Table(title=recipe_path(slot) + default, title_justify="left")
+    definitions = recipe_schema(registry)["$defs"]
+    for name, slot in SLOTS.items():
+        default = f" (default {slot.default})" if slot.default else ""
+        table = Table(title=recipe_path(name) + default, title_justify="left")
         for column in ("type", "meaning", "origin"):
             table.add_column(column, overflow="fold")
-        for kind, component in registry.components(slot).items():
-            origin = registry.plugins[kind.split("/")[0]].released_as
-            table.add_row(escape(kind), _first_paragraph(component.__doc__), escape(origin))
+        for kind, schema in _by_type(definitions[name]).items():
+            table.add_row(*map(escape, (kind, schema["description"], _release(kind, registry))))
         yield table
 
 
 def details(name: str, registry: Registry) -> Iterator[Group]:
     """The options of a component (`qgs/latent`), of all in a slot, or of a section of settings.
 
-    Raises ValueError when `name` is none of these.
+    The name `recipe` stands for the settings at the top of a recipe. Raises ValueError for a name
+    that is none of these.
     """
     schema = recipe_schema(registry)
-    if name in SETTINGS:
-        for key in name.split(".") if name != "recipe" else ():
+    settings = {".".join(path) or "recipe": path for path in SETTINGS}
+    if name in settings:
+        for key in settings[name]:
             schema = schema["properties"][key]
-        options = {k: option for k, option in schema["properties"].items() if _is_setting(option)}
-        yield Group(
-            f"[bold]{name}[/bold]", _first_paragraph(schema.get("description")), _options(options)
-        )
+        options = {key: schema["properties"][key] for key in SETTINGS[settings[name]].model_fields}
+        about = schema.get("description", "")
+        yield Group(f"[bold]{name}[/bold]", escape(about), _options(options))
         return
     slot = name.removeprefix("model.").removeprefix("decoder.")
     shown = [
@@ -59,18 +59,25 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
         if name == kind or slot == place
     ]
     if not shown:
-        known = [*SLOTS, *SETTINGS, *(k for place in SLOTS for k in registry.components(place))]
+        known = [*SLOTS, *settings, *(k for place in SLOTS for k in registry.components(place))]
         raise ValueError(
             f"there is no slot, component or section `{name}`; {did_you_mean(name, known, 'names')}"
         )
     for place, kind, component in shown:
-        written = {o["properties"]["type"]["const"]: o for o in schema["$defs"][place]["anyOf"]}
-        options = {k: o for k, o in written[kind]["properties"].items() if k != "type"}
-        origin = registry.plugins[kind.split("/")[0]].released_as
-        heading = f"[bold]{recipe_path(place)}: {escape(kind)}[/bold], {escape(origin)}"
-        yield Group(
-            heading, _first_paragraph(component.__doc__), _options(options), *_fields(component), ""
-        )
+        written = _by_type(schema["$defs"][place])[kind]
+        options = {key: option for key, option in written["properties"].items() if key != "type"}
+        heading = f"{recipe_path(place)}: {kind}, {_release(kind, registry)}"
+        about = (f"[bold]{escape(heading)}[/bold]", escape(written["description"]))
+        yield Group(*about, _options(options), *_fields(component), "")
+
+
+def _by_type(definition: Schema) -> dict[str, Schema]:
+    """The components of a slot's JSON Schema by their `type`."""
+    return {one["properties"]["type"]["const"]: one for one in definition["anyOf"]}
+
+
+def _release(kind: str, registry: Registry) -> str:
+    return registry.plugins[kind.split("/")[0]].released_as
 
 
 def recipe_path(slot: str) -> str:
@@ -80,11 +87,7 @@ def recipe_path(slot: str) -> str:
     return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
 
 
-def _first_paragraph(docstring: str | None) -> str:
-    return escape(" ".join(cleandoc(docstring or "").partition("\n\n")[0].split()))
-
-
-def _options(properties: Mapping[str, Any]) -> Table | str:
+def _options(properties: Mapping[str, Schema]) -> Table | str:
     """A table of options, given as properties of a JSON Schema."""
     if not properties:
         return "  no options"
@@ -96,28 +99,23 @@ def _options(properties: Mapping[str, Any]) -> Table | str:
     return table
 
 
-def _rows(properties: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, ...]]:
+def _rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
     """An option a row; those inside a mapping follow it, `option.inner`."""
     for name, option in properties.items():
-        default = one_line(option["default"]) if "default" in option else "required"
+        default = inline(option["default"]) if "default" in option else "required"
         meaning = " ".join(option.get("description", "").split())
         yield above + name, _type(option), default, meaning
         for variant in option.get("oneOf", [option]):
             yield from _rows(variant.get("properties", {}), f"{above}{name}.")
 
 
-def _is_setting(option: Mapping[str, Any]) -> bool:
-    """Whether it is a value, and no component or section."""
-    return "default" in option or "const" in option
-
-
-def _type(option: Mapping[str, Any]) -> str:
+def _type(option: Schema) -> str:
     """Which values a JSON Schema allows."""
     variants = option.get("anyOf", option.get("oneOf"))
     if variants:
         return " or ".join(dict.fromkeys(map(_type, variants)))
     if "const" in option or "enum" in option:
-        return " or ".join(map(one_line, option.get("enum", [option.get("const")])))
+        return " or ".join(map(inline, option.get("enum", [option.get("const")])))
     if "prefixItems" in option:
         return f"[{', '.join(map(_type, option['prefixItems']))}]"
     if "items" in option:

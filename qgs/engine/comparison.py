@@ -17,10 +17,8 @@ from qgs.engine.results import (
     as_json,
     listed,
     markdown_table,
-    null_entries,
     print_lines,
     print_table,
-    value_name,
 )
 from qgs.io.files import write_text
 
@@ -132,8 +130,8 @@ class Comparison:
         for result in (first, second):
             if result.missing:
                 yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
-        if facts["null"]:
-            yield null_entries(facts["null"])
+        if null := facts["null"]:
+            yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
         for result, only in ((first, facts["only_first"]), (second, facts["only_second"])):
             if only:
                 yield f"{len(only)} scenes only in {result.name}, left out: {listed(only)}"
@@ -255,7 +253,7 @@ def _difference(
     metric: str, first: StoredResults, second: StoredResults, shared: Sequence[str]
 ) -> Difference | None:
     """None where no scene has the metric in both."""
-    column, value = first.columns[metric], value_name("model", metric)
+    column, value = first.columns[metric], f"model_{metric}"
     both = [s for s in shared if value in first.scenes[s] and value in second.scenes[s]]
     if not both:
         return None

@@ -14,7 +14,7 @@ from qgs.contracts import Column, Metric, MetricInput, SceneSource
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
 from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
-from qgs.engine.results import TUNING, Evaluation, SceneScore, value_name
+from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
 from qgs.metrics import gaussians_used, mean_colour, nearest_input
 from qgs.model import QueryGaussianModel
@@ -106,7 +106,7 @@ class _Judge:
             if metric.unavailable:
                 found[name] = metric.unavailable
                 continue
-            lacking = sum(value_name("model", name) not in score.values for score in scores)
+            lacking = sum(f"model_{name}" not in score.values for score in scores)
             if lacking:
                 needs = " and ".join(metric.needs).replace("_", " ")
                 found[name] = f"it needs {needs}, not known for {lacking} of {len(scores)} scenes"
@@ -181,7 +181,7 @@ class _Judge:
             "mean_colour": MetricInput(mean_colour(inputs, targets.cameras), targets),
         }
         values = {
-            value_name(method, name): value
+            f"{method}_{name}": value
             for method, shown in given.items()
             for name, value in self._measured(shown)
         }

@@ -29,11 +29,6 @@ _FRAMES = ("scene", "input_frames", "target_frames")
 _NAMED = 10
 
 
-def value_name(method: str, metric: str) -> str:
-    """What the value of a metric of one of METHODS is called in `SceneScore.values`."""
-    return f"{method}_{metric}"
-
-
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Mean, variance (over the population) and median of a value over scenes."""
     x = torch.tensor(values, dtype=torch.float64)
@@ -45,8 +40,8 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 class SceneScore:
     """One scene. views: input and target frames of each of its samples.
 
-    values: of every metric by `value_name`, means over the samples; "gaussians_used"; of tuned
-    scenes TUNING. A value is missing where the method or the scene lacks what a metric needs.
+    values: METHOD_METRIC to a mean over the samples; "gaussians_used"; of tuned scenes TUNING. A
+    value is missing where the method or the scene lacks what its metric needs.
     """
 
     scene: str
@@ -89,7 +84,7 @@ class Evaluation:
 
         Scenes weigh alike, however many samples and views they have.
         """
-        values = self._values(value_name(method, metric))
+        values = self._values(f"{method}_{metric}")
         return sum(values) / len(values) if values else None
 
     def means(self, method: str = "model") -> dict[str, float | None]:
@@ -116,7 +111,7 @@ class Evaluation:
 
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
-        values = {name: self._values(value_name("model", name)) for name in self.columns}
+        values = {name: self._values(f"model_{name}") for name in self.columns}
         return {
             "protocol": {
                 "name": self.protocol.name,
@@ -230,11 +225,12 @@ class Evaluation:
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_NAMED])
         if len(self.missing) > _NAMED:
             yield f"{len(self.missing) - _NAMED} more missing scenes are in scenes.csv"
-        if self.null:
-            yield null_entries(self.null)
-        if self.unlisted:
-            count, names = len(self.unlisted), listed(self.unlisted)
-            yield f"scenes of the data that the index lacks, not judged ({count}): {names}"
+        for names, what in (
+            (self.null, "null entries of the index"),
+            (self.unlisted, "scenes of the data that the index lacks"),
+        ):
+            if names:
+                yield f"{what}, not judged ({len(names)}): {listed(names)}"
         if given := [score for score in self.scores if score.given]:
             named = [f"{score.scene} ({' '.join(map(str, score.given))})" for score in given]
             yield (
@@ -242,7 +238,7 @@ class Evaluation:
                 f"nearest input view is perfect: {listed(named)}"
             )
         for name, why in self.incomplete.items():
-            count = len(self._values(value_name("model", name)))
+            count = len(self._values(f"model_{name}"))
             over = f"over {self._of_wanted(count)} scenes" if count else "empty"
             yield f"{self.columns[name].heading} is {over}: {why}"
         if self.held_out:
@@ -264,11 +260,6 @@ def listed(names: Sequence[str], most: int = _NAMED) -> str:
     """Names with commas between, at most so many."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
-
-
-def null_entries(names: Sequence[str]) -> str:
-    """A note on scenes that an index lists without frames."""
-    return f"null entries of the index, not judged ({len(names)}): {listed(names)}"
 
 
 def as_json(value: Mapping[str, Any]) -> str:

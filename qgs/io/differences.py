@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from qgs.composer.recipe import flat
-from qgs.composer.yaml_text import dump
+from qgs.composer.yaml_text import inline
 from qgs.contracts.weights import Shapes
 
 _WITHOUT_EFFECT_ON_TRAINED = re.compile(
@@ -43,11 +43,6 @@ def listed(names: Sequence[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + more
 
 
-def one_line(value: Any) -> str:
-    """`value` as YAML on one line."""
-    return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
-
-
 def differing_options(
     a: Mapping[str, Any], b: Mapping[str, Any]
 ) -> dict[str, tuple[str | None, str | None]]:
@@ -63,8 +58,8 @@ def differing_options(
     )
     return {
         path: (
-            one_line(of_a[path]) if path in of_a else None,
-            one_line(of_b[path]) if path in of_b else None,
+            inline(of_a[path]) if path in of_a else None,
+            inline(of_b[path]) if path in of_b else None,
         )
         for path in different
     }

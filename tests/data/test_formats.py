@@ -23,7 +23,9 @@ from photo_formats import (
 from PIL import Image
 from upath import UPath
 
-from qgs.data import read_photos
+from qgs.data import PhotosSource, read_photos
+from qgs.data import photos as formats
+from qgs.data.photos.reader import Listing, PhotoReader
 from qgs.data.photos.source import PhotoScene
 from qgs.data.scenes import warn_once
 
@@ -171,6 +173,24 @@ def test_sources_travel_to_workers_without_their_cache(tmp_path):
     assert len(content) < 20_000
     again = ForkingPickler.loads(content).scenes("train")[0]
     assert torch.equal(again.images(range(6)), images)
+
+
+def test_another_format_is_one_class(tmp_path, monkeypatch):
+    class Csv(PhotoReader):
+        name, listing, poses = "csv", "poses.csv", "opencv"
+
+        @classmethod
+        def read(cls, folder, images):
+            return Listing(folder / cls.listing, [])
+
+    choices = PhotosSource.Config.model_json_schema()["properties"]["format"]["enum"]
+    assert choices == ["auto", *(reader.name for reader in formats.READERS)]
+    monkeypatch.setattr(formats, "READERS", (*formats.READERS, Csv))
+    with pytest.raises(FileNotFoundError, match=r"one of transforms\.json.*poses\.csv \(csv\)"):
+        formats.read_listing(UPath(tmp_path))
+    (tmp_path / "poses.csv").touch()
+    assert formats.formats_of(UPath(tmp_path)) == ["csv"]
+    assert formats.read_listing(UPath(tmp_path)).file.name == "poses.csv"
 
 
 def test_photos_in_memory_and_in_archives(tmp_path):

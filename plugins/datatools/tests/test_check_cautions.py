@@ -11,25 +11,6 @@ from textured_room import SIZE
 from upath import UPath
 
 
-def test_image_of_another_scale_than_the_rest(room):
-    file = room.path / "images" / "3.jpg"
-    Image.open(file).resize((90, 60)).save(file)
-    assert told(room.path) == [
-        "error: room, frame 3 (images/3.jpg): the image is 90 x 60 pixels, but listed as 180 x "
-        "120, another scale than the rest of the scene: give the original image, or one scaled as "
-        "the others"
-    ]
-
-
-def test_listed_size_that_intrinsics_do_not_go_with(room):
-    room.listing(lambda data: data.update(w=360, h=240))
-    assert told(room.path) == [
-        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): the image is 180 x 120 pixels, "
-        "but listed as 360 x 240: correct the listed width and height, which the intrinsics do not "
-        "go with"
-    ]
-
-
 def test_a_scaled_copy_passes(room):
     room.listing(lambda data: data.update({key: 4 * data[key] for key in data if key != "frames"}))
     (room.path / "images").rename(room.path / "images_4")

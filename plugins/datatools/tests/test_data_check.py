@@ -1,39 +1,23 @@
-import json
 import re
 import shutil
 
-import numpy as np
 import pytest
-from textured_room import INTRINSICS, SIZE, walk
 from typer.testing import CliRunner
 
 from qgs.cli import app
 
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+@pytest.fixture(scope="module")
+def sound(good):
+    return good / "room"
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    path = tmp_path_factory.mktemp("set") / "room"
-    (path / "images").mkdir(parents=True)
-    fx, fy, cx, cy = INTRINSICS
-    frames = []
-    for number, shot in enumerate(walk(6)[:3]):
-        (path / "images" / f"{number}.jpg").write_bytes(shot.encoded())
-        pose = (shot.c2w @ FLIP).tolist()
-        frames.append({"file_path": f"images/{number}.jpg", "transform_matrix": pose})
-    top = {"w": SIZE[1], "h": SIZE[0], "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    (path / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
-    return path
-
-
-@pytest.fixture(scope="module")
-def broken(room):
-    """A folder of folders: the sound room, and one with a missing image and markup in its name."""
-    path = room.parent / "many"
-    path.mkdir()
-    shutil.copytree(room, path / "sound")
-    shutil.copytree(room, path / "<b>bad")
+def broken(sound, tmp_path_factory):
+    """A folder of folders: a sound room, and one with a missing image and markup in its name."""
+    path = tmp_path_factory.mktemp("many")
+    shutil.copytree(sound, path / "sound")
+    shutil.copytree(sound, path / "<b>bad")
     (path / "<b>bad" / "images" / "1.jpg").unlink()
     return path
 
@@ -42,15 +26,15 @@ def run(*arguments):
     return CliRunner().invoke(app, ["data", "check", *map(str, arguments)])
 
 
-def test_a_sound_set_has_exit_code_0_and_a_table(room):
-    result = run(room)
+def test_a_sound_set_has_exit_code_0_and_a_table(sound):
+    result = run(sound)
     assert result.exit_code == 0, result.output
     lines = result.output.splitlines()
     assert re.fullmatch(
         r"scene +format +frames +decodable +missing +bad poses +epipolar px", lines[0].strip()
     )
-    assert re.fullmatch(r"room +nerfstudio +3 +3 +0 +0 +0\.\d\d", lines[1].strip())
-    assert lines[-1] == f"{room}: 1 scene, 0 errors, 0 warnings"
+    assert re.fullmatch(r"room +nerfstudio +6 +6 +0 +0 +0\.\d\d", lines[1].strip())
+    assert lines[-1] == f"{sound}: 1 scene, 0 errors, 0 warnings"
 
 
 def test_errors_have_exit_code_1_and_one_line_each(broken):
@@ -85,12 +69,10 @@ def test_the_page_needs_no_other_file(broken, tmp_path):
     assert html.count('alt="worst pair of') == 1
 
 
-def test_quick_reads_headers_only(room, tmp_path):
-    path = tmp_path / "room"
-    shutil.copytree(room, path)
-    file = path / "images" / "2.jpg"
+def test_quick_reads_headers_only(room):
+    file = room.path / "images" / "2.jpg"
     file.write_bytes(file.read_bytes()[:-400])
-    result = run(path, "--quick")
+    result = run(room.path, "--quick")
     assert result.exit_code == 0, result.output
     assert "quick: only headers of images were read" in result.output
-    assert run(path, "--geometry", 0).exit_code == 1
+    assert run(room.path, "--geometry", 0).exit_code == 1

@@ -213,20 +213,24 @@ class PhotosSource(SceneSource):
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)
-        self._scenes = _scenes(config, opened_path(config.path))
-        single = self._scenes["train"]
-        if self._scenes["test"] is single and len(single) == 1:
-            _ = single[0].cameras
+        root = opened_path(config.path)
+        train = test = {folder_name(root): root}
+        if root.is_dir() and not formats_of(root):
+            train, test = (_folders(root / part, config) for part in ("train", "test"))
+            if not (train and test):
+                train = test = _folders(root, config) or {folder_name(root): root}
+        scenes = PhotoScenes(train, config)
+        if train is test and len(scenes) == 1:
+            _ = scenes[0].cameras  # tells at once what is wrong
+        others = scenes if train is test else PhotoScenes(test, config)
+        self._scenes = {"train": scenes, "test": others}
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
         """A listing of cameras in the folder, in one inside, or in one inside train or test."""
-        folders = (path, path / "train", path / "test")
-        return any(
-            formats_of(folder) or any(formats_of(item) for item in folder.iterdir())
-            for folder in folders
-            if folder.is_dir()
-        )
+        places = [place for place in (path, path / "train", path / "test") if place.is_dir()]
+        inside = (item for place in places for item in place.iterdir() if item.is_dir())
+        return bool(formats_of(path)) or any(map(formats_of, inside))
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
@@ -249,20 +253,6 @@ class PhotosSource(SceneSource):
     def names(self, split: Split) -> Sequence[str]:
         """See `SceneSource`."""
         return self._scenes[split].names
-
-
-def _scenes(config: PhotosConfig, root: UPath) -> Mapping[Split, PhotoScenes]:
-    """The scenes of both splits; raises FileNotFoundError when `root` holds none."""
-    if root.is_dir() and not formats_of(root):
-        train, test = (_folders(root / part, config) for part in ("train", "test"))
-        if train and test:
-            return {"train": PhotoScenes(train, config), "test": PhotoScenes(test, config)}
-        inside = _folders(root, config)
-        if inside:
-            scenes = PhotoScenes(inside, config)
-            return {"train": scenes, "test": scenes}
-    single = PhotoScenes({folder_name(root): root}, config)
-    return {"train": single, "test": single}
 
 
 def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:

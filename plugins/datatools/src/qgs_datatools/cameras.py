@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from qgs.data.photos.frames import Fault, Intrinsics, Size, intrinsics_faults, pose_faults
 
+from qgs.data.lenses import Intrinsics, Size
+from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
 from qgs_datatools.decoding import DecodedScene
 from qgs_datatools.findings import Finding
 
@@ -26,20 +27,20 @@ def camera_findings(scene: DecodedScene, sized: set[int]) -> tuple[list[Finding]
     others: list[Finding] = []
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         listed = photo.listed
-        unread = bool(listed.faults) and not np.isfinite(listed.c2w).all()
-        of_pose = [] if unread else list(pose_faults(listed.c2w))
-        rest = list(listed.faults)
-        if not listed.faults and frame not in sized:
+        unread = bool(listed.problems) and not np.isfinite(listed.c2w).all()
+        of_pose = [] if unread else list(pose_problems(listed.c2w))
+        rest = list(listed.problems)
+        if not listed.problems and frame not in sized:
             rest += _of_intrinsics(listed.intrinsics, listed.size or result.size)
-        for faults, found in ((of_pose, poses), (rest, others)):
-            found += [scene.finding([frame], fault.reason, fault.fix) for fault in faults]
+        for problems, found in ((of_pose, poses), (rest, others)):
+            found += [scene.finding([frame], p.reason, p.fix) for p in problems]
     return poses, others
 
 
-def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[Fault]:
-    faults = list(intrinsics_faults(intrinsics, size))
-    if size is None or faults:
-        return faults
+def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[FrameProblem]:
+    problems = list(intrinsics_problems(intrinsics, size))
+    if size is None or problems:
+        return problems
     height, width = size
     _, _, cx, cy = intrinsics
     if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) <= _FAR_OFF_CENTRE:
@@ -48,7 +49,8 @@ def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[Fault]:
         f"the principal point ({cx:.6g}, {cy:.6g}) is far from the middle of the {width} x "
         f"{height} pixels"
     )
-    return [Fault(reason, "correct cx and cy, unless the photo is cut from a larger one", False)]
+    fix = "correct cx and cy, unless the photo is cut from a larger one"
+    return [FrameProblem("intrinsics", reason, fix, fatal=False)]
 
 
 def sharing_findings(

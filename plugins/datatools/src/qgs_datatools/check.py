@@ -12,24 +12,17 @@ from upath import UPath
 
 from qgs.data.photos import READERS, Format, read_listing
 from qgs_datatools.cameras import camera_findings, sharing_findings
-from qgs_datatools.candidates import Candidate, dl3dv_scenes, photo_folders
+from qgs_datatools.candidates import Candidate
 from qgs_datatools.chunks import chunk_folders
 from qgs_datatools.decoding import DecodedScene, decode_scene, file_findings, size_findings
 from qgs_datatools.findings import Finding, errors_of, merged
+from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
-from qgs_datatools.indices import Held, IndexSummary, found_indices, index_findings
+from qgs_datatools.indices import Held, found_indices, index_findings
+from qgs_datatools.sources import kind_of, source_scenes, sources
 
-FORMATS = ("auto", *READERS, "chunks", "dl3dv")
-"""Formats of data sets; auto tells them from what is there."""
-
-_LISTINGS = {
-    "nerfstudio": "transforms.json",
-    "dl3dv": "transforms.json",
-    "blender": "its transforms file",
-    "colmap": "the model",
-    "llff": "poses_bounds.npy",
-    "chunks": "the chunk",
-}
+_PHOTO_FORMATS = {reader.name: reader.listing for reader in READERS}
+_LISTINGS = {**_PHOTO_FORMATS, "dl3dv": "transforms.json", "chunks": "the chunk"}
 
 
 @dataclass(frozen=True)
@@ -37,8 +30,9 @@ class Options:
     """How thorough a check is.
 
     geometry: poses are judged against photos in so many scenes, spread over the data set.
-    headers_only: no image is decoded, and none is matched. format: one of FORMATS. images: folder
-    of photos to read instead of the listed one, such as images_4.
+    headers_only: no image is decoded, and none is matched. format: of photos, chunks, dl3dv or
+    PLUGIN/NAME of a plugin's source; auto tells it from what is there. images: folder of photos to
+    read instead of the listed one, such as images_4.
     """
 
     geometry: int = 20
@@ -46,11 +40,6 @@ class Options:
     threads: int = 8
     format: str = "auto"
     images: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.format not in FORMATS:
-            known = ", ".join(FORMATS)
-            raise ValueError(f"there is no format {self.format!r}: give one of {known}")
 
 
 @dataclass(frozen=True)
@@ -93,13 +82,13 @@ class SceneReport:
 @dataclass(frozen=True)
 class CheckReport:
     """What was found. general: findings about files of the data set. judged: scenes whose poses
-    were to be judged against photos. notes: what was not done, and why.
+    were to be judged against photos. indices: each in words. notes: what was not done, and why.
     """
 
     path: str
     scenes: Sequence[SceneReport]
     general: Sequence[Finding]
-    indices: Sequence[IndexSummary]
+    indices: Sequence[str]
     judged: int
     notes: Sequence[str]
 
@@ -125,8 +114,11 @@ def check(
 
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
     is no data set at `path`, or no file at one of `indices`, and MissingExtraError when a package
-    that the format needs is missing.
+    that the format needs is missing, ValueError for an unknown format.
     """
+    formats = ("auto", *_LISTINGS, *(kind for kind in sources() if not kind.startswith("qgs/")))
+    if options.format not in formats:
+        raise ValueError(f"there is no format {options.format!r}: use one of {', '.join(formats)}")
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
     candidates, general, told = _candidates(path, options)
@@ -141,7 +133,7 @@ def check(
         report = check_scene(candidate, options, with_geometry=number in judged)
         scenes.append(report)
         held[report.scene].append(Held(report.split, report.listed - report.missing or None))
-    summaries: list[IndexSummary] = []
+    summaries: list[str] = []
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         findings, summary = index_findings(file, held, told)
         general += findings
@@ -154,7 +146,7 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
     kind = options.format
     if kind == "auto":
         is_chunk = path.is_file() and path.suffix == ".torch"
-        kind = "chunks" if is_chunk else recognised(path).removeprefix("qgs/")
+        kind = "chunks" if is_chunk else kind_of(path)
     if kind == "chunks":
         folders = chunk_folders(path)
         return (
@@ -207,7 +199,7 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
         nothing = Finding(name, "no photos are listed", "export the scene again")
         return replace(report, findings=[nothing])
     scene = decode_scene(name, photos, options.threads, options.headers_only)
-    files = list(file_findings(scene, _LISTINGS[candidate.kind]))
+    files = list(file_findings(scene, _LISTINGS.get(candidate.kind, "the data set")))
     sizes = list(size_findings(scene))
     poses, others = camera_findings(scene, _frames(sizes))
     placed = [

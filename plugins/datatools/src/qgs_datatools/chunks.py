@@ -10,12 +10,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from qgs.data.chunks.files import INDEX, SUFFIX, has_chunks, load_chunk, read_chunk_index
-from qgs.data.chunks.record import Record, parse_record, unit_faults
-from qgs.data.lazy import a_type
-from qgs.data.photos.frames import PhotoFrame, Size
 from upath import UPath
 
+from qgs.data.chunk_files import (
+    INDEX,
+    SUFFIX,
+    Record,
+    a_type,
+    has_chunks,
+    load_chunk,
+    parse_record,
+    read_chunk_index,
+    unit_problems,
+)
+from qgs.data.lenses import Size
+from qgs.data.photos.reader import PhotoFrame
 from qgs_datatools.candidates import Candidate, Photo
 from qgs_datatools.conventions import OPENCV
 from qgs_datatools.findings import Finding
@@ -178,8 +187,6 @@ def _photos(file: UPath, place: int) -> list[Photo]:
 
 
 def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
-    height, width = size or (1, 1)
-    fx, fy, cx, cy = record.cameras[frame, :4].double().tolist()
     try:
         c2w = np.linalg.inv(record.w2c[frame].numpy())
     except np.linalg.LinAlgError:
@@ -188,9 +195,9 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         name=record.names[frame],
         path=file,
         c2w=c2w,
-        intrinsics=(fx * width, fy * height, cx * width, cy * height),
+        intrinsics=record.intrinsics(frame, size or (1, 1)),
         size=size,
-        faults=tuple(unit_faults(record, frame)),
+        problems=tuple(unit_problems(record, frame)),
     )
     return Photo(listed, lambda: record.images[frame].numpy().tobytes())
 

@@ -30,7 +30,7 @@ def check(
         typer.Option(help="Evaluation index to compare with the scenes; repeatable."),
     ] = None,
     format: Annotated[
-        str, typer.Option(help="Only scenes listed in this format, such as colmap or chunks.")
+        str, typer.Option(help="Only scenes in this format, such as colmap or chunks.")
     ] = "auto",
     images: Annotated[
         str | None, typer.Option(help="Folder of photos to read, such as images_4.")
@@ -171,10 +171,14 @@ def _opened(
     from qgs.composer import resolve
     from qgs.data.paths import opened_path
     from qgs.data.recognition import recognised
+    from qgs_datatools.sources import sources
 
     recipe: Any = path
     if Path(path).suffix not in {".yaml", ".yml"}:
-        recipe = {"recipe": 1, "data": {"type": recognised(opened_path(path)), "path": path}}
+        kind = recognised(opened_path(path), sources())
+        plugin = kind.partition("/")[0]
+        recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
+        recipe["plugins"] = [] if plugin == "qgs" else [plugin]
     source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
     if image_size is not None:
         source = type(source)(source.config.model_copy(update={"image_size": image_size}))

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from statistics import median, median_low
 
 from PIL import Image, UnidentifiedImageError
-from qgs.data.photos.frames import PhotoFrame, Size, open_mask, size_faults
 
+from qgs.data.images import open_mask
+from qgs.data.lenses import Size
+from qgs.data.photos.checks import size_problems
+from qgs.data.photos.reader import PhotoFrame
 from qgs_datatools.candidates import Photo
 from qgs_datatools.findings import Finding, Severity
 
@@ -160,9 +163,9 @@ def size_findings(scene: DecodedScene) -> Iterator[Finding]:
         if item.is_as_listed_or_scaled:
             alike.append(item)
             continue
-        fault = next(size_faults(item.file, item.listed), None)
+        problem = next(size_problems(item.file, item.listed), None)
         fix = "give the original image, or correct the listed size"
-        reason, fix = (fault.reason, fault.fix) if fault else (item.reason, fix)
+        reason, fix = (problem.reason, problem.fix) if problem else (item.reason, fix)
         yield scene.finding([frame], reason, fix)
     if not alike:
         return

@@ -10,12 +10,12 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 from PIL import Image
-from qgs.data.photos.frames import undistorted
-from qgs.data.photos.scene import EncodedFrame, EncodedScene
 from torch import Tensor
 
 from qgs.contracts import Scene
 from qgs.data.images import decode_gray, decode_rgb
+from qgs.data.lenses import undistorted
+from qgs.data.scenes import EncodedFrame, EncodedScene
 
 ChunkEntry: TypeAlias = dict[str, Any]
 

@@ -20,18 +20,6 @@ class Held:
     frames: int | None
 
 
-@dataclass(frozen=True)
-class IndexSummary:
-    """An index in numbers. null: scenes that it lists without frames, which are never judged."""
-
-    file: str
-    scenes: int
-    null: int
-
-    def __str__(self) -> str:
-        return f"{self.file}: {self.scenes} scenes, {self.null} of them without frames (null)"
-
-
 def found_indices(path: UPath) -> list[UPath]:
     """The JSON files in the folder `path` that have the form of an evaluation index."""
     files = path.iterdir() if path.is_dir() else ()
@@ -50,10 +38,11 @@ def _is_index(file: UPath) -> bool:
 
 def index_findings(
     file: UPath, scenes: Mapping[str, Sequence[Held]], told: Container[str] = ()
-) -> tuple[list[Finding], IndexSummary | None]:
+) -> tuple[list[Finding], str | None]:
     """What the index names and is not there, less scenes whose absence is `told` already.
 
-    The summary is None for a file that is no index. Raises FileNotFoundError without a file.
+    Also the index in numbers, in words; None for a file that is no index. Raises FileNotFoundError
+    without a file.
     """
     try:
         index = read_index(str(file))
@@ -63,8 +52,8 @@ def index_findings(
     for name, entry in index.items():
         if entry is not None and (name in scenes or name not in told):
             findings += _entry_findings(file.name, name, entry, scenes.get(name, ()))
-    null = sum(entry is None for entry in index.values())
-    return findings, IndexSummary(str(file), len(index), null)
+    null = sum(entry is None for entry in index.values())  # scenes that are never judged
+    return findings, f"{file}: {len(index)} scenes, {null} of them without frames (null)"
 
 
 def _entry_findings(

@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, TypeAlias, get_args
 
 import torch
-from qgs.data.chunks.files import INDEX, SUFFIX
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
+from qgs.data.chunk_files import INDEX, SUFFIX
 from qgs.io.files import opened_replacing, write_bytes
 from qgs_datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames, stored_bytes
 

@@ -19,7 +19,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from qgs.drawing.figures import INK, figure_picture, figure_style, hex_color
 from qgs.drawing.images import Picture, png_uri
 from qgs_datatools.check import CheckReport, SceneReport
-from qgs_datatools.epipolar import Pair, epipolar_lines
+from qgs_datatools.epipolar import Pair
 
 PICTURED = 12
 """Scenes that get pictures, the worst first."""
@@ -160,9 +160,8 @@ def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
 
     A dot off its line of the same colour is what a wrong pose looks like.
     """
-    chosen = _spread(pair.matches.first, _MATCHES)
-    points = (pair.matches.first[chosen], pair.matches.second[chosen])
-    lines = epipolar_lines(pair.matches, pair.poses[0], pair.poses[1], pair.intrinsics)
+    chosen = _spread(pair.matches[0], _MATCHES)
+    points, lines = pair.matches[:, chosen], pair.lines()[:, chosen]
     height, width = pair.size
     with figure_style():
         figure = Figure(figsize=(8.0, 4.0 * height / width * (1 - _GAP) + 0.3))
@@ -171,7 +170,7 @@ def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
         for axis, photo, dots, wanted, frame in zip(
             axes, photos, points, lines, pair.frames, strict=True
         ):
-            _photo(axis, photo, dots, wanted[chosen])
+            _photo(axis, photo, dots, wanted)
             axis.set_title(f"frame {frame}")
     return figure
 

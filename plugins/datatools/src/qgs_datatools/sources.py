@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from functools import cache, partial
+from typing import get_args
 
-from PIL import Image
+import numpy as np
 from upath import UPath
 
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
+from qgs_datatools.candidates import Candidate, Photo
 from qgs_datatools.conventions import OPENCV
-from qgs_datatools.findings import Candidate, Photo
+from qgs_datatools.entries import Encoding
 
 _SIZE = (256, 256)  # of the images that a source is asked for
 
@@ -35,9 +36,8 @@ def source_scenes(kind: str, path: UPath) -> Iterator[Candidate]:
     source = sources()[kind]
     assert issubclass(source, SceneSource)
     opened = source(source.config_for(str(path), _SIZE, None))
-    splits: tuple[Split, ...] = ("train", "test")
     known: set[str] = set()
-    for split in splits:
+    for split in get_args(Split):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
                 photos = partial(_photos, opened, split, place)
@@ -47,24 +47,16 @@ def source_scenes(kind: str, path: UPath) -> Iterator[Candidate]:
 
 def _photos(source: SceneSource, split: Split, place: int) -> list[Photo]:
     scene = source.scenes(split)[place]
-    cameras = scene.cameras
-    return [
-        Photo(
-            PhotoFrame(
-                scene.frame_name(i),
-                UPath(scene.frame_name(i)),
-                cameras.c2w[i].double().numpy(),
-                tuple(cameras.intrinsics[i].tolist()),
-                cameras.size,
-            ),
-            partial(_png, scene, i),
-        )
-        for i in range(len(scene))
-    ]
+    return [Photo(_listed(scene, i), partial(_image_file, scene, i)) for i in range(len(scene))]
 
 
-def _png(scene: Scene, frame: int) -> bytes:
-    pixels = scene.images([frame])[0].mul(255).round().byte().permute(1, 2, 0)
-    file = io.BytesIO()
-    Image.fromarray(pixels.numpy()).save(file, "png")
-    return file.getvalue()
+def _listed(scene: Scene, frame: int) -> PhotoFrame:
+    camera, name = scene.cameras[frame], scene.frame_name(frame)
+    fx, fy, cx, cy = camera.intrinsics.tolist()
+    c2w = camera.c2w.double().numpy()
+    return PhotoFrame(name, UPath(name), c2w, (fx, fy, cx, cy), camera.size)
+
+
+def _image_file(scene: Scene, frame: int) -> bytes:
+    pixels = scene.images([frame])[0].permute(1, 2, 0).mul(255).round().byte().numpy()
+    return Encoding().image(np.ascontiguousarray(pixels))

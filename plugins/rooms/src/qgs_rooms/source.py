@@ -20,6 +20,7 @@ from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.scenes import LazyScenes
 from qgs.types import Cameras
 from qgs_rooms.path import camera_path
+from qgs_rooms.plan import furnish
 from qgs_rooms.shapes import Room
 
 _SHADOW_CELLS = 80
@@ -86,7 +87,6 @@ class RoomScene(Scene):
     @cached_property
     def room(self) -> Room:
         """The furnished room."""
-        from qgs_rooms.plan import furnish
 
         return furnish(Random(self._plan_seed), self.size, self._c2w[:, :3, 3])
 
