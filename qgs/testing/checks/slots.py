@@ -28,8 +28,7 @@ from qgs.testing.registry import check
 from qgs.testing.trees import cloned, described, difference, mapped, not_finite
 from qgs.types import GaussianAttributes, ImageMemory, Views, map_tensors
 
-Patch = tuple[int, int, int]
-"""View, row and column."""
+Patch = tuple[int, int, int]  # view, row and column
 
 
 @check({"head"})
