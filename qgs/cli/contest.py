@@ -97,8 +97,8 @@ def table_of(entries: Sequence[Entry]) -> Table:
     """The comparison as a table for the terminal."""
     rows = [entry.contender for entry in entries]
     columns = entries[0].evaluation.columns
-    options = {"collapse_padding": True, "pad_edge": False}
-    table = Table(title="Unseen scenes", caption="best in green", box=box.SIMPLE_HEAD, **options)
+    table = Table(title="Unseen scenes", caption="best in green", box=box.SIMPLE_HEAD)
+    table.pad_edge = False
     table.add_column("", no_wrap=True)
     headings = [column.title for column in columns.values()]
     for heading in (*headings, "Gaussians", "parameters", "seconds"):
