@@ -133,38 +133,37 @@ def decode_config(
         if kind == "missing" and isinstance(given, ListNode):
             same = [d["loc"][-1] for d in details if d["loc"][:-1] == loc[:-1]]
             count = 1 + max(index for index in same if isinstance(index, int))
-            reason = f"needs {count} items, got {len(given)}"
-            fix = f"give {count} items{_default(config, detail)}"
+            reason, fix = f"needs {count} items, got {len(given)}", f"give {count} items"
         else:
-            if kind == "missing":
-                steps.append(loc[-1])
-            name = ".".join([*path, *map(str, loc)])
-            reason, fix = _explain(detail, given, config, name)
-        problems.add(origin, ".".join([*path, *map(str, steps)]), reason, fix)
+            steps += [loc[-1]] if kind == "missing" else []
+            reason, fix = _explain(detail, given, config)
+        name = ".".join([*path, *map(str, steps)])
+        if kind == "extra_forbidden" and name in MOVED:
+            reason, fix = f"`{name}` has moved", f"write `{MOVED[name]}`"
+        field = config.model_fields.get(str(loc[0])) if loc else None
+        if field and not field.is_required() and not isinstance(field.default, BaseModel):
+            fix += f" (default: {inline(to_jsonable_python(field.get_default()))})"
+        problems.add(origin, name, reason, fix)
     return None
 
 
-def _explain(
-    error: ErrorDetails, given: Any, config: type[BaseModel], path: str
-) -> tuple[str, str]:
+def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[str, str]:
     """Reason and fix: pydantic's message, or a better one where we know more than pydantic.
 
-    given: the offending value. config: the class that refused it. path: of the option.
+    given: the offending value. config: the class that refused it.
     """
-    kind, cause = error["type"], error.get("ctx", {}).get("error")
+    kind, context = error["type"], error.get("ctx", {})
+    cause = context.get("error")
     option = str(error["loc"][-1]) if error["loc"] else ""
-    default = _default(config, error)
-    if kind == "extra_forbidden" and path in MOVED:
-        return f"`{option}` has moved", f"write `{MOVED[path]}`"
     if kind == "extra_forbidden":
         siblings = _options_beside(config, error["loc"])
         return f"there is no option `{option}`", did_you_mean(option, siblings, "options")
     if kind == "missing":
         return f"the option `{option}` is missing and has no default", f"add `{option}: ...`"
     if isinstance(cause, OptionError):
-        return cause.reason, cause.fix + default
+        return cause.reason, cause.fix
     if kind == "value_error":
-        return str(cause), f"change the value so that this holds{default}"
+        return str(cause), "change the value so that this holds"
     reason = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
     reason = reason.replace(" after validation", "")
     reason = reason if kind in ("too_long", "too_short") else f"{reason}, got {kind_of(given)}"
@@ -173,20 +172,11 @@ def _explain(
         word = _BOOLS[written.lower()]
         return reason, f"write `{word}`: in YAML 1.2 `{written}` is a string"
     if kind == "string_type":
-        return reason, f"put it in quotes{default}"
+        return reason, "put it in quotes"
     if kind == "literal_error":
-        expected = error.get("ctx", {})["expected"]
-        near = nearest(written, re.findall(r"'([^']*)'", expected))
-        return reason, f"did you mean `{near}`?" if near else f"choose {expected}{default}"
-    return reason, f"give a value that fits{default}"
-
-
-def _default(config: type[BaseModel], error: ErrorDetails) -> str:
-    """A note on the default of the top-level option that `error` is in."""
-    field = config.model_fields.get(str(error["loc"][0])) if error["loc"] else None
-    if field is None or field.is_required() or isinstance(field.default, BaseModel):
-        return ""
-    return f" (default: {inline(to_jsonable_python(field.get_default()))})"
+        near = nearest(written, re.findall(r"'([^']*)'", context["expected"]))
+        return reason, f"did you mean `{near}`?" if near else f"choose {context['expected']}"
+    return reason, "give a value that fits"
 
 
 def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[str]:
@@ -196,11 +186,10 @@ def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[
     """
     models: set[type[BaseModel]] = {config}
     for step in loc[:-1]:
-        fields = [(name, f, m) for m in models for name, f in m.model_fields.items()]
-        below = {
-            inner for name, f, _ in fields if name == step for inner in models_in(f.annotation)
-        }
-        models = below or {m for _, f, m in fields if step in get_args(f.annotation)} or models
+        fields = [(name, field, m) for m in models for name, field in m.model_fields.items()]
+        inner = [models_in(field.annotation) for name, field, _ in fields if name == step]
+        tagged = {m for _, field, m in fields if step in get_args(field.annotation)}
+        models = set().union(*inner) or tagged or models
     return {name for model in models for name in model.model_fields}
 
 

@@ -9,31 +9,18 @@ from typing import Any
 
 import torch
 
+from qgs import contracts
 from qgs.composer.build import build, build_model
 from qgs.composer.decode import Chosen, decode_places
 from qgs.composer.errors import Problems
 from qgs.composer.files import apply_overrides, merge, read_recipe
-from qgs.composer.flow import Parts, check_flow, check_options
+from qgs.composer.flow import check_flow, check_options
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.registry import Registry
 from qgs.composer.sections import check_tree, decode_settings, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import inline
-from qgs.contracts import (
-    ComponentConfig,
-    EvaluationConfig,
-    Loss,
-    Metric,
-    ModelDims,
-    Optimizer,
-    Plugin,
-    RecipeContext,
-    SceneSource,
-    SceneSourceConfig,
-    TrainingConfig,
-    ViewsConfig,
-)
 from qgs.model import QueryGaussianModel
 
 
@@ -51,35 +38,35 @@ class Recipe:
     tree: Mapping[str, Any]
     provenance: Mapping[str, str]
     parts: Mapping[KeyPath, Chosen]
-    dims: ModelDims
+    dims: contracts.ModelDims
     layer_scale: float
     seed: int
     init_from: str | None
-    views: ViewsConfig
-    training: TrainingConfig
-    evaluation: EvaluationConfig
+    views: contracts.ViewsConfig
+    training: contracts.TrainingConfig
+    evaluation: contracts.EvaluationConfig
     plugin_versions: Mapping[str, str]
 
     def build_model(self, device: torch.device | str | None = None) -> QueryGaussianModel:
         """The model with its initial parameters; on "meta" it takes no memory."""
         return build_model(self.parts, self.dims, self.layer_scale, self.seed, self.tree, device)
 
-    def build_losses(self) -> dict[str, Loss]:
+    def build_losses(self) -> dict[str, contracts.Loss]:
         """Losses by the names that the recipe gives them.
 
         `losses: {}` gives none: fine for everything but training, which refuses it.
         """
         return self._build_named("losses")
 
-    def build_metrics(self) -> dict[str, Metric]:
+    def build_metrics(self) -> dict[str, contracts.Metric]:
         """What evaluations measure, by the names that the recipe gives."""
         return self._build_named("metrics")
 
-    def build_optimizer(self) -> Optimizer:
+    def build_optimizer(self) -> contracts.Optimizer:
         """The optimiser; raises ValueError where `training` is too short for it."""
         return build(self.parts["optimizer",], self.training)
 
-    def build_data(self) -> SceneSource:
+    def build_data(self) -> contracts.SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""
         if ("data",) not in self.parts:
             raise ValueError("this recipe has no data; add `data: {type: PLUGIN/NAME}`")
@@ -93,7 +80,7 @@ class Recipe:
 def resolve(
     recipe: str | Path | Mapping[str, Any],
     overrides: Sequence[str] = (),
-    plugins: Sequence[Plugin] = (),
+    plugins: Sequence[contracts.Plugin] = (),
 ) -> Recipe:
     """Read, merge and check a recipe.
 
@@ -110,12 +97,19 @@ def resolve(
     tree = _with_defaults(tree)
     settings, sizes_known = decode_settings(tree, problems)
     model, decoder = settings["model",], settings["model", "decoder"]
-    dims = ModelDims(model.width, model.heads, decoder.depth)
+    dims = contracts.ModelDims(model.width, model.heads, decoder.depth)
     registry = load_plugins(tree, problems, plugins)
     places = apply_swaps(tree.child("swap"), expand(tree, dims.depth, problems), problems)
     parts = decode_places(places, registry, problems)
     if sizes_known:
-        _check_components(parts, dims, registry, problems)
+        data = parts.get(("data",))
+        source = data.config if data else None
+        size = source.image_size if isinstance(source, contracts.SceneSourceConfig) else None
+        context = contracts.RecipeContext(dims, size)
+        sound = {
+            p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
+        }
+        check_flow(sound, dims.depth, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     spelled_out, provenance = _spell_out(tree, settings, registry, chosen)
@@ -136,35 +130,19 @@ def resolve(
 
 def _with_defaults(tree: MapNode) -> MapNode:
     """`tree` with the default components of sections such as `losses` under what is written."""
-    origin = Origin("default")
     missing = {
         name: {key: {"type": kind} for key, kind in section.defaults.items()}
         for name, section in SECTIONS.items()
         if section.named and (section.defaults_stay or name not in tree)
     }
-    defaults = from_plain(missing, origin)
+    defaults = from_plain(missing, Origin("default"))
     assert isinstance(defaults, MapNode)
     return merge(defaults, tree)
 
 
-def _check_components(
-    parts: Parts, dims: ModelDims, registry: Registry, problems: Problems
-) -> None:
-    """Check components against the rest of the recipe, as far as that could be decoded."""
-    data = parts.get(("data",))
-    source = data.config if data else None
-    size = source.image_size if isinstance(source, SceneSourceConfig) else None
-    context = RecipeContext(dims, size)
-    sound = {
-        path: chosen if chosen and check_options(chosen, context, problems) else None
-        for path, chosen in parts.items()
-    }
-    check_flow(sound, dims.depth, registry, problems)
-
-
 def _spell_out(
     source: MapNode,
-    settings: Mapping[KeyPath, ComponentConfig],
+    settings: Mapping[KeyPath, contracts.ComponentConfig],
     registry: Registry,
     parts: Mapping[KeyPath, Chosen],
 ) -> tuple[dict[str, Any], dict[str, str]]:
@@ -257,6 +235,7 @@ def annotated(recipe: Recipe) -> str:
 def _lines(
     tree: Mapping[str, Any], path: KeyPath, provenance: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
+    """Lines of YAML, and what set the value of each."""
     for key, value in tree.items():
         below, name = (*path, key), "  " * len(path) + inline(key)
         if isinstance(value, Mapping) and value:

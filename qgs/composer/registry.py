@@ -22,15 +22,8 @@ import qgs.losses
 import qgs.metrics
 import qgs.renderers
 from qgs.composer.slots import SLOTS
-from qgs.contracts import (
-    CONTRACT_VERSION,
-    ENTRY_POINT_GROUP,
-    Component,
-    ComponentConfig,
-    Plugin,
-    Renderer,
-    WeightLayout,
-)
+from qgs.contracts import Component, ComponentConfig, Renderer, WeightLayout
+from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 
 BUILTIN = Plugin(
     name="qgs",
@@ -135,9 +128,9 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
     plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()
-    for entry in available.pop(BUILTIN.name, []):
-        reason = f"{_release(entry)} offers a plugin `qgs`, the framework's own name"
-        broken.append(f"{reason}; uninstall {_release(entry)}")
+    for release in map(_release, available.pop(BUILTIN.name, [])):
+        reason = f"{release} offers a plugin `qgs`, the framework's own name"
+        broken.append(f"{reason}; uninstall {release}")
     for name in sorted(available):
         try:
             plugins[name] = load_plugin(name)
@@ -159,16 +152,12 @@ def load_plugin(name: str) -> InstalledPlugin:
     entries = available.get(name, [])
     if not entries:
         installed = ", ".join(sorted(available)) or "none"
-        raise PluginError(
-            f"no installed distribution offers a plugin `{name}`",
-            f"install the one that does; installed plugins: {installed}",
-        )
+        fix = f"install the one that does; installed plugins: {installed}"
+        raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
+        reason = f"several distributions offer a plugin `{name}`: "
         releases = ", ".join(sorted(map(_release, entries)))
-        raise PluginError(
-            f"several distributions offer a plugin `{name}`: {releases}",
-            "uninstall all of them but one",
-        )
+        raise PluginError(reason + releases, "uninstall all of them but one")
     entry = entries[0]
     assert entry.dist is not None
     # The record of where a distribution came from (PEP 610): whether by `pip install -e`.
@@ -180,17 +169,17 @@ def load_plugin(name: str) -> InstalledPlugin:
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:
-        place = place_in(error, package_named(entry.module))
-        at = f" (at {place})" if place else ""
-        told = f"{type(error).__name__}: {error}{at}"
+        package = entry.module.partition(".")[0]
+        spec = find_spec(package)
+        place = place_in(error, [package_of(spec.origin)] if spec and spec.origin else [])
+        told = f"{type(error).__name__}: {error}{f' (at {place})' if place else ''}"
         reason = f"{named} cannot be imported from `{entry.value}`: {told}"
         fix = installed.repair(place or f"`{entry.value}`")
         missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
-        package = missing.partition(".")[0]
         if missing == entry.module:
             fix = f"install {installed.released_as} again, its files are gone"
-        elif package not in ("", "qgs", entry.module.partition(".")[0]):
-            fix = f"install `{package}`, which {installed.released_as} needs"
+        elif missing.partition(".")[0] not in ("", "qgs", package):
+            fix = f"install `{missing.partition('.')[0]}`, which {installed.released_as} needs"
         raise PluginError(reason, f"{fix}, or do without the plugin") from error
     for fault in _plugin_faults(plugin, name):
         version = getattr(plugin, "contract_version", None)
@@ -201,7 +190,8 @@ def load_plugin(name: str) -> InstalledPlugin:
 
 
 def _release(entry: EntryPoint) -> str:
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
+    assert entry.dist is not None
+    return f"{entry.dist.name} {entry.dist.version}"
 
 
 def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
@@ -321,15 +311,6 @@ def package_of(file: str) -> Path:
     while (path.parent / "__init__.py").exists():
         path = path.parent
     return path
-
-
-def package_named(module: str) -> list[Path]:
-    """The folder, or the file, of the outermost package of `module`, which need not import."""
-    try:
-        spec = find_spec(module.partition(".")[0])
-    except (ImportError, ValueError):
-        return []
-    return [package_of(spec.origin)] if spec and spec.origin else []
 
 
 def lies_in(file: str, root: Path) -> bool:

@@ -16,7 +16,7 @@ from qgs.contracts import ComponentConfig, EvaluationConfig, Plugin, TrainingCon
 
 
 class ModelSettings(ComponentConfig):
-    """Sizes that the whole model shares."""
+    """The model: sizes that all of its components share."""
 
     width: int = Field(default=1024, ge=1, le=65_536)
     """Features of a token and of a query (D in the papers)."""

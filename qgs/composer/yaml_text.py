@@ -17,15 +17,11 @@ _LARGEST = 2**63 - 1
 _STANDARD = "tag:yaml.org,2002:"
 _TAGS = {_STANDARD + name for name in ("null", "bool", "int", "float", "str", "map", "seq")}
 _RESOLVERS = (
-    ("null", r"~|null|Null|NULL|", "~nN\0"),
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
     ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
-    (
-        "float",
-        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
-        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        "-+.0123456789",
-    ),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", "-+.0123456789"),
+    ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+."),
 )
 
 
@@ -43,10 +39,8 @@ class Yaml12Loader(yaml.SafeLoader):
         """PyYAML's, refusing what would overflow the stack of whoever walks the tree."""
         self._nesting += 1
         if self._nesting > MAX_NESTING:
-            raise SizeError(
-                problem=f"mappings and lists stand more than {MAX_NESTING} deep in each other",
-                problem_mark=self.peek_event().start_mark,
-            )
+            told = f"mappings and lists stand more than {MAX_NESTING} deep in each other"
+            raise SizeError(problem=told, problem_mark=self.peek_event().start_mark)
         node = super().compose_node(parent, index)
         self._nesting -= 1
         return node
@@ -64,11 +58,8 @@ class Yaml12Dumper(yaml.SafeDumper):
 
 for _kind, _pattern, _first in _RESOLVERS:
     for _class in (Yaml12Loader, Yaml12Dumper):
-        _class.add_implicit_resolver(
-            _STANDARD + _kind,
-            re.compile(f"^(?:{_pattern})$"),
-            [c if c != "\0" else "" for c in _first],
-        )
+        _full = re.compile(f"^(?:{_pattern})$")
+        _class.add_implicit_resolver(_STANDARD + _kind, _full, list(_first))
 
 
 def scalar_value(tag: str, text: str) -> Any:
@@ -93,9 +84,8 @@ def scalar_value(tag: str, text: str) -> Any:
 
 def dump(value: Any, *, flow: bool | None = False) -> str:
     """`value` as YAML 1.2, keys in their order."""
-    return yaml.dump(
-        value, Dumper=Yaml12Dumper, sort_keys=False, default_flow_style=flow, width=10_000
-    )
+    style: Any = {"default_flow_style": flow, "sort_keys": False, "width": 10_000}
+    return yaml.dump(value, Dumper=Yaml12Dumper, **style)
 
 
 def inline(value: Any) -> str:

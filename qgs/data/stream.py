@@ -251,12 +251,10 @@ def _prepare_worker(number: int) -> None:
 
 
 class Feed:
-    """Holds the batches of the step that comes next.
+    """The batches of the next optimiser step, or the error that fetching them raised.
 
-    They are fetched while the step before is not over, so that processes can agree on a failure
-    where they exchange numbers anyway: one that ended alone would leave the others waiting.
-
-    error: what fetching raised; after that there are no batches any more.
+    They are fetched before the present step is over, so that processes can tell each other of a
+    failure where they exchange numbers anyway; one that ended alone would leave the others waiting.
     """
 
     def __init__(self, stream: Iterator[Batch], count: int) -> None:
@@ -266,7 +264,7 @@ class Feed:
         self._count = count
 
     def fetch(self) -> None:
-        """Get the `count` batches of the next step, or the error."""
+        """Get the `count` batches of the next step; none, and `error`, when that fails."""
         try:
             self.batches = list(islice(self._stream, self._count))
         except Exception as error:  # raised by whoever reads `error`

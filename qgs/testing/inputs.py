@@ -190,11 +190,12 @@ class Maker:
         """Gaussians, and the state they are said to come from."""
         return LayerPrediction(self.gaussians(), self.state())
 
-    def rendering(self) -> Rendering:
-        """Noise pictures; of no views for a loss that needs none."""
+    def rendering(self, views: int | None = None) -> Rendering:
+        """Noise pictures; by default of no views for a loss that needs none."""
         loss = self.case.component
         assert issubclass(loss, Loss)
-        views = 0 if loss.renderings == "none" else self.sizes.views
+        if views is None:
+            views = 0 if loss.renderings == "none" else self.sizes.views
         shape = (self.sizes.batch, views)
         rgb, alpha = (self.uniform(0, 1, *shape, c, *self.image) for c in (3, 1))
         return Rendering(rgb, alpha, self.uniform(1, 2, *shape, 1, *self.image))

@@ -6,6 +6,7 @@ import inspect
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
 import numpy
@@ -44,12 +45,15 @@ def is_torchs_own(part: nn.Module) -> bool:
 def attributes(module: nn.Module) -> dict[str, Any]:
     """Comparable values of what a module keeps besides parameters, buffers and submodules.
 
-    Attributes of its submodules, and of the classes of all of them, are included.
+    Attributes of its submodules, and of the classes of all of them, are included; what a
+    `cached_property` keeps is not: it depends on the module alone.
     """
     found = {}
     for name, part in module.named_modules():
-        own = {key: value for key, value in vars(part).items() if key not in TORCH_OWN}
-        found |= {f"{name}.{key}".lstrip("."): _comparable(own[key]) for key in own}
+        for key, value in vars(part).items():
+            kept = isinstance(getattr(type(part), key, None), cached_property)
+            if key not in TORCH_OWN and not kept:
+                found[f"{name}.{key}".lstrip(".")] = _comparable(value)
         for owner in type(part).__mro__:
             if owner.__module__.partition(".")[0] not in ("torch", "builtins", "abc", "typing"):
                 found |= {

@@ -109,8 +109,10 @@ def _one_thread() -> Iterator[None]:
 
 
 def numbers(components: tuple[type[Component], ...]) -> Iterator[tuple[str, str]]:
-    """Component and option of every floating-point option."""
+    """Component and option of every floating-point option, those of optimisers aside."""
     for component in components:
+        if component.slot == "optimizer":
+            continue
         for option, field in component.Config.model_fields.items():
             kinds = {field.annotation, *get_args(field.annotation)} - {NoneType}
             if float in kinds and option not in BEGINNINGS:

@@ -36,7 +36,7 @@ class Steps(Refinement):
         return state.replace(fields=self.moved(state["place.center"], self.step(state.features)))
 
 
-@mutant(CHECK, "reads memory.features")
+@mutant(CHECK, "reads some of memory.features, memory.patch_rays")
 class ReadsMemoryUndeclared(ContentCrossAttention):
     def forward(self, state, memory):
         return super().forward(state, memory) + memory.features.mean(1, keepdim=True)
@@ -56,13 +56,6 @@ class LooksForAField(ContentSelfAttention):
         return super().forward(state) * (2 if "anchor.center" in state else 1)
 
 
-@mutant(CHECK, "reads anchor.raw_radius")
-class ReadsFromACopy(ContentSelfAttention):
-    def forward(self, state):
-        copy = state.replace(2 * state.features)
-        return super().forward(copy) + copy.fields.get("anchor.raw_radius", 0)
-
-
 @mutant(CHECK, "reads anchor.center")
 class ReadsInTraining(ContentSelfAttention):
     def forward(self, state):
@@ -70,14 +63,14 @@ class ReadsInTraining(ContentSelfAttention):
         return super().forward(state) * (0.5 if missing else 1)
 
 
-@mutant(CHECK, "goes through all fields")
+@mutant("writes_equal_provides", "it writes unrelated.center besides")
 class SearchesTheFields(NoRefinement):
     def forward(self, state):
         moved = {name: x + 1 for name, x in state.fields.items() if name.endswith(".center")}
         return state.replace(fields=moved)
 
 
-@mutant(CHECK, "although `renderings` is none")
+@mutant(CHECK, "reads some of rendering.alpha")
 class ReadsAnUndeclaredRendering(Loss):
     renderings = "none"
 
@@ -95,7 +88,11 @@ class ReadsAFieldOfThePrediction(Loss):
         return {"small": small if radius is None else small + radius.mean()}
 
 
-@mutant("requires_are_read", "requires memory.features", also="gradients_reach_inputs")
+@mutant(
+    "requires_are_read",
+    "requires memory.features, which",
+    also="gradients_reach_inputs",
+)
 class RequiresTooMuch(ContentCrossAttention):
     @classmethod
     def requires(cls, config):

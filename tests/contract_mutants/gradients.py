@@ -15,18 +15,16 @@ from qgs.components import (
     FreeCenters,
     MlpFeedForward,
 )
-from qgs.components.blocks import merge_heads
 from qgs.contracts import Loss
 
 
-@mutant("gradients_reach_inputs", "memory.keys, memory.values")
+@mutant("gradients_reach_inputs", "memory.keys, memory.values", also="gradients_match_differences")
 class DetachesTheImages(ContentCrossAttention):
     def forward(self, state, memory):
-        seen = super().forward(state, memory)
-        return self.core.out_proj(merge_heads(self.core.project(state.features))) + 0 * seen
+        return self.core(state.features, memory.keys.detach(), memory.values.detach())
 
 
-@mutant("gradients_reach_inputs", "state.fields.place.center")
+@mutant("gradients_reach_inputs", "state.fields.place.center", also="requires_are_read")
 class MultipliesAFieldByZero(ContentSelfAttention):
     @classmethod
     def requires(cls, config):
@@ -37,7 +35,6 @@ class MultipliesAFieldByZero(ContentSelfAttention):
 
 
 @mutant("gradients_match_differences", "Jacobian")
-@mutant("gradients_reach_inputs", "reaches [0, 1], [1, 1]")
 class DetachesLaterGaussians(FreeCenters):
     def forward(self, offsets, state):
         first, later = offsets[:, :, :1], offsets[:, :, 1:]

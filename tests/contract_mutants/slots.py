@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import count
 
 import torch
 from contract_mutants.mutant import mutant
-from qgs_rooms.source import RoomsSource
 from torch import Tensor, nn
 
 from qgs.components import (
@@ -17,11 +15,20 @@ from qgs.components import (
     LatentQueries,
     LayerSupervision,
     MultiViewViT,
+    OneCycleAdamW,
 )
 from qgs.components.blocks import CrossAttentionCore, split_heads
-from qgs.contracts import MEMORY_FIELDS, AttentionWeights, Column, CrossAttention, Loss
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    AttentionWeights,
+    Column,
+    CrossAttention,
+    Loss,
+    Scene,
+    SceneSource,
+)
 from qgs.metrics import Psnr
-from qgs.types import ImageMemory, LayerPrediction, Rendering, Views
+from qgs.types import Cameras, ImageMemory, LayerPrediction, Rendering, Views
 
 
 class OneTerm(Loss):
@@ -84,13 +91,24 @@ class WeighsTwice(LayerSupervision):
         return {layer: 2 * weight for layer, weight in super().weights().items()}
 
 
-_opened = count()
+class NoiseScene(Scene):
+    """Two frames of another noise each time."""
+
+    name = "noise"
+
+    @property
+    def cameras(self):
+        lens = torch.tensor([16.0, 16.0, 12.0, 8.0]).expand(2, 4)
+        return Cameras(torch.eye(4).expand(2, 4, 4), lens, (16, 24))
+
+    def images(self, frames):
+        return torch.rand(len(frames), 3, 16, 24)
 
 
-@mutant("scenes_repeat", "scene 0 is", case={"image_size": (16, 24)})
-class StartsAtAnotherScene(RoomsSource):
+@mutant("scenes_repeat", "opened again, 1: values differ")
+class DrawsItsImages(SceneSource):
     def scenes(self, split):
-        return super().scenes(split)[next(_opened) :]
+        return [NoiseScene()]
 
 
 @mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
@@ -109,7 +127,7 @@ class TakesTheWorstView(OneTerm):
         return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
 
 
-@mutant("metric_gives_its_columns", "the value of '' is not finite")
+@mutant("metric_gives_its_columns", "the values of the columns [''] are not finite")
 class DividesByTheError(Psnr):
     def forward(self, given):
         return 1 / (given.images - given.targets.images).square().mean((2, 3, 4))
@@ -124,6 +142,21 @@ class GivesAValueWithoutColumn(Psnr):
 @mutant("truth_scores_best", "lower is better, but PSNR is 100 for the truth")
 class ReversesItsDirection(Psnr):
     column = Column("PSNR", "lower")
+
+
+@mutant("optimizer_steps", "it leaves out parameters")
+class OptimizesDecayingGroups(OneCycleAdamW):
+    def build(self, groups):
+        return super().build([group for group in groups if group["decays"]])
+
+
+@mutant("optimizer_continues", "three and three from a checkpoint")
+class CountsItsOwnSteps(OneCycleAdamW):
+    calls = 0
+
+    def learning_rate(self, step, seconds):
+        self.calls += 1
+        return 0.1 / self.calls
 
 
 @mutant("patch_rays_are_those_of_the_grid", "differ by up to 0.9")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -66,6 +67,16 @@ class MovesItsState(ContentSelfAttention):
 
     def forward(self, state):
         return super().forward(state.to(state.features.device))
+
+
+@named
+class KeepsAConstant(MlpFeedForward):
+    @cached_property
+    def half(self):
+        return 0.5
+
+    def forward(self, features):
+        return self.half * super().forward(features)
 
 
 @named

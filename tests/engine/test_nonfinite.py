@@ -13,6 +13,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from torch import Tensor
+from training_runs import Tiny
 
 import qgs
 from qgs.composer import Recipe
@@ -52,7 +53,7 @@ class Step:
 
 
 @pytest.fixture
-def step(tiny: Callable[..., Recipe]) -> Step:
+def step(tiny: Tiny) -> Step:
     return Step(tiny("tokengs", "training.render_views=1"))
 
 

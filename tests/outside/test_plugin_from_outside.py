@@ -1,4 +1,4 @@
-"""A plugin that was written outside this repository, beside the wheels of qgs and query-gaussians-locus."""
+"""A plugin written outside this repository, beside the wheels of qgs and LocusGS."""
 
 from __future__ import annotations
 

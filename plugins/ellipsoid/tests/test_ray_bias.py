@@ -7,9 +7,10 @@ from collections.abc import Callable
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_ellipsoid.clamped_ratio import BLOCK, NUMERATOR
 from qgs_ellipsoid.fields import anchor_rotation
 from qgs_ellipsoid.ray_bias import (
+    BLOCK,
+    NUMERATOR,
     anchor_features,
     ellipsoid_bias,
     ellipsoid_bias_direct,

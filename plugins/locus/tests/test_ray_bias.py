@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from qgs_locus.clamped_product import BLOCK
-from qgs_locus.ray_bias import ray_bias, ray_bias_direct, ray_features
+from qgs_locus.ray_bias import BLOCK, ray_bias, ray_bias_direct, ray_features
 from torch import Tensor
 
 from qgs.geometry.rays import normalised_rays

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -13,12 +14,11 @@ from qgs.composer.recipe import Recipe, resolve
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Fields, Loss, Plugin
 from qgs.testing.case import Case, expect
-from qgs.testing.inputs import Maker, Sizes, inputs_of, required_fields
+from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of, required_fields
 from qgs.testing.modules import each_mode, seeded
-from qgs.testing.recording import Reads, recorded
 from qgs.testing.registry import ALL_SLOTS, MODULES, STATEFUL, check
-from qgs.testing.trees import described, not_finite, scalar
-from qgs.types import QueryState, map_tensors
+from qgs.testing.trees import described, difference, leaves, mapped, not_finite, scalar
+from qgs.types import LayerPrediction, QueryState, map_tensors
 
 PLUGIN = "under_test"
 GIVEN = "given_fields"
@@ -34,53 +34,68 @@ def check_reads_within_requires(case: Case) -> None:
     Looking whether a field is there is asking for it. The other fields are passed on with
     `QueryState.replace`. A loss looks at no rendering if it declares that it needs none.
     """
-    reads, failure = _reads(case)
-    beyond = sorted((reads.asked | _fields_of(reads.numbers)) - set(_required(case)))
-    expect(not beyond, f"it reads {', '.join(beyond)}, which it does not require")
-    expect(
-        not reads.all_asked,
-        "it goes through all fields of the state; read those in `requires` by their names, and "
-        "pass the others on with `state.replace`",
-    )
-    component = case.component
-    if issubclass(component, Loss) and component.renderings == "none":
-        seen = sorted(name for name in reads.numbers if name.startswith("rendering."))
-        expect(not seen, f"it reads {', '.join(seen)}, although `renderings` is none")
-    if failure is not None:
-        raise failure
+    module, inputs, required = case.lively(), inputs_of(case), case.component.requires(case.config)
+    unread = {name for name in leaves(inputs) if name.startswith("memory.")} - set(required)
+    if issubclass(case.component, Loss) and case.component.renderings == "none":
+        inputs["rendering"] = Maker(case, Sizes(), torch.Generator()).rendering(views=2)
+        unread = {name for name in leaves(inputs) if name.startswith("rendering.")}
+    poisoned = mapped(inputs, lambda name, x: x + torch.nan if name in unread else x)
+    for mode in each_mode(module):
+        asked: set[str] = set()
+        with seeded(0):
+            first = module(*_with_asked_fields(inputs, asked).values())
+        beyond = sorted(asked - set(required))
+        expect(not beyond, f"in {mode} it reads {', '.join(beyond)}, which it does not require")
+        with seeded(0):
+            found = difference(first, module(*poisoned.values()))
+        names = ", ".join(sorted(unread))
+        expect(not found, f"in {mode} it reads some of {names}, which it declares not to: {found}")
+
+
+class AskedFields(dict[str, Tensor]):
+    """Fields of a state that add the names they are asked for to `asked`."""
+
+    asked: set[str]
+
+    def __getitem__(self, name: str) -> Tensor:
+        self.asked.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        self.asked.add(str(name))
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """As of any dict."""
+        self.asked.add(name)
+        return super().get(name, default)
+
+
+def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
+    def changed(value: Any) -> Any:
+        if isinstance(value, LayerPrediction):
+            return replace(value, state=changed(value.state))
+        if not isinstance(value, QueryState):
+            return value
+        fields = AskedFields(value.fields)
+        fields.asked = asked
+        return replace(value, fields=fields)
+
+    return {name: changed(value) for name, value in inputs.items()}
 
 
 @check(STATEFUL)
 def check_requires_are_read(case: Case) -> None:
     """Every field in `requires` is read: else recipes that lack it are refused for nothing."""
-    reads, failure = _reads(case)
-    if failure is not None:
-        raise failure
-    idle = sorted(set(_required(case)) - _fields_of(reads.numbers) - reads.numbers)
-    expect(not idle, f"it requires {', '.join(idle)}, which it does not read")
-
-
-def _fields_of(names: set[str]) -> set[str]:
-    """The fields of the state and the tensors of the image memory among tensors of the inputs."""
-    of_state = {name.partition(".fields.")[2] for name in names} - {""}
-    return of_state | {name for name in names if name.startswith("memory.")}
-
-
-def _required(case: Case) -> Fields:
-    return case.component.requires(case.config)
-
-
-def _reads(case: Case) -> tuple[Reads, Exception | None]:
-    """What passes in both modes look at, and the error of the last one, as of a missing field."""
-    module = case.lively()
-    inputs, reads = recorded(inputs_of(case))
-    failure = None
-    for _ in each_mode(module):
-        try:
-            module(*inputs.values())
-        except Exception as error:
-            failure = error
-    return reads, failure
+    module, inputs = case.lively(), inputs_of(case)
+    outputs = module(*inputs.values())
+    for field in case.component.requires(case.config):
+        full = next(name for name in leaves(inputs) if name.endswith(field))
+        others = [leaves(inputs_of(case, seed=seed))[full] for seed in (1, 2, 3)]
+        others.append(leaves(inputs)[full].roll(1, 1))  # rays are the same for every seed
+        changed = [mapped(inputs, lambda n, x, o=o, f=full: o if n == f else x) for o in others]
+        read = any(difference(outputs, module(*given.values())) for given in changed)
+        expect(read, f"it requires {field}, which changes nothing")
 
 
 @check({"refinement", "queries"})
@@ -94,7 +109,7 @@ def check_writes_equal_provides(case: Case) -> None:
         inputs, before = inputs_of(case), {}
         if case.slot == "refinement":
             state = inputs["state"]
-            before = {"unrelated.field": torch.randn(*state.features.shape[:2], 3), **state.fields}
+            before = {"unrelated.center": torch.randn(*state.features.shape[:2], 3), **state.fields}
             inputs = {"state": QueryState(state.features, before)}
         with seeded(0):
             output = module(*inputs.values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Iterator
@@ -9,9 +10,16 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from qgs.contracts import AttentionWeights, Loss, Metric, MetricInput
+from qgs.contracts import (
+    AttentionWeights,
+    Loss,
+    Metric,
+    MetricInput,
+    Optimizer,
+    ParameterGroup,
+)
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.testing.case import CannotCheck, Case, expect
 from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of
@@ -173,8 +181,8 @@ def check_metric_gives_its_columns(case: Case) -> None:
         values, again = (_values(module, given) for _ in range(2))
         keys = sorted(module.columns())
         expect(sorted(values) == keys, f"it has values for {sorted(values)}, columns for {keys}")
-        broken = not_finite(values)
-        expect(not broken, f"the value of {', '.join(map(repr, broken))} is not finite")
+        broken = [key for key, value in values.items() if not value.isfinite().all()]
+        expect(not broken, f"the values of the columns {broken} are not finite")
         expect(not difference(values, again), f"the second time {difference(values, again)}")
         found = difference(before, given)
         expect(not found, f"it changes what it is given: {found}")
@@ -220,6 +228,70 @@ def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
     return {"": values} if isinstance(values, Tensor) else dict(values)
 
 
+@check({"optimizer"})
+def check_optimizer_steps(case: Case) -> None:
+    """Steps move all parameters that have gradients and no others, at finite learning rates.
+
+    Its groups hold all parameters that it was given, with the `factor` of their learning rate.
+    """
+    run = _Optimization(case)
+    given = [x for group in run.torch_optimizer.param_groups for x in group["params"]]
+    expect({*map(id, given)} == {*map(id, run.weights)}, "it leaves out parameters, or adds some")
+    lost = [group for group in run.torch_optimizer.param_groups if "factor" not in group]
+    expect(not lost, "a group of its own has no `factor`, by which its learning rate is scaled")
+    before = cloned(run.weights)
+    run.step(range(3))
+    expect(not not_finite(run.weights), "after three steps a parameter is not finite")
+    still = [torch.equal(old, new) for old, new in zip(before, run.weights, strict=True)]
+    expect(not any(still[:2]), "three steps leave a parameter with a gradient as it was")
+    expect(still[2], "it moves a parameter that has no gradient")
+
+
+@check({"optimizer"})
+def check_optimizer_continues(case: Case) -> None:
+    """Restored from its `state`, and from what torch's optimiser keeps of each parameter, an
+    optimiser goes on as if it had not stopped, to the bit."""
+    straight, first, second = _Optimization(case), _Optimization(case), _Optimization(case)
+    straight.step(range(6))
+    first.step(range(3))
+    with torch.no_grad():
+        for theirs, ours in zip(first.weights, second.weights, strict=True):
+            ours.copy_(theirs)
+            kept = first.torch_optimizer.state.get(theirs, {})
+            second.torch_optimizer.state[ours] = copy.deepcopy(kept)
+    second.optimizer.load_state(json.loads(json.dumps(dict(first.optimizer.state()))))
+    second.step(range(3, 6))
+    found = difference(straight.weights, second.weights)
+    expect(not found, f"after six steps, or three and three from a checkpoint, {found}")
+
+
+class _Optimization:
+    """Three parameters and their optimiser: one decays, one does not, one gets no gradient."""
+
+    def __init__(self, case: Case) -> None:
+        generator = torch.Generator().manual_seed(0)
+        self.weights = [nn.Parameter(torch.randn(4, 3, generator=generator)) for _ in range(3)]
+        self.optimizer: Optimizer = case.build()
+        self.torch_optimizer = self.optimizer.build(
+            [
+                ParameterGroup(params=self.weights[::2], decays=True, factor=1.0),
+                ParameterGroup(params=self.weights[1:2], decays=False, factor=0.5),
+            ]
+        )
+
+    def step(self, steps: range) -> None:
+        """As training does, with other gradients in every step."""
+        for step in steps:
+            rate = self.optimizer.learning_rate(step, float(step))
+            expect(0 <= rate < math.inf, f"the learning rate of step {step} is {rate}")
+            for group in self.torch_optimizer.param_groups:
+                group["lr"] = rate * group.get("factor", 1.0)
+            generator = torch.Generator().manual_seed(step)
+            for weights in self.weights[:2]:
+                weights.grad = torch.randn(weights.shape, generator=generator)
+            self.torch_optimizer.step()
+
+
 @check({"encoder"})
 def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
     """`grid` counts the patches of each view, `patch_rays` are their mean rays, in its order."""
@@ -245,7 +317,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         memory = module(views)
         patch, grid = _patch_size(where, views, memory), memory.grid
         tokens = torch.randperm(math.prod(grid), generator=torch.Generator().manual_seed(0))
-        places = [_place(int(token), grid) for token in tokens[:PATCHES]]
+        places = _places(tokens[:PATCHES], grid)
         changed = module(_one_patch_each(views, places, patch))
         for name in ("keys", "values", "features"):
             change = (getattr(changed, name) - getattr(memory, name)).square().sum(-1)
@@ -253,7 +325,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
             if not change.any():
                 expect(name == "keys", f"{where}, `{name}` stays as it is when the images change")
                 continue
-            moved = [_place(int(token), grid) for token in change.argmax(-1)]
+            moved = _places(change.argmax(-1), grid)
             astray = [pair for pair in zip(places, moved, strict=True) if pair[0] != pair[1]]
             one, other = astray[0] if astray else (None, None)
             expect(
@@ -282,9 +354,8 @@ def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
     return patch
 
 
-def _place(token: int, grid: Patch) -> Patch:
-    _, rows, columns = grid
-    return token // (rows * columns), token // columns % rows, token % columns
+def _places(tokens: Tensor, grid: Patch) -> list[Patch]:
+    return [*zip(*(x.tolist() for x in torch.unravel_index(tokens, grid)), strict=True)]
 
 
 def _one_patch_each(views: Views, places: list[Patch], patch: int) -> Views:
@@ -362,8 +433,9 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
 def _lengths(update: Tensor, values: Tensor) -> Tensor:
     """(B, h, M) of the gradients of a query's `update` (B, D) in `values` (B, h, M, d)."""
     direction = torch.randn(update.shape, generator=torch.Generator().manual_seed(0))
-    (gradient,) = torch.autograd.grad(update, values, direction.to(update), retain_graph=True)
-    return gradient.norm(dim=-1)
+    total = (direction.to(update) * update).sum()
+    (found,) = torch.autograd.grad(total, values, retain_graph=True, allow_unused=True)
+    return values.new_zeros(values.shape[:-1]) if found is None else found.norm(dim=-1)
 
 
 def _explanation(module: Any, inputs: Inputs) -> AttentionWeights | None:

@@ -87,7 +87,6 @@ class RoomScene(Scene):
     @cached_property
     def room(self) -> Room:
         """The furnished room."""
-        from qgs_rooms.plan import furnish
 
         return furnish(Random(self._plan_seed), self.size, self._c2w[:, :3, 3])
 
