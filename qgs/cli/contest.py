@@ -98,7 +98,7 @@ def table_of(entries: Sequence[Entry]) -> Table:
     rows = [entry.contender for entry in entries]
     columns = entries[0].evaluation.columns
     table = Table(title="Unseen scenes", caption="best in green", box=box.SIMPLE_HEAD)
-    table.pad_edge = False
+    table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
     headings = [column.title for column in columns.values()]
     for heading in (*headings, "Gaussians", "parameters", "seconds"):
