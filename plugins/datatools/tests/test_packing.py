@@ -15,6 +15,7 @@ from upath import UPath
 
 from qgs.cli import app
 from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
+from qgs.data.paths import opened_path
 
 SIZE = (24, 32)
 GIVEN = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 25.0}
@@ -321,3 +322,25 @@ def test_the_command_packs_the_data_of_a_recipe(tmp_path):
     for split in ("train", "test"):
         for one, other in zip(before.scenes(split), after.scenes(split), strict=True):
             same(one, other, 1e-6)
+
+
+@pytest.fixture(params=["{}", "file://{}", "memory://urls{}"])
+def folder(request, tmp_path) -> UPath:
+    return opened_path(request.param.format(tmp_path / "folder"))
+
+
+def write_half(file: UPath) -> None:
+    with packing.opened_replacing(file) as opened:
+        opened.write(b"half")
+        raise KeyError
+
+
+def test_files_appear_whole_or_not_at_all(folder):
+    file = folder / "a.bin"
+    packing.write_bytes(file, b"first")
+    with pytest.raises(KeyError):
+        write_half(file)
+    assert file.read_bytes() == b"first"
+    packing.write_bytes(file, b"second")
+    assert file.read_bytes() == b"second"
+    assert [item.name for item in folder.iterdir()] == ["a.bin"]
