@@ -37,7 +37,7 @@ def read(convention, stored: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("convention", "name", "write"), WRITTEN_AND_READ)
 def test_a_misreading_gives_the_true_poses_back(convention, name, write):
     first, second = (shot.c2w for shot in walk(2))
-    meant = convention.misreadings[name].meant
+    meant = convention[name].meant
     as_meant = [meant(read(convention, write(pose))) for pose in (first, second)]
     relative = np.linalg.inv(as_meant[1]) @ as_meant[0]
     assert relative == pytest.approx(np.linalg.inv(second) @ first)
