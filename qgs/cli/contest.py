@@ -20,8 +20,10 @@ from qgs.drawing.figures import Curves
 from qgs.engine import Evaluation, RunFolder, evaluate, train
 from qgs.io.ply import write_ply
 
-SAME = ("data", "views", "evaluation", "metrics", "training")
+SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
+
+PICTURED_SCENES = 3
 
 
 class StoppedError(Exception):
@@ -95,35 +97,26 @@ def table_of(entries: Sequence[Entry]) -> Table:
     """The comparison as a table for the terminal."""
     rows = [entry.contender for entry in entries]
     columns = entries[0].evaluation.columns
-    table = Table(
-        title="Unseen scenes",
-        caption="best in green",
-        box=box.SIMPLE_HEAD,
-        collapse_padding=True,
-        pad_edge=False,
-    )
+    table = Table(title="Unseen scenes", caption="best in green", box=box.SIMPLE_HEAD)
+    table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
     headings = [column.title for column in columns.values()]
     for heading in (*headings, "Gaussians", "parameters", "seconds"):
         table.add_column(heading, justify="right")
     best = {name: column.best(c.scores[name] for c in rows) for name, column in columns.items()}
     for c in rows:
-        cells = [
-            f"[green]{column.shown(c.scores[name])}[/green]"
-            if c.scores[name] is not None and c.scores[name] == best[name]
-            else column.shown(c.scores[name])
-            for name, column in columns.items()
-        ]
-        cells += [f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}"]
-        table.add_row(c.name, *cells)
+        cells = []
+        for name, column in columns.items():
+            score, cell = c.scores[name], column.shown(c.scores[name])
+            is_best = score is not None and score == best[name]
+            cells.append(f"[green]{cell}[/green]" if is_best else cell)
+        sizes = (f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}")
+        table.add_row(c.name, *cells, *sizes)
     table.add_section()
     for b in baselines(entries[0]):
         cells = [column.shown(b.scores[name]) for name, column in columns.items()]
         table.add_row(b.name, *cells, *["–"] * 3, style="dim")
     return table
-
-
-PICTURED_SCENES = 3
 
 
 def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
