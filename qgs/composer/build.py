@@ -16,14 +16,7 @@ from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.flow import fits
 from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
-from qgs.contracts import (
-    ModelComponent,
-    ModelDims,
-    Optimizer,
-    Queries,
-    Refinement,
-    SceneSource,
-)
+from qgs.contracts import ModelComponent, ModelDims, Optimizer, Queries, Refinement, SceneSource
 from qgs.contracts.component import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
 from qgs.types import QueryState

@@ -139,11 +139,6 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
     return Registry(plugins), broken
 
 
-def plugin_versions(names: Iterable[str]) -> dict[str, str]:
-    """Plugin name to the version of its distribution, `qgs` included; raises PluginError."""
-    return {name: plugin.version for name, plugin in load_registry(names).plugins.items()}
-
-
 def load_plugin(name: str) -> InstalledPlugin:
     """Import and check the plugin `name`; raises PluginError."""
     if name == BUILTIN.name:
