@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -62,7 +61,8 @@ def evaluate(
 ) -> None:
     """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour.
 
-    With --compare nothing is evaluated: the results in several RUNs are compared, scene by scene.
+    With --compare nothing is evaluated: the results in the first RUN are compared with those in
+    each of the others, scene by scene, and written to --out where it is given.
     """
     settings = list(overrides or ())
     if index is not None:
@@ -77,7 +77,15 @@ def evaluate(
                 f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
                 "evaluate each run with these settings first"
             )
-        compare_results(runs, across_protocols, out, console)
+        from qgs.engine.comparison import compare as compared
+        from qgs.engine.results import read_results
+
+        comparisons = compared([read_results(run) for run in runs], across_protocols)
+        comparisons.show(console)
+        if out:
+            comparisons.write(out)
+        end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
+        console.print(end, soft_wrap=True)
         return
     if len(runs) > 1 or across_protocols:
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
@@ -146,23 +154,3 @@ def evaluate_into(
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)
     return evaluation
-
-
-def compare_results(
-    runs: Sequence[Path], across_protocols: bool, out: Path | None, console: Console
-) -> None:
-    """Compare the results in the first folder with those in each of the others.
-
-    out: folder for comparison.json and comparison.md; None writes nothing.
-    """
-    from qgs.engine.comparison import compare
-    from qgs.engine.results import read_results
-
-    results = [read_results(run) for run in runs]
-    comparisons = compare(results, across_protocols)
-    comparisons.show(console)
-    if out is None:
-        console.print("add --out FOLDER to keep this as JSON and Markdown")
-        return
-    comparisons.write(out)
-    console.print(f"written to {out}", soft_wrap=True)
