@@ -31,16 +31,12 @@ def photos(path, frames: int = 4, suffix=".png", convert=lambda image: image, ma
     entries = []
     (path / "images").mkdir(parents=True, exist_ok=True)
     for i in range(frames):
-        file = io.BytesIO()
-        convert(noise(i)).save(file, Image.registered_extensions()[suffix])
-        (path / "images" / f"{i}{suffix}").write_bytes(file.getvalue())
+        convert(noise(i)).save(path / "images" / f"{i}{suffix}")
         pose = np.eye(4)
         pose[:3, 3] = 0.3 * i, 5.1, -1000.7
         entry = {"file_path": f"images/{i}{suffix}", "transform_matrix": pose.tolist()}
         if mask and i % 2:
-            file = io.BytesIO()
-            noise(100 + i).convert("L").save(file, "PNG")
-            (path / f"mask{i}.png").write_bytes(file.getvalue())
+            noise(100 + i).convert("L").save(path / f"mask{i}.png")
             entry["mask_path"] = f"mask{i}.png"
         entries.append(entry)
     (path / "transforms.json").write_text(json.dumps({**GIVEN, **top, "frames": entries}))
