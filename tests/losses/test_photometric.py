@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs.losses import Photometric
 from qgs.losses.visibility import view_visibility
-from qgs.metrics import psnr, ssim
+from qgs.metrics.images import psnr, ssim
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "loss_a.safetensors"
