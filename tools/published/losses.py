@@ -63,7 +63,7 @@ def read_inputs(golden: GoldenFile, images: bool) -> LossInputs:
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
 
     def read(name: str, *shape: int) -> Tensor:
-        return golden.input(name) if images else golden.input_or(name, torch.ones(shape))
+        return golden.input(name) if images or name in golden.tensors else torch.ones(shape)
 
     views = cameras.c2w.shape[:2]
     colours, pixels = (*views, 3, *golden.size), (*views, 1, *golden.size)
@@ -98,7 +98,8 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     for threshold in _thresholds(golden):
         found |= _visibility(inputs, threshold)
     for release, ssim in wholes:
-        terms = _whole_loss(inputs, release, golden.released(f"{release}_options"), ssim)
+        options = ReleasedOptions(golden.options(f"{release}_options"))
+        terms = _whole_loss(inputs, release, options, ssim)
         found |= {f"{EXPECTED}{release}.{ssim}.{name}": term for name, term in terms.items()}
     return found
 

@@ -25,11 +25,6 @@ DIMS = ModelDims(width=16, heads=2, depth=2)
 HALF = math.sqrt(0.5)
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _state(batch: int = 2, count: int = 5) -> QueryState:
     fields = {
         CENTER: torch.randn(batch, count, 3),

@@ -26,11 +26,6 @@ CHOSEN = {"sigma0": 0.3, "sigma_sq_min": 1e-5, "bias_min": -7.0, "gamma_init": 0
 OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _radii(raw: Tensor) -> Tensor:
     return F.softplus(raw) + 0.05
 

@@ -23,11 +23,6 @@ from torch import Tensor
 ONE = torch.ones((), dtype=torch.float64)
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _lines(count: int) -> tuple[Tensor, Tensor]:
     """Origins and directions (2, count, 3), float64."""
     origins = 0.5 * torch.randn(2, count, 3, dtype=torch.float64)

@@ -17,11 +17,6 @@ def _rays(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.cat([torch.linalg.cross(origins, directions), directions], -1) * 0.97
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 @pytest.mark.parametrize("bandwidth", ["radius", "fixed"])
 def test_factored_equals_direct(bandwidth: str) -> None:
     center, rays, gamma = torch.randn(2, 50, 3), _rays(200), torch.tensor(0.1)
