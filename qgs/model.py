@@ -1,7 +1,5 @@
 """The model: views to image memory, queries through the decoder layers, states to Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 

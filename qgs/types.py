@@ -11,8 +11,6 @@ Frames: "world" is the frame of the first input camera once poses are normalised
 Containers are frozen. A component returns a new one and never writes into the one it was given.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -132,7 +130,7 @@ class Cameras(TensorContainer):
         translation = -rotation @ self.c2w[..., :3, 3:]
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
 
-    def __getitem__(self, index: Any) -> Cameras:
+    def __getitem__(self, index: Any) -> Self:
         return map_tensors(lambda x: x[index], self)
 
 
@@ -162,7 +160,7 @@ class Views(TensorContainer):
                 f"Views.cameras {tuple(self.cameras.shape)}"
             )
 
-    def select(self, index: Any) -> Views:
+    def select(self, index: Any) -> Self:
         """The views at `index` of every scene (a slice or a list of ints)."""
         return map_tensors(lambda x: x[:, index], self)
 
@@ -233,7 +231,7 @@ class QueryState(TensorContainer):
 
     def replace(
         self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
-    ) -> QueryState:
+    ) -> "QueryState":
         """A new state with other features and with `fields` added or replaced."""
         return QueryState(
             self.features if features is None else features, {**self.fields, **(fields or {})}
@@ -285,7 +283,7 @@ class Gaussians(TensorContainer):
         """Gaussians per scene."""
         return self.means.shape[-2]
 
-    def __getitem__(self, index: Any) -> Gaussians:
+    def __getitem__(self, index: Any) -> Self:
         return map_tensors(lambda x: x[index], self)
 
 

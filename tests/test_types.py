@@ -1,7 +1,5 @@
 """Containers refuse what does not fit together, where it is made."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

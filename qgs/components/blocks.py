@@ -3,8 +3,6 @@
 Axes: B scenes, T tokens, N queries, M image tokens, Q chosen queries, D width, h heads, d = D/h.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from einops import rearrange

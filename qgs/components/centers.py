@@ -1,7 +1,5 @@
 """`qgs/free`: means straight from the head's offsets, anywhere in the world (TokenGS)."""
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The default decoder layer: attention by content alone, an MLP, no refinement (TokenGS)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field

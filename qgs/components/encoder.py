@@ -1,7 +1,5 @@
 """`qgs/multiview_vit`: a small ViT over the patches of all views together (TokenGS release)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """`qgs/gaussian_head`: one linear layer from a query to its Gaussians (TokenGS, LocusGS)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import ClassVar

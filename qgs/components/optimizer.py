@@ -1,7 +1,5 @@
 """AdamW with a one-cycle learning rate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeAlias

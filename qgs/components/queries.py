@@ -1,7 +1,5 @@
 """`qgs/latent`: learned queries without a position (TokenGS)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

@@ -1,7 +1,5 @@
 """`qgs/layers`: a set of supervised layers, later ones weighing more (LocusGS)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Slot `data`: where scenes come from."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal, TypeAlias

@@ -1,7 +1,5 @@
 """Slots `losses` and `supervision`: what training minimises, and after which layers."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar, Literal, TypeAlias

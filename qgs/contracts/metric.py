@@ -1,7 +1,5 @@
 """Slot `metrics`: how good a reconstruction is."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

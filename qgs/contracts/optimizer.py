@@ -1,7 +1,5 @@
 """Slot `optimizer`: how gradients change the weights, and how fast."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeAlias, TypedDict

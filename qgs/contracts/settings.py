@@ -1,7 +1,5 @@
 """Sections of a recipe that are not components: views, training, evaluation."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, field_validator

@@ -1,7 +1,5 @@
 """Weights that other codebases publish: their names for our parameters, and recipes that fit."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping

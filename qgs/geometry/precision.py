@@ -1,7 +1,5 @@
 """Float32 or better for geometry, also inside autocast."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps

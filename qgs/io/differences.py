@@ -1,7 +1,5 @@
 """In what two state dicts, or two recipes, differ: the lines that messages list."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Files appear whole or not at all, on disk and behind URLs; files of JSON records."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

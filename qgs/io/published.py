@@ -1,7 +1,5 @@
 """Published state dicts and ours: which parameter is which, and which recipe fits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Files of published weights: safetensors, or torch's own, whose code is never run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

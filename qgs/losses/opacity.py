@@ -1,7 +1,5 @@
 """`qgs/opacity`, `qgs/mask`: Gaussians become opaque, alpha becomes the mask (TokenGS release)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field

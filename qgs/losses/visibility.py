@@ -1,7 +1,5 @@
 """`qgs/visibility`: moves points that no target view sees towards the nearest one (TokenGS)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import ClassVar, Literal
 

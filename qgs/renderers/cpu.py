@@ -1,7 +1,5 @@
 """`qgs/cpu`: projection and blending by tiles of 16 x 16 pixels, in numba."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec

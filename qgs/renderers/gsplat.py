@@ -1,7 +1,5 @@
 """`qgs/gsplat`: the CUDA kernels of gsplat 1.5.3."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from importlib import import_module
 from importlib.util import find_spec

@@ -3,8 +3,6 @@
 EWA projection after Zwicker et al. 2001 and gsplat 1.5.3.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The TokenGS components, each on its own."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Every limit and epsilon of the releases is an option: published by default, and it matters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The comparison on files of other sizes and options, and on files with something wrong."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from typing import Any

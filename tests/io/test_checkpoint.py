@@ -1,7 +1,5 @@
 """Checkpoints: the same model back, or a reason."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle  # noqa: TID251

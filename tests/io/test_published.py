@@ -1,7 +1,5 @@
 """Published state dicts under our names and back; what no layout can hold is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

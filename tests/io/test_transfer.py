@@ -1,7 +1,5 @@
 """Published weights in and out of checkpoints: bit-equal, or nothing is written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

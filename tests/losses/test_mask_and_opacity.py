@@ -1,7 +1,5 @@
 """The mask and opacity losses against the released code."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The photometric loss: its options, and finite gradients; golden/test_files.py has the numbers."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

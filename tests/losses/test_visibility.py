@@ -1,7 +1,5 @@
 """Gradients and options of visibility; golden/test_files.py compares it with the released code."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """What every renderer owes, checked against float64 autograd of the dense oracle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

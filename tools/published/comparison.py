@@ -1,7 +1,5 @@
 """How far two tensors are apart, and whether that is small enough."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

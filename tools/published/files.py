@@ -1,7 +1,5 @@
 """A file of golden numbers: tensors, and in its metadata what they were computed with."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

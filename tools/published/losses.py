@@ -3,11 +3,10 @@
 `refssim` means SSIM with zero padding ("same"), as in training here.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from qgs_locus.fields import CENTER
@@ -43,7 +42,7 @@ class LossInputs(TensorContainer):
     target: Views
     has_mask: Tensor
 
-    def scenes(self) -> Iterator[LossInputs]:
+    def scenes(self) -> Iterator[Self]:
         """Each scene as a batch of one."""
         for index in range(len(self.has_mask)):
             yield map_tensors(lambda x, one=slice(index, index + 1): x[one], self)

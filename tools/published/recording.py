@@ -3,8 +3,6 @@
 tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial

@@ -1,7 +1,5 @@
 """Anchors, refinement, decoding and head, each on its own."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """With three equal radii and a shape that does not turn it is LocusGS, in every tensor."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

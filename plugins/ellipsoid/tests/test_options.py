@@ -1,7 +1,5 @@
 """Every option does what it says: each component, with options off their defaults, by formula."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

@@ -1,7 +1,5 @@
 """The factored bias against its definition, and the definition against a search along the ray."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Anchors, refinement and decoding, each on its own."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The factored bias against the formula of the paper, and its invariances."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from qgs_locus.ray_bias import BLOCK, ray_bias, ray_bias_direct, ray_features

@@ -1,7 +1,5 @@
 """LocusGS's published layout: sizes and variants are read off names and shapes."""
 
-from __future__ import annotations
-
 import pytest
 from qgs_locus.weights import LOCUSGS
 
