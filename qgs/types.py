@@ -33,10 +33,9 @@ class TensorContainer:
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """`value` with `function(tensor)` in place of every tensor.
+    """`value` with `function(tensor)` for each tensor in containers, mappings, lists and tuples.
 
-    Goes into containers, mappings, lists and tuples. A part in which no tensor changes is returned
-    itself, not copied.
+    A part in which no tensor changes is returned itself, not copied.
     """
     if isinstance(value, Tensor):
         return function(value)
@@ -54,10 +53,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """Every tensor in `value` with its dotted name, such as `gaussians.means`.
-
-    Goes where `map_tensors` goes. name: that of `value` itself, put before the others.
-    """
+    """Every tensor that `map_tensors` finds, with its dotted name; `name` is that of `value`."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, TensorContainer | Mapping | list | tuple):
@@ -73,7 +69,7 @@ def _items(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _check_shapes(
-    container: TensorContainer, known: Mapping[str, int] | None = None, **shapes: str
+    container: TensorContainer, known: Mapping[str, int] | None = None, /, **shapes: str
 ) -> None:
     """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
 
@@ -238,6 +234,9 @@ class QueryState(TensorContainer):
         )
 
 
+_OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "colors": "... 3"}
+
+
 @dataclass(frozen=True)
 class GaussianAttributes(TensorContainer):
     """What a head reads off each query; everything of a Gaussian but its mean.
@@ -254,9 +253,7 @@ class GaussianAttributes(TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        _check_shapes(
-            self, offsets="... 3", scales="... 3", quats="... 4", opacities="...", colors="... 3"
-        )
+        _check_shapes(self, offsets="... 3", **_OF_GAUSSIANS)
 
 
 @dataclass(frozen=True)
@@ -274,9 +271,7 @@ class Gaussians(TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        _check_shapes(
-            self, means="... 3", scales="... 3", quats="... 4", opacities="...", colors="... 3"
-        )
+        _check_shapes(self, means="... 3", **_OF_GAUSSIANS)
 
     @property
     def count(self) -> int:

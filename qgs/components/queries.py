@@ -27,9 +27,7 @@ class LatentQueries(Queries):
 
     @property
     def count(self) -> int:
-        """N."""
         return self.features.shape[0]
 
     def forward(self, batch_size: int) -> QueryState:
-        """Features (B, N, D), no fields."""
         return QueryState(self.features.expand(batch_size, -1, -1))

@@ -46,11 +46,11 @@ def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
     same = (ours == theirs) | (ours.isnan() & theirs.isnan())
     error = (ours - theirs).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0)
     relative = (error / theirs.abs()).nan_to_num(torch.inf)[(theirs != 0) & (error > 0)]
-    largest = [float(errors.max()) if errors.numel() else 0.0 for errors in (error, relative)]
+    absolute, relative = (float(x.max()) if x.numel() else 0.0 for x in (error, relative))
     close = torch.isclose(ours, theirs, rtol=RTOL, atol=ATOL, equal_nan=True)
     beyond = int((~close).sum())
     problem = f"{beyond} of {close.numel()} beyond tolerance" if beyond else ""
-    return Row(name, shape, *largest, problem)
+    return Row(name, shape, absolute, relative, problem)
 
 
 def table(rows: list[Row]) -> Iterator[str]:

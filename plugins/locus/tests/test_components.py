@@ -15,7 +15,7 @@ from qgs_locus.self_attention import sine_embedding
 from qgs import QueryState
 from qgs.components import posact
 from qgs.composer import RecipeError, resolve
-from qgs.contracts import ModelDims
+from qgs.contracts import ModelDims, Problem
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
 
@@ -133,6 +133,13 @@ LOCUS = {"recipe": 1, "plugins": ["locus"]}
 ANCHORED = {"queries": {"type": "locus/anchored"}}
 
 
+def problem_of(model: dict) -> Problem:
+    with pytest.raises(RecipeError) as caught:
+        resolve({**LOCUS, "model": model})
+    (problem,) = caught.value.problems
+    return problem
+
+
 @pytest.mark.parametrize(
     ("model", "path"),
     [
@@ -152,9 +159,7 @@ def test_options_without_effect_are_refused(model: dict, path: str) -> None:
     kinds = {"refinement": "locus/refine", "cross_attention": "locus/ray_biased"}
     for slot, options in model.get("decoder", {}).items():
         model["decoder"] = {slot: {"type": kinds[slot], **options}}
-    with pytest.raises(RecipeError) as caught:
-        resolve({**LOCUS, "model": {**ANCHORED, **model}})
-    (problem,) = caught.value.problems
+    problem = problem_of({**ANCHORED, **model})
     assert problem.option.endswith(path)
     assert "no effect" in problem.reason or "nothing is refined" in problem.reason
 
@@ -176,9 +181,7 @@ def test_idle_options_at_their_defaults_compose_again() -> None:
     ],
 )
 def test_without_anchors_the_fix_is_to_use_anchored_queries(decoder: dict) -> None:
-    with pytest.raises(RecipeError) as caught:
-        resolve({**LOCUS, "model": {"decoder": decoder}})
-    (problem,) = caught.value.problems
+    problem = problem_of({"decoder": decoder})
     assert "use `locus/anchored` in the slot `queries`" in problem.fix
     assert "locus/refine" not in problem.fix
 
@@ -186,9 +189,7 @@ def test_without_anchors_the_fix_is_to_use_anchored_queries(decoder: dict) -> No
 def test_option_of_another_kind_of_start_is_no_suggestion() -> None:
     center_init = {"kind": "frustum", "mean": [0.0, 0.0, 1.0]}
     queries = {"type": "locus/anchored", "center_init": center_init}
-    with pytest.raises(RecipeError) as caught:
-        resolve({**LOCUS, "model": {"queries": queries}})
-    (problem,) = caught.value.problems
+    problem = problem_of({"queries": queries})
     assert problem.reason == "there is no option `mean`"
     assert problem.fix == "options: depth, kind, slope"
 
@@ -196,7 +197,5 @@ def test_option_of_another_kind_of_start_is_no_suggestion() -> None:
 @pytest.mark.parametrize("depth", [[0.0, 1.0], [2.0, 1.0], [-1.0, 1.0], [1.0]])
 def test_frustum_needs_ordered_positive_depths(depth: list[float]) -> None:
     queries = {"type": "locus/anchored", "center_init": {"kind": "frustum", "depth": depth}}
-    with pytest.raises(RecipeError) as caught:
-        resolve({**LOCUS, "model": {"queries": queries}})
-    (problem,) = caught.value.problems
+    problem = problem_of({"queries": queries})
     assert problem.option == "model.queries.center_init.depth"
