@@ -42,9 +42,8 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
     try:
         dict(component.requires(config))
         asked = "provides"
-        beyond = component.provides(config).keys() - _writable(
-            component, component.provides(config)
-        )
+        provided = component.provides(config)
+        beyond = provided.keys() - _writable(component, provided)
         if issubclass(component, Supervision):
             asked = "weights"
             dict(component(config).weights())
