@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
-from qgs.contracts import AttentionWeights, CrossAttention, SelfAttention
+from qgs.contracts import AttentionWeights
 from qgs.model import DecoderLayer, QueryGaussianModel
 from qgs.types import ImageMemory, QueryState, map_tensors
 
@@ -115,7 +115,7 @@ class _Recorder:
             self.record.layers[number] = LayerTrace(before=self._chosen(state))
 
     @torch.no_grad()
-    def _explain(self, part: str, module: CrossAttention | SelfAttention, args: Any) -> None:
+    def _explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
         layer = self.record.layers[self.current]
         weights = module.explain(*args, self.record.queries.to(args[0].features.device))
         setattr(layer, part, weights)

@@ -8,7 +8,6 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import typer
@@ -23,8 +22,10 @@ from qgs.drawing.figures import Curves
 from qgs.engine import Evaluation, RunFolder, evaluate, train
 from qgs.io.ply import write_ply
 
-SAME = ("data", "views", "evaluation", "metrics", "training")
+SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
+
+PICTURED_SCENES = 3
 
 
 @dataclass(frozen=True)
@@ -92,22 +93,23 @@ def baselines(entry: Entry) -> list[Baseline]:
 
 def table_of(entries: Sequence[Entry]) -> Table:
     """The comparison as a table for the terminal."""
-    contenders = [entry.contender for entry in entries]
+    rows = [entry.contender for entry in entries]
     columns = entries[0].evaluation.columns
-    compact: dict[str, Any] = {"box": box.SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
-    table = Table(title="Unseen scenes", caption="best in green", **compact)
+    table = Table(title="Unseen scenes", caption="best in green", box=box.SIMPLE_HEAD)
+    table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
     headings = [column.title for column in columns.values()]
     for heading in (*headings, "Gaussians", "parameters", "seconds"):
         table.add_column(heading, justify="right")
-    for c in contenders:
+    best = {name: column.best(c.scores[name] for c in rows) for name, column in columns.items()}
+    for c in rows:
         cells = []
         for name, column in columns.items():
-            best = column.best(other.scores[name] for other in contenders)
-            cell, score = column.shown(c.scores[name]), c.scores[name]
-            cells.append(f"[green]{cell}[/green]" if score is not None and score == best else cell)
-        cells += [f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}"]
-        table.add_row(c.name, *cells)
+            score, cell = c.scores[name], column.shown(c.scores[name])
+            is_best = score is not None and score == best[name]
+            cells.append(f"[green]{cell}[/green]" if is_best else cell)
+        sizes = (f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}")
+        table.add_row(c.name, *cells, *sizes)
     table.add_section()
     for b in baselines(entries[0]):
         cells = [column.shown(b.scores[name]) for name, column in columns.items()]

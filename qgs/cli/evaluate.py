@@ -51,7 +51,8 @@ def evaluate(
 ) -> None:
     """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour.
 
-    With --compare nothing is evaluated: the results in several RUNs are compared, scene by scene.
+    With --compare nothing is evaluated: the results in the first RUN are compared with those in
+    each of the others, scene by scene, and written to --out where it is given.
     """
     settings = list(overrides or ())
     if index is not None:
@@ -66,15 +67,15 @@ def evaluate(
                 f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
                 "evaluate each run with these settings first"
             )
-        from qgs.engine.comparison import compare as compare_results
+        from qgs.engine.comparison import compare as compared
         from qgs.engine.results import read_results
 
-        comparisons = compare_results([read_results(run) for run in runs], across_protocols)
+        comparisons = compared([read_results(run) for run in runs], across_protocols)
         comparisons.show(console)
         if out:
             comparisons.write(out)
-        done = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
-        console.print(done, soft_wrap=True)
+        end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
+        console.print(end, soft_wrap=True)
         return
     if len(runs) > 1 or across_protocols:
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")

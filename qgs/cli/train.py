@@ -74,4 +74,4 @@ def with_absolute_path(recipe: Recipe) -> Recipe:
     tree = {**recipe.tree, "evaluation": absolute(recipe.tree["evaluation"], "index")}
     if tree.get("data"):
         tree["data"] = absolute(tree["data"], "path", "test_scenes")
-    return replace(recipe, tree=tree)
+    return recipe if tree == recipe.tree else replace(recipe, tree=tree)

@@ -1,19 +1,15 @@
 """Slot `metrics`: how good a reconstruction is."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from qgs.contracts.component import Component, ComponentConfig
+from qgs.contracts.component import Component
 from qgs.types import Gaussians, TensorContainer, Views
-
-Need: TypeAlias = Literal["masks", "gaussians", "depth", "true_depth"]
 
 
 @dataclass(frozen=True)
@@ -75,13 +71,9 @@ class Metric(Component, torch.nn.Module):
     slot: ClassVar[str] = "metrics"
     definition: ClassVar[str] = ""
     not_in_protocol: ClassVar[frozenset[str]] = frozenset()
-    needs: ClassVar[tuple[Need, ...]] = ()
+    needs: ClassVar[tuple[Literal["masks", "gaussians", "depth", "true_depth"], ...]] = ()
     column: ClassVar[Column]
     unavailable: str = ""
-
-    def __init__(self, config: ComponentConfig) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
 
     def columns(self) -> Mapping[str, Column]:
         """How values are shown, by key; override it for several values or headings by option.

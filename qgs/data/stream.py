@@ -68,7 +68,10 @@ def training_batches(
 
 def scenes_fingerprint(source: SceneSource) -> str:
     """Equal where `training_batches` visits equally many training scenes, stored alike."""
-    return SceneOrder(source.groups("train"), len(source.scenes("train")), seed=0).fingerprint
+    digest = hashlib.sha256()
+    for group in filter(len, source.groups("train")):
+        digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())
+    return digest.hexdigest()[:16]
 
 
 class SceneOrder:
@@ -94,14 +97,6 @@ class SceneOrder:
         """The scene of a sample, counted from 0 over all epochs."""
         epoch, position = divmod(sample, self._count)
         return int(self._epoch(epoch)[position])
-
-    @property
-    def fingerprint(self) -> str:
-        """Equal for equal groups: sequences of equal fingerprint and seed visit alike."""
-        digest = hashlib.sha256()
-        for group in self._groups:
-            digest.update(len(group).to_bytes(8, "little") + group.astype("<i8").tobytes())
-        return digest.hexdigest()[:16]
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self._seed, 0, epoch])
@@ -251,12 +246,10 @@ def _prepare_worker(number: int) -> None:
 
 
 class Feed:
-    """Holds the batches of the step that comes next.
+    """The batches of the next optimiser step, or the error that fetching them raised.
 
-    They are fetched while the step before is not over, so that processes can agree on a failure
-    where they exchange numbers anyway: one that ended alone would leave the others waiting.
-
-    error: what fetching raised; after that there are no batches any more.
+    They are fetched before the present step is over, so that processes can tell each other of a
+    failure where they exchange numbers anyway; one that ended alone would leave the others waiting.
     """
 
     def __init__(self, stream: Iterator[Batch], count: int) -> None:
@@ -266,7 +259,7 @@ class Feed:
         self._count = count
 
     def fetch(self) -> None:
-        """Get the `count` batches of the next step, or the error."""
+        """Get the `count` batches of the next step; none, and `error`, when that fails."""
         try:
             self.batches = list(islice(self._stream, self._count))
         except Exception as error:  # raised by whoever reads `error`

@@ -104,13 +104,13 @@ class Guard:
 
     def state(self) -> dict[str, Any]:
         """See `qgs.engine.checkpoint.Stateful`."""
-        counted = {"incidents": self.incidents, "skipped": self.skipped}
-        return {"detector": self.detector.state(), **counted}
+        detector = self.detector.state()
+        return {"incidents": self.incidents, "skipped": self.skipped, "detector": detector}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """See `qgs.engine.checkpoint.Stateful`."""
-        self.detector.load_state(state["detector"])
         self.incidents, self.skipped = state["incidents"], state["skipped"]
+        self.detector.load_state(state["detector"])
 
     def passed(self, numbers: Mapping[str, float]) -> None:
         """Take note of a finite step."""
@@ -246,9 +246,8 @@ def _as_list(causes: Sequence[str]) -> str:
 class CollapseDetector:
     """Counts consecutive steps without signs of life.
 
-    A step is dead when nothing is drawn (mean alpha under EMPTY_ALPHA, which is also what a model
-    shows whose Gaussians are all invisible), when no gradient is left, or when the images have gone
-    back to the plain background after showing more.
+    A step is dead when nothing is drawn (mean alpha under EMPTY_ALPHA), when no gradient is left,
+    or when the images have gone back to the plain background after showing more.
     """
 
     def __init__(self, window: int) -> None:
@@ -394,9 +393,8 @@ class Finding(NamedTuple):
 class Watch:
     """Notes the first tensor that is not finite, in the order in which a step computes.
 
-    That is: weights, images and cameras, outputs of the model's modules, and then, layer by layer,
-    what is predicted, the renderings, the loss terms and the gradients of the Gaussians; last the
-    gradients of the modules' outputs and of the parameters, backwards.
+    Weights, images and cameras, outputs of modules; then layer by layer the prediction, renderings,
+    loss terms and gradients of the Gaussians; then gradients of modules and parameters, backwards.
     """
 
     def __init__(self) -> None:

@@ -93,7 +93,7 @@ class Objective(nn.Module):
         """The target views as the losses take them."""
         if not self.render_views or any(loss.renderings == "all" for loss in self.losses.values()):
             return [targets]
-        return [targets.select(views) for views in self._slices(targets.cameras)]
+        return [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
 
     def _render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """The rendering for all `cameras`; the graphs of at most `render_views` exist at a time."""
@@ -101,17 +101,10 @@ class Objective(nn.Module):
             return self.model.render(gaussians, cameras)
         parts = [
             checkpoint(self.model.render, gaussians, cameras[:, views], use_reentrant=False)
-            for views in self._slices(cameras)
+            for views in _slices(cameras, self.render_views)
         ]
-        return Rendering(
-            rgb=torch.cat([part.rgb for part in parts], 1),
-            alpha=torch.cat([part.alpha for part in parts], 1),
-            depth=torch.cat([part.depth for part in parts], 1),
-        )
-
-    def _slices(self, cameras: Cameras) -> list[slice]:
-        count, step = cameras.shape[1], self.render_views
-        return [slice(start, min(start + step, count)) for start in range(0, count, step)]
+        images = zip(*((part.rgb, part.alpha, part.depth) for part in parts), strict=True)
+        return Rendering(*(torch.cat(of_parts, 1) for of_parts in images))
 
     def _terms(
         self, layer: LayerPrediction, rendering: Rendering, target: Views, number: int
@@ -209,6 +202,10 @@ def _signs_of_all(parts: list[tuple[float, dict[str, Tensor]]]) -> dict[str, Ten
         for name in ("psnr", "alpha")
     }
     return means | {"deviation": torch.stack([s["deviation"] for _, s in parts]).amax()}
+
+
+def _slices(cameras: Cameras, step: int) -> list[slice]:
+    return [slice(first, first + step) for first in range(0, cameras.shape[1], step)]
 
 
 def _trained(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

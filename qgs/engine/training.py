@@ -80,19 +80,17 @@ def train(
 
     Writes recipe.yaml, history.jsonl (one record per optimiser step), checkpoint.safetensors (the
     model) and state.safetensors (what continues the run): on schedule, at the end, and after SIGINT
-    or SIGTERM, which finish the step and return. The clock of `training.seconds` starts after the
-    first step, in which kernels compile. A start that fails, for want of data for instance, leaves
-    no folder. Of several processes the main one writes; all of them must see `run`.
+    or SIGTERM, which finish the step and return. A start that fails, for want of data for instance,
+    leaves no folder. Of several processes the main one writes; all of them must see `run`.
 
     resume: continue the run in `run` from its state, as if it had never been interrupted, or start
     it where there is none yet. A run whose budget is used is left as it is.
 
     Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
-    as `choose_device`, `make_optimizer` and the optimiser, `OtherRunError` for another recipe or
-    data than the run's, what the data source raises, CollapseError when the model died, the
-    checkpoint then holding the last good weights, and NonFiniteError for a step that gave NaN. An
-    error of the data, between two steps, leaves the run saved where it stood; a note of the error
-    says so.
+    as `choose_device`, `make_optimizer` and the optimiser, OtherRunError for another recipe or data
+    than the run's, CollapseError when the model died (the checkpoint then holds the last good
+    weights), NonFiniteError for a step that gave NaN, and what the data source raises; the run is
+    then saved where it stood, and a note of the error says so.
     """
     if not resume:
         RunFolder(run).refuse_other(resume)
@@ -298,7 +296,7 @@ class Trainer:
             self.trackers.open(self.folder.path, self.recipe, self.resumed_at or 0)
         self.accelerator.wait_for_everyone()
 
-    def _report(self, record: dict[str, float], progress: TrainingProgress) -> None:
+    def _report(self, record: Mapping[str, float], progress: TrainingProgress) -> None:
         if self.accelerator.is_main_process:
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)

@@ -48,4 +48,4 @@ def test_data_without_a_path_stays():
             "data": {"type": "rooms/procedural", "image_size": [16, 16]},
         }
     )
-    assert with_absolute_path(recipe) is recipe
+    assert with_absolute_path(recipe).tree == recipe.tree

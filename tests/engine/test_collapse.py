@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
+from training_runs import QUIET, Tiny, run_anywhere, run_calling
 
 import qgs
 from qgs.composer import Recipe
 from qgs.contracts import TrainingConfig
 from qgs.data.evaluation import evaluation_samples
-from qgs.engine import CollapseError, RunFolder, train
+from qgs.engine import CollapseError, RunFolder
 from qgs.engine.distributed import StopRequest
 from qgs.engine.guard import (
     EMPTY_ALPHA,
@@ -31,7 +30,6 @@ from qgs.io.checkpoint import load_extra
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
 DEAD = dict.fromkeys(ALIVE, 0.0)
-QUIET = Console(quiet=True)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +97,7 @@ def mean_alpha(checkpoint: Path, recipe: Recipe) -> float:
 
 
 def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
-    tiny: Callable[..., Recipe], tmp_path: Path
+    tiny: Tiny, tmp_path: Path
 ) -> None:
     recipe = tiny(
         "tokengs",
@@ -111,7 +109,7 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     )
     assert recipe.training.collapse_window == TrainingConfig().collapse_window
     with pytest.raises(CollapseError) as caught:
-        train(recipe, tmp_path / "run", console=QUIET)
+        run_anywhere(recipe, tmp_path / "run")
     message = str(caught.value)
     for cause in ("learning_rate", "visibility", "opacity_bias", "checkpoint.safetensors"):
         assert cause in message
@@ -125,7 +123,7 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
 
 
 def test_gaussians_invisible_from_the_start_are_noticed_within_the_window(
-    tiny: Callable[..., Recipe], tmp_path: Path
+    tiny: Tiny, tmp_path: Path
 ) -> None:
     recipe = tiny(
         "tokengs",
@@ -134,21 +132,19 @@ def test_gaussians_invisible_from_the_start_are_noticed_within_the_window(
         "training.collapse_window=20",
     )
     with pytest.raises(CollapseError, match="renderings are empty"):
-        train(recipe, tmp_path / "run", console=QUIET)
+        run_anywhere(recipe, tmp_path / "run")
     lines = (tmp_path / "run" / "history.jsonl").read_text().splitlines()
     assert len(lines) == recipe.training.collapse_window
     assert json.loads(lines[-1])["step"] == recipe.training.collapse_window
 
 
-def test_a_run_that_ends_inside_a_collapse_fails_too(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_a_run_that_ends_inside_a_collapse_fails_too(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
     with pytest.raises(CollapseError, match="for the last 12 steps"):
-        train(recipe, tmp_path / "run", console=QUIET)
+        run_anywhere(recipe, tmp_path / "run")
 
 
-def test_nan_stops_at_once_with_finite_weights(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_nan_stops_at_once_with_finite_weights(tiny: Tiny, tmp_path: Path) -> None:
     trainer = Trainer(tiny("locus"), tmp_path / "run")
     with torch.no_grad():
         trainer.model.decoder[0].feed_forward_scale.gamma.fill_(torch.nan)
@@ -161,40 +157,25 @@ def test_nan_stops_at_once_with_finite_weights(tiny: Callable[..., Recipe], tmp_
     assert all(p.isfinite().all() for p in model.parameters())
 
 
-def test_weights_that_are_not_finite_are_never_saved_as_good(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
-    trainer = Trainer(tiny("tokengs", "training.steps=3"), tmp_path / "run")
-    break_weights = trainer.model.queries.features.data.fill_
+def test_weights_that_are_not_finite_are_never_saved_as_good(tiny: Tiny, tmp_path: Path) -> None:
+    def break_at_the_end(trainer: Trainer, stop: StopRequest) -> None:
+        if trainer.step == 3:
+            trainer.model.queries.features.data.fill_(torch.nan)
 
-    class BreakingAtTheEnd(TrainingProgress):
-        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
-            if step == 3:
-                break_weights(torch.nan)
-            return False
-
-    with (
-        closing(trainer),
-        pytest.raises(CollapseError, match=r"weights are not finite: queries\.features"),
-    ):
-        trainer.run(BreakingAtTheEnd(QUIET), StopRequest())
-    assert broken_tensors(qgs.load(trainer.folder.checkpoint)) == ""
+    with pytest.raises(CollapseError, match=r"weights are not finite: queries\.features"):
+        run_calling(break_at_the_end, tiny("tokengs", "training.steps=3"), tmp_path / "run")
+    assert broken_tensors(qgs.load(RunFolder(tmp_path / "run").checkpoint)) == ""
 
 
 def test_one_dead_step_at_the_end_fails_no_run(
-    tiny: Callable[..., Recipe], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tiny: Tiny, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    trainer = Trainer(tiny("tokengs", "training.steps=3"), tmp_path / "run")
+    def die_at_the_end(trainer: Trainer, stop: StopRequest) -> None:
+        if trainer.step == 3:
+            trainer.guard.detector.observe(DEAD)
 
-    class DyingAtTheEnd(TrainingProgress):
-        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
-            if step == 3:
-                trainer.guard.detector.observe(DEAD)
-            return False
-
-    with closing(trainer):
-        trainer.run(DyingAtTheEnd(QUIET), StopRequest())
-    assert load_extra(trainer.folder.checkpoint) == {"step": "3"}
+    result = run_calling(die_at_the_end, tiny("tokengs", "training.steps=3"), tmp_path / "run")
+    assert load_extra(result.folder.checkpoint) == {"step": "3"}
     assert "for the last 1 steps" in caplog.text
 
 

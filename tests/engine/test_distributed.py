@@ -6,20 +6,17 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from rich.console import Console
+from training_runs import Tiny, losses, run, run_calling
 
 import qgs
 from qgs.composer import Recipe
-from qgs.engine import RunFolder, train
 from qgs.engine.checkpoint import read_state
 from qgs.engine.distributed import StopRequest
-from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 
 WORKER = Path(__file__).with_name("distributed.py")
@@ -46,17 +43,13 @@ def train_in_two_processes(recipe: Recipe, run: Path, **environment: str) -> lis
     return [list(words) for words in re.findall(r"(True|False) (\d+) (\d+\.\d+)", done.stdout)]
 
 
-def losses(run: Path) -> list[float]:
-    return [record["loss"] for record in RunFolder(run).history()]
-
-
 @pytest.mark.parametrize("accumulate", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_two_processes_have_the_loss_curve_of_one(
-    tiny: Callable[..., Recipe], tmp_path: Path, accumulate: int
+    tiny: Tiny, tmp_path: Path, accumulate: int
 ) -> None:
     options = ("training.save_every=2", f"training.accumulate={accumulate}", PARTS)
     alone = tiny("locus", "training.batch_size=2", *options)
-    train(alone, tmp_path / "alone", console=Console(quiet=True), device="cpu")
+    run(alone, tmp_path / "alone")
     said = train_in_two_processes(
         tiny("locus", "training.batch_size=1", *options), tmp_path / "two"
     )
@@ -71,11 +64,11 @@ def test_two_processes_have_the_loss_curve_of_one(
 
 @pytest.mark.parametrize("accumulate", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_shards_continue_what_one_process_began(
-    tiny: Callable[..., Recipe], tmp_path: Path, accumulate: int
+    tiny: Tiny, tmp_path: Path, accumulate: int
 ) -> None:
     options = ("training.save_every=2", "training.ema=0.9", PARTS)
     alone = tiny("locus", "training.batch_size=4", *options)
-    train(alone, tmp_path / "alone", console=Console(quiet=True), device="cpu")
+    run(alone, tmp_path / "alone")
     begin(alone, tmp_path / "shards")
     part = f"training.batch_size={2 // accumulate}", f"training.accumulate={accumulate}"
     said = train_in_two_processes(tiny("locus", *part, *options), tmp_path / "shards", **FSDP)
@@ -91,16 +84,12 @@ def test_shards_continue_what_one_process_began(
     qgs.load(tmp_path / "shards" / "checkpoint.safetensors")
 
 
-def begin(recipe: Recipe, run: Path) -> None:
+def begin(recipe: Recipe, folder: Path) -> None:
     """The first two steps of a run, killed in the third."""
 
-    class Killing(TrainingProgress):
-        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
-            if step == 3:
-                raise KeyboardInterrupt
-            return False
+    def kill(trainer: Trainer, stop: StopRequest) -> None:
+        if trainer.step == 3:
+            raise KeyboardInterrupt
 
-    trainer = Trainer(recipe, run)
     with pytest.raises(KeyboardInterrupt):
-        trainer.run(Killing(Console(quiet=True)), StopRequest())
-    trainer.close()
+        run_calling(kill, recipe, folder)

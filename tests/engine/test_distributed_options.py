@@ -7,11 +7,11 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import yaml
 from safetensors.torch import load_file
+from training_runs import Tiny
 
 from qgs.composer import Recipe
 
@@ -45,9 +45,7 @@ def trained_by_two(recipe: Recipe, folder: Path) -> list[str]:
     return [out for out, _ in outputs]
 
 
-def test_all_processes_leave_out_a_step_that_one_found_bad(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny(
         "locus",
         "training.steps=4",

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import nn
+from training_runs import Tiny
 
-from qgs.composer import Recipe
 from qgs.engine.optimizer import MovingAverage
 from qgs.io.checkpoint import unique_tensors
 
@@ -66,7 +64,7 @@ def test_the_average_of_half_precision_weights_is_float32() -> None:
     )
 
 
-def test_a_restored_average_goes_on_alike(tiny: Callable[..., Recipe]) -> None:
+def test_a_restored_average_goes_on_alike(tiny: Tiny) -> None:
     model = tiny("locus").build_model()
     average, restored = MovingAverage(model, 0.9), MovingAverage(model, 0.9)
     with torch.no_grad():

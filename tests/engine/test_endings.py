@@ -5,39 +5,27 @@ from __future__ import annotations
 import json
 import multiprocessing
 import resource
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from rich.console import Console
+from training_runs import QUIET, Tiny, losses, run, run_calling, same, weights
 
-from qgs.composer import Recipe
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleStream, WorkerError
-from qgs.engine import NonFiniteError, RunFolder, TrainingResult, periodic, train
+from qgs.engine import NonFiniteError, periodic
 from qgs.engine.checkpoint import read_state
 from qgs.engine.distributed import StopRequest, signal
 from qgs.engine.folder import RunFolder as Folder
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 
-QUIET = Console(quiet=True)
-
-
-def run(recipe: Recipe, folder: Path, resume: bool = False) -> TrainingResult:
-    return train(recipe, folder, console=QUIET, device="cpu", resume=resume)
-
 
 def saved_step(folder: Path) -> int:
     return read_state(Folder(folder).state).parts["counters"]["step"]
-
-
-def losses(folder: Path) -> list[float]:
-    return [record["loss"] for record in RunFolder(folder).history()]
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch, from_sample: int) -> None:
@@ -53,7 +41,7 @@ def spoil(monkeypatch: pytest.MonkeyPatch, from_sample: int) -> None:
 
 
 def test_data_that_fails_leaves_a_run_that_goes_on(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = tiny("tokengs", "training.save_every=0", "training.batch_size=2", "training.ema=0.9")
     through = run(recipe, tmp_path / "through")
@@ -66,36 +54,30 @@ def test_data_that_fails_leaves_a_run_that_goes_on(
     again = run(recipe, tmp_path / "broken", resume=True)
     assert (again.resumed_at, again.steps) == (3, 4)
     assert losses(tmp_path / "broken") == losses(tmp_path / "through")
-    ours, theirs = again.model.state_dict(), through.model.state_dict()
-    assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
+    assert same(weights(again), weights(through))
 
 
 def test_data_that_fails_after_the_last_step_fails_no_run(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil(monkeypatch, from_sample=4)
     assert run(tiny("tokengs", "training.batch_size=1"), tmp_path / "run").steps == 4
 
 
-def test_a_killed_worker_leaves_a_run_that_goes_on(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_a_killed_worker_leaves_a_run_that_goes_on(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
 
-    class Killing(TrainingProgress):
-        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
-            for child in multiprocessing.active_children():
-                child.kill()
-            return False
+    def kill(trainer: Trainer, stop: StopRequest) -> None:
+        for child in multiprocessing.active_children():
+            child.kill()
 
-    trainer = Trainer(recipe, tmp_path / "run")
-    with closing(trainer), pytest.raises(WorkerError, match=r"lower training\.workers"):
-        trainer.run(Killing(QUIET), StopRequest())
+    with pytest.raises(WorkerError, match=r"lower training\.workers"):
+        run_calling(kill, recipe, tmp_path / "run")
     assert saved_step(tmp_path / "run") == len(losses(tmp_path / "run")) >= 1
 
 
 def test_an_evaluation_that_fails_is_told_and_ends_nothing(
-    tiny: Callable[..., Recipe],
+    tiny: Tiny,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -114,7 +96,7 @@ def test_an_evaluation_that_fails_is_told_and_ends_nothing(
     assert "the evaluation at step 2 failed: ValueError: no scene could be judged" in caplog.text
 
 
-def test_a_stop_is_heard_between_two_scenes(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_a_stop_is_heard_between_two_scenes(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.evaluate_every=2", "evaluation.scenes=3")
     trainer, stop = Trainer(recipe, tmp_path / "run"), StopRequest()
     scenes: list[int] = []
@@ -133,7 +115,7 @@ def test_a_stop_is_heard_between_two_scenes(tiny: Callable[..., Recipe], tmp_pat
     assert not (tmp_path / "run" / "evaluations.jsonl").exists()
 
 
-def test_a_full_disk_is_told_with_what_to_do(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_a_full_disk_is_told_with_what_to_do(tiny: Tiny, tmp_path: Path) -> None:
     recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
     run(tiny("tokengs", "training.steps=3"), folder)
     whole = Folder(folder).state.read_bytes()
@@ -149,7 +131,7 @@ def test_a_full_disk_is_told_with_what_to_do(tiny: Callable[..., Recipe], tmp_pa
 
 
 def test_bad_poses_are_told_as_data_with_the_remedy_first(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = SampleStream.batch
 
@@ -173,7 +155,7 @@ def test_bad_poses_are_told_as_data_with_the_remedy_first(
 
 @pytest.mark.parametrize("damage", ['{"step": 2, "lo', "\0\0\0", "[1]", "\x85\u2028"])
 def test_a_damaged_line_stops_no_run(
-    tiny: Callable[..., Recipe], tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+    tiny: Tiny, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     folder = tmp_path / "run"
     run(tiny("tokengs", "training.steps=3", "training.evaluate_every=3"), folder)

@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 from torch import Generator, Tensor
+from training_runs import Tiny
 
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
@@ -22,7 +23,6 @@ from qgs.io.published import exact_names_of
 from qgs.io.transfer import import_weights
 from qgs.model import QueryGaussianModel
 
-Tiny = Callable[..., Recipe]
 COUNT = 24
 GROWTH_NOISE = 0.01  # LocusGS release
 PER_QUERY = {"tokengs": ["features"], "locus": ["features", "center", "raw_radius"]}

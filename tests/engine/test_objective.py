@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
+from training_runs import Tiny
 
 from qgs.composer import Recipe
 from qgs.data.sampling import Batch
@@ -18,7 +17,7 @@ def first_batch(recipe: Recipe) -> Batch:
     return next(training_batches(recipe.build_data(), recipe.views, 2, seed=0))
 
 
-def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Callable[..., Recipe]) -> None:
+def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Tiny) -> None:
     recipe = tiny("tokengs")
     model, losses, batch = recipe.build_model().train(), recipe.build_losses(), first_batch(recipe)
     outcome = Objective(model, losses)(batch.inputs, batch.targets)
@@ -38,7 +37,7 @@ def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Callable[..., Re
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_every_parameter_gets_a_finite_gradient(tiny: Callable[..., Recipe], name: str) -> None:
+def test_every_parameter_gets_a_finite_gradient(tiny: Tiny, name: str) -> None:
     recipe = tiny(name)
     objective, batch = (
         Objective(recipe.build_model().train(), recipe.build_losses()),
@@ -50,7 +49,7 @@ def test_every_parameter_gets_a_finite_gradient(tiny: Callable[..., Recipe], nam
         assert parameter.grad.isfinite().all(), parameter_name
 
 
-def test_two_losses_with_one_term_are_refused(tiny: Callable[..., Recipe]) -> None:
+def test_two_losses_with_one_term_are_refused(tiny: Tiny) -> None:
     recipe = tiny("tokengs", "losses.again={type: qgs/visibility}")
     batch = first_batch(recipe)
     objective = Objective(recipe.build_model().train(), recipe.build_losses())
@@ -58,6 +57,6 @@ def test_two_losses_with_one_term_are_refused(tiny: Callable[..., Recipe]) -> No
         objective(batch.inputs, batch.targets)
 
 
-def test_no_loss_at_all_is_refused(tiny: Callable[..., Recipe]) -> None:
+def test_no_loss_at_all_is_refused(tiny: Tiny) -> None:
     with pytest.raises(ValueError, match="at least one loss"):
         Objective(tiny("tokengs").build_model("meta"), {})

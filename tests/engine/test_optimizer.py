@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
 from torch import nn
+from training_runs import Tiny, run, same, weights
 
-from qgs.composer import Recipe, resolve
-from qgs.engine import train
+from qgs.composer import resolve
 from qgs.engine.checkpoint import read_state
 from qgs.engine.optimizer import make_optimizer, parameter_groups, rate_factors
 
@@ -24,21 +22,21 @@ def undecayed_names(module: nn.Module) -> set[str]:
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_the_head_and_1d_parameters_do_not_decay(tiny: Callable[..., Recipe], name: str) -> None:
+def test_the_head_and_1d_parameters_do_not_decay(tiny: Tiny, name: str) -> None:
     model = tiny(name).build_model("meta")
     expected = {n for n, p in model.named_parameters() if p.ndim == 1 or n.startswith("head.")}
     assert undecayed_names(model) == expected
     assert undecayed_names(nn.ModuleDict({"model": model})) == {f"model.{n}" for n in expected}
 
 
-def test_queries_anchors_and_gammas_decay(tiny: Callable[..., Recipe]) -> None:
+def test_queries_anchors_and_gammas_decay(tiny: Tiny) -> None:
     model = tiny("locus").build_model("meta")
     decayed = set(dict(model.named_parameters())) - undecayed_names(model)
     gammas = {f"decoder.{i}.cross_attention.raw_gamma" for i in range(model.depth)}
     assert {"queries.features", "queries.center", "queries.raw_radius"} | gammas <= decayed
 
 
-def test_every_trained_parameter_is_in_one_group(tiny: Callable[..., Recipe]) -> None:
+def test_every_trained_parameter_is_in_one_group(tiny: Tiny) -> None:
     recipe = tiny("locus", "optimizer.weight_decay=0.1")
     model = recipe.build_model()
     model.queries.features.requires_grad_(False)
@@ -50,7 +48,7 @@ def test_every_trained_parameter_is_in_one_group(tiny: Callable[..., Recipe]) ->
     assert optimizer.defaults["betas"] == (0.9, 0.95)
 
 
-def test_decay_shrinks_only_what_decays(tiny: Callable[..., Recipe]) -> None:
+def test_decay_shrinks_only_what_decays(tiny: Tiny) -> None:
     recipe = tiny("tokengs", "optimizer.weight_decay=0.5", "optimizer.learning_rate=0.1")
     model = recipe.build_model()
     optimizer = make_optimizer(model, recipe.build_optimizer())
@@ -78,7 +76,7 @@ def test_decay_shrinks_only_what_decays(tiny: Callable[..., Recipe]) -> None:
 )
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_a_pattern_names_a_part_and_all_below_it(
-    tiny: Callable[..., Recipe], pattern: str, expected: str, wrapped: bool
+    tiny: Tiny, pattern: str, expected: str, wrapped: bool
 ) -> None:
     model = tiny("locus").build_model("meta")
     factors = rate_factors(nn.ModuleDict({"model": model}) if wrapped else model, {pattern: 0.5})
@@ -87,7 +85,7 @@ def test_a_pattern_names_a_part_and_all_below_it(
     assert found == wanted != set()
 
 
-def test_the_last_pattern_that_matches_counts(tiny: Callable[..., Recipe]) -> None:
+def test_the_last_pattern_that_matches_counts(tiny: Tiny) -> None:
     factors = rate_factors(
         tiny("locus").build_model("meta"), {"*": 0.5, "head": 1, "head.linear.bias": 2}
     )
@@ -106,39 +104,37 @@ def test_the_last_pattern_that_matches_counts(tiny: Callable[..., Recipe]) -> No
     ],
 )
 def test_a_pattern_that_matches_nothing_ends_the_start(
-    tiny: Callable[..., Recipe], tmp_path: Path, pattern: str, fix: str
+    tiny: Tiny, tmp_path: Path, pattern: str, fix: str
 ) -> None:
     recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
     with pytest.raises(ValueError, match=rf"optimizer\.parts: .*`{re.escape(pattern)}`.*{fix}"):
-        train(recipe, tmp_path / "run", console=Console(quiet=True))
+        run(recipe, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_everything_frozen_is_refused(tiny: Callable[..., Recipe]) -> None:
+def test_everything_frozen_is_refused(tiny: Tiny) -> None:
     recipe = tiny("tokengs", 'optimizer.parts={"*": 0}')
     with pytest.raises(ValueError, match="nothing to train"):
         make_optimizer(recipe.build_model("meta"), recipe.build_optimizer())
 
 
-def test_a_factor_scales_the_step(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_a_factor_scales_the_step(tiny: Tiny, tmp_path: Path) -> None:
     """The first step of AdamW without decay is the learning rate, whatever the gradient."""
     options = ("training.steps=1", "optimizer.warmup=0", "optimizer.weight_decay=0.0")
     recipe = tiny("tokengs", *options, 'optimizer.parts={"head": 0.25, "queries": 2.0}')
     before = recipe.build_model().state_dict()
-    after = train(recipe, tmp_path, console=Console(quiet=True), device="cpu").model.state_dict()
+    after = weights(run(recipe, tmp_path))
     rate = recipe.build_optimizer().learning_rate(0, 0.0)
     for name, factor in {"head.linear.bias": 0.25, "queries.features": 2.0}.items():
         largest = float((after[name] - before[name]).abs().max())
         assert largest == pytest.approx(rate * factor, rel=1e-2)
 
 
-def test_frozen_parts_stay_and_are_not_remembered(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_frozen_parts_stay_and_are_not_remembered(tiny: Tiny, tmp_path: Path) -> None:
     options = ("training.ema=0.5", "training.save_every=2", "optimizer.weight_decay=0.5")
     recipe = tiny("locus", *options, 'optimizer.parts={"encoder": 0, "decoder.*.feed_forward": 0}')
     before = recipe.build_model().state_dict()
-    model = train(recipe, tmp_path, console=Console(quiet=True), device="cpu").model
+    model = run(recipe, tmp_path).model
     for name, parameter in model.named_parameters():
         frozen = name.startswith("encoder.") or ".feed_forward." in name
         assert torch.equal(parameter, before[name]) == frozen, name
@@ -170,7 +166,7 @@ plugin = Plugin("plain", 1, (Plain,))
 
 
 def test_a_plugin_adds_an_optimiser_by_one_class(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     info = tmp_path / "plain-1.dist-info"
     info.mkdir()
@@ -182,13 +178,11 @@ def test_a_plugin_adds_an_optimiser_by_one_class(
     tree["optimizer"] = {"type": "plain/sgd", "rate": 0.02, "parts": {"encoder": 0, "head": 0.5}}
     recipe = resolve(tree)
     assert recipe.tree["optimizer"] == tree["optimizer"]
-    quiet = Console(quiet=True)
-    through = train(recipe, tmp_path / "through", console=quiet, device="cpu")
+    through = run(recipe, tmp_path / "through")
     assert [record["lr"] for record in through.folder.history()] == [0.02] * 4
-    train(resolve(tree, ["training.steps=2"]), tmp_path / "run", console=quiet, device="cpu")
-    again = train(recipe, tmp_path / "run", console=quiet, device="cpu", resume=True)
+    run(resolve(tree, ["training.steps=2"]), tmp_path / "run")
+    again = run(recipe, tmp_path / "run", resume=True)
     assert again.resumed_at == 2
-    ours, theirs = again.model.state_dict(), through.model.state_dict()
-    assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
+    assert same(weights(again), weights(through))
     moments = read_state(again.folder.state).parts["moments"]
     assert {key.rsplit("/")[-1] for key in moments} == {"momentum_buffer"}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from training_runs import Tiny
 
 from qgs.composer import Recipe
 from qgs.drawing.images import rgb_picture
@@ -36,7 +36,7 @@ class Told(Trackers):
 
 
 @pytest.fixture
-def recipe(tiny: Callable[..., Recipe]) -> Recipe:
+def recipe(tiny: Tiny) -> Recipe:
     return tiny("locus", "evaluation.scenes=3")
 
 

@@ -13,6 +13,7 @@ from typing import ClassVar
 import pytest
 import torch
 from torch import Tensor, nn
+from training_runs import Tiny
 
 from qgs.composer import Recipe
 from qgs.contracts import ComponentConfig, Loss
@@ -73,7 +74,7 @@ def with_masks(views: Views) -> Views:
 
 
 @pytest.fixture(scope="module")
-def setting(tiny: Callable[..., Recipe]) -> Callable[..., tuple]:
+def setting(tiny: Tiny) -> Callable[..., tuple]:
     def make(renderer: str, *, dtype: torch.dtype = torch.float32) -> tuple:
         recipe = tiny("locus", f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
         torch.manual_seed(0)

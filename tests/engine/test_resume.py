@@ -5,59 +5,44 @@ from __future__ import annotations
 import json
 import random
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from rich.console import Console
+from training_runs import QUIET, Tiny, run, run_calling
 
 from qgs.composer import Recipe
-from qgs.engine import RunFolder, TrainingResult, train
+from qgs.engine import RunFolder
 from qgs.engine.checkpoint import OtherRunError, RandomStates, read_state, write_state
 from qgs.engine.distributed import StopRequest
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointError, load_extra
 
-QUIET = Console(quiet=True)
-
 
 class Killed(BaseException):
     """Ends a run as a kill does, from the loop's point of view: nothing is saved any more."""
 
 
-class Killer(TrainingProgress):
-    """Kills the run once it has made so many steps."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__(QUIET)
-        self._last = step
-
-    def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
-        if step == self._last:
+def kill_after(steps: int, recipe: Recipe, folder: Path, resume: bool = False) -> None:
+    def kill(trainer: Trainer, stop: StopRequest) -> None:
+        if trainer.step == steps:
             raise Killed
-        return False
+
+    with pytest.raises(Killed):
+        run_calling(kill, recipe, folder, resume)
 
 
-def kill_after(steps: int, recipe: Recipe, run: Path, resume: bool = False) -> None:
-    trainer = Trainer(recipe, run, resume=resume)
-    try:
-        with pytest.raises(Killed):
-            trainer.run(Killer(steps), StopRequest())
-    finally:
-        trainer.close()
-
-
-def resumed(recipe: Recipe, run: Path) -> TrainingResult:
-    return train(recipe, run, console=QUIET, device="cpu", resume=True)
+resumed = partial(run, resume=True)
 
 
 def assert_equal_runs(first: Path, second: Path) -> None:
     """Same weights, optimiser state and random states to the bit, same history but for time."""
-    ours, theirs = (read_state(RunFolder(run).state).parts for run in (first, second))
+    ours, theirs = (read_state(RunFolder(folder).state).parts for folder in (first, second))
     assert ours.keys() == theirs.keys()
     for name in ours:
         assert ours[name].keys() == theirs[name].keys(), name
@@ -70,8 +55,8 @@ def assert_equal_runs(first: Path, second: Path) -> None:
     assert losses(first) == losses(second)
 
 
-def losses(run: Path) -> list[tuple[float, float, float]]:
-    history = RunFolder(run).history()
+def losses(folder: Path) -> list[tuple[float, float, float]]:
+    history = RunFolder(folder).history()
     return [(record["step"], record["loss"], record["lr"]) for record in history]
 
 
@@ -84,7 +69,7 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "overrides"), CASES)
 def test_17_and_23_steps_are_40(
-    tiny: Callable[..., Recipe], tmp_path: Path, name: str, overrides: Sequence[str]
+    tiny: Tiny, tmp_path: Path, name: str, overrides: Sequence[str]
 ) -> None:
     recipe = tiny(
         name,
@@ -93,7 +78,7 @@ def test_17_and_23_steps_are_40(
         "training.collapse_window=10",
         *overrides,
     )
-    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
+    run(recipe, tmp_path / "through")
     kill_after(17, recipe, tmp_path / "killed")
     assert len(RunFolder(tmp_path / "killed").history()) == 17
     result = resumed(recipe, tmp_path / "killed")
@@ -102,11 +87,9 @@ def test_17_and_23_steps_are_40(
 
 
 @pytest.mark.slow
-def test_workers_and_several_kills_change_nothing(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_workers_and_several_kills_change_nothing(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("locus", "training.steps=40", "training.save_every=1")
-    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
+    run(recipe, tmp_path / "through")
     with_workers = tiny("locus", "training.steps=40", "training.save_every=1", "training.workers=2")
     kill_after(9, with_workers, tmp_path / "killed")
     kill_after(17, with_workers, tmp_path / "killed", resume=True)
@@ -115,28 +98,21 @@ def test_workers_and_several_kills_change_nothing(
     assert_equal_runs(tmp_path / "through", tmp_path / "killed")
 
 
-def test_a_stopped_run_goes_on_where_it_stopped(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_a_stopped_run_goes_on_where_it_stopped(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("locus", "training.save_every=0")
-    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
-    trainer = Trainer(recipe, tmp_path / "stopped")
-    stop = StopRequest()
+    run(recipe, tmp_path / "through")
 
-    class Stopping(TrainingProgress):
-        def update(self, step: int, *rest: float) -> bool:  # type: ignore[override]
-            stop.signal = None if step < 2 else signal.SIGTERM
-            return False
+    def ask(trainer: Trainer, stop: StopRequest) -> None:
+        stop.signal = None if trainer.step < 2 else signal.SIGTERM
 
-    trainer.run(Stopping(QUIET), stop)
-    trainer.close()
-    assert trainer.step == 3, "a request is seen at the end of the step in which it comes"
+    stopped = run_calling(ask, recipe, tmp_path / "stopped")
+    assert stopped.steps == 3, "a request is seen at the end of the step in which it comes"
     assert resumed(recipe, tmp_path / "stopped").resumed_at == 3
     assert_equal_runs(tmp_path / "through", tmp_path / "stopped")
 
 
 def test_a_run_stopped_before_it_showed_signs_of_life_goes_on_too(
-    tiny: Callable[..., Recipe], tmp_path: Path
+    tiny: Tiny, tmp_path: Path
 ) -> None:
     recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
     trainer = Trainer(recipe, tmp_path / "run")
@@ -148,23 +124,23 @@ def test_a_run_stopped_before_it_showed_signs_of_life_goes_on_too(
 
 
 def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
-    tiny: Callable[..., Recipe], tmp_path: Path
+    tiny: Tiny, tmp_path: Path
 ) -> None:
-    recipe, run = tiny("tokengs"), tmp_path / "run"
-    first = resumed(recipe, run)
+    recipe, folder = tiny("tokengs"), tmp_path / "run"
+    first = resumed(recipe, folder)
     assert (first.resumed_at, first.steps) == (None, 4)
-    files = {path: path.stat().st_mtime_ns for path in run.iterdir()}
-    again = resumed(recipe, run)
+    files = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    again = resumed(recipe, folder)
     assert (again.resumed_at, again.steps, again.stopped_by) == (4, 4, None)
-    assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == files
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == files
     ours, theirs = first.model.state_dict(), again.model.state_dict()
     assert all(torch.equal(theirs[name], tensor) for name, tensor in ours.items())
 
 
 def test_a_kill_between_the_first_two_files_loses_nothing(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe, run = tiny("tokengs", "training.save_every=0"), tmp_path / "run"
+    recipe, folder = tiny("tokengs", "training.save_every=0"), tmp_path / "run"
 
     def die(*_: object, **__: object) -> None:
         raise Killed
@@ -172,25 +148,23 @@ def test_a_kill_between_the_first_two_files_loses_nothing(
     with monkeypatch.context() as patch:
         patch.setattr("qgs.engine.checkpoint.save", die)
         with pytest.raises(Killed):
-            train(recipe, run, console=QUIET, device="cpu")
-    assert not (run / "checkpoint.safetensors").exists()
-    assert resumed(recipe, run).resumed_at == 4
-    assert load_extra(run / "checkpoint.safetensors") == {"step": "4"}
+            run(recipe, folder)
+    assert not (folder / "checkpoint.safetensors").exists()
+    assert resumed(recipe, folder).resumed_at == 4
+    assert load_extra(folder / "checkpoint.safetensors") == {"step": "4"}
 
 
-def test_a_longer_budget_continues_a_finished_run(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    resumed(tiny("tokengs"), run)
+def test_a_longer_budget_continues_a_finished_run(tiny: Tiny, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    resumed(tiny("tokengs"), folder)
     longer = tiny("tokengs", "training.steps=6", "evaluation.scenes=1", "training.save_every=7")
-    assert resumed(longer, run).steps == 6
-    assert [step for step, *_ in losses(run)] == [1, 2, 3, 4, 5, 6]
-    assert "steps: 6" in (run / "recipe.yaml").read_text()
-    assert load_extra(run / "checkpoint.safetensors") == {"step": "6"}
+    assert resumed(longer, folder).steps == 6
+    assert [step for step, *_ in losses(folder)] == [1, 2, 3, 4, 5, 6]
+    assert "steps: 6" in (folder / "recipe.yaml").read_text()
+    assert load_extra(folder / "checkpoint.safetensors") == {"step": "6"}
 
 
-def test_the_clock_goes_on(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_the_clock_goes_on(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.5")
     kill_after(5, tiny("tokengs", "training.steps=5", "training.save_every=4"), tmp_path / "run")
     state = read_state(tmp_path / "run" / "state.safetensors")
@@ -202,51 +176,50 @@ def test_the_clock_goes_on(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
     assert 1.5 <= result.seconds < 10
 
 
-def test_a_run_killed_before_its_first_save_starts_again(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
-    recipe, run = tiny("locus"), tmp_path / "run"
-    kill_after(2, recipe, run)
+def test_a_run_killed_before_its_first_save_starts_again(tiny: Tiny, tmp_path: Path) -> None:
+    recipe, folder = tiny("locus"), tmp_path / "run"
+    kill_after(2, recipe, folder)
     for name in (".state.safetensors.4711.tmp", ".tmpA9b0zZ"):
-        (run / name).write_text("half a state")
-    with (run / "history.jsonl").open("a") as file:
+        (folder / name).write_text("half a state")
+    with (folder / "history.jsonl").open("a") as file:
         file.write('{"step": 3, "lo')
     with pytest.raises(OtherRunError, match=r"seed: 1 here, 0 in the run"):
-        resumed(tiny("locus", "seed=1"), run)
-    assert resumed(recipe, run).resumed_at is None
-    assert [step for step, *_ in losses(run)] == [1, 2, 3, 4]
-    assert not list(run.glob(".*"))
+        resumed(tiny("locus", "seed=1"), folder)
+    assert resumed(recipe, folder).resumed_at is None
+    assert [step for step, *_ in losses(folder)] == [1, 2, 3, 4]
+    assert not list(folder.glob(".*"))
 
 
-def test_another_recipe_is_refused_by_its_keys(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    kill_after(2, tiny("tokengs", "training.save_every=1"), run)
-    before = {path.name: path.read_bytes() for path in run.iterdir()}
+def test_another_recipe_is_refused_by_its_keys(tiny: Tiny, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    kill_after(2, tiny("tokengs", "training.save_every=1"), folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(OtherRunError) as caught:
         resumed(
-            tiny("tokengs", "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3"), run
+            tiny("tokengs", "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3"),
+            folder,
         )
     message = str(caught.value)
     assert "optimizer.learning_rate: 0.001 here, 0.0015 in the run" in message
     assert "seed: 4 here, 0 in the run" in message
     assert "training.save_every:" not in message
-    assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_step_must_see_as_many_samples(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    run = tmp_path / "run"
+def test_a_step_must_see_as_many_samples(tiny: Tiny, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
     recipe = tiny("tokengs", "training.batch_size=2", "training.save_every=1")
-    train(recipe, tmp_path / "through", console=QUIET, device="cpu")
-    kill_after(2, recipe, run)
+    run(recipe, tmp_path / "through")
+    kill_after(2, recipe, folder)
     with pytest.raises(OtherRunError, match="sees 2 samples, here it would see 3"):
-        resumed(tiny("tokengs", "training.batch_size=3"), run)
+        resumed(tiny("tokengs", "training.batch_size=3"), folder)
     halves = tiny("tokengs", "training.batch_size=1", "training.accumulate=2")
-    assert resumed(halves, run).steps == 4
-    for ours, theirs in zip(losses(run), losses(tmp_path / "through"), strict=True):
+    assert resumed(halves, folder).steps == 4
+    for ours, theirs in zip(losses(folder), losses(tmp_path / "through"), strict=True):
         assert ours == pytest.approx(theirs, rel=1e-4)
 
 
-def test_other_scenes_are_refused(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_other_scenes_are_refused(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.save_every=1")
     kill_after(2, recipe, tmp_path / "run")
     file = tmp_path / "run" / "state.safetensors"
@@ -257,7 +230,7 @@ def test_other_scenes_are_refused(tiny: Callable[..., Recipe], tmp_path: Path) -
         resumed(recipe, tmp_path / "run")
 
 
-def test_folders_without_a_run_are_refused(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_folders_without_a_run_are_refused(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs")
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="holds no run"):
@@ -270,9 +243,7 @@ def test_folders_without_a_run_are_refused(tiny: Callable[..., Recipe], tmp_path
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_one_process_at_a_time_trains_in_a_folder(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_one_process_at_a_time_trains_in_a_folder(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs")
     kill_after(2, recipe, tmp_path / "run")
     folder = RunFolder(tmp_path / "run")
@@ -283,22 +254,20 @@ def test_one_process_at_a_time_trains_in_a_folder(
     assert resumed(recipe, tmp_path / "run").steps == 4
 
 
-def test_a_state_that_is_damaged_or_newer_is_refused(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
-    recipe, run = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
-    kill_after(2, recipe, run)
-    file = run / "state.safetensors"
+def test_a_state_that_is_damaged_or_newer_is_refused(tiny: Tiny, tmp_path: Path) -> None:
+    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
+    kill_after(2, recipe, folder)
+    file = folder / "state.safetensors"
     whole = file.read_bytes()
     file.write_bytes(whole[:-100])
     with pytest.raises(CheckpointError, match="not a whole safetensors file"):
-        resumed(recipe, run)
+        resumed(recipe, folder)
     file.write_bytes(whole.replace(b'"qgs.state_version":"1"', b'"qgs.state_version":"9"'))
     with pytest.raises(CheckpointError, match="install the newer qgs"):
-        resumed(recipe, run)
-    file.write_bytes((run / "checkpoint.safetensors").read_bytes())
+        resumed(recipe, folder)
+    file.write_bytes((folder / "checkpoint.safetensors").read_bytes())
     with pytest.raises(CheckpointError, match="no training state"):
-        resumed(recipe, run)
+        resumed(recipe, folder)
 
 
 def test_random_states_come_back() -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sys
 import types
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from training_runs import Tiny
 
-from qgs.composer import Recipe
 from qgs.contracts.component import MissingExtraError
 from qgs.engine import tracking as trackers
 from qgs.engine.distributed import make_accelerator
@@ -29,9 +28,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     Trackers(()).log({"loss": 1.0}, 1)
 
 
-def test_tensorboard_gets_numbers_options_and_pictures(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -50,9 +47,7 @@ def test_tensorboard_gets_numbers_options_and_pictures(
     assert "model.width: 32" in options
 
 
-def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -87,7 +82,7 @@ class Wandb(types.ModuleType):
 
 
 def test_wandb_continues_one_run(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_accelerator("cpu")
     wandb = Wandb()

@@ -6,41 +6,36 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
+from training_runs import Tiny, run_anywhere
 
 import qgs
-from qgs.composer import Recipe, resolve
+from qgs.composer import resolve
 from qgs.data.stream import training_batches
-from qgs.engine import RunFolder, train
+from qgs.engine import RunFolder
 from qgs.engine import distributed as interrupt
 from qgs.engine.distributed import stop_requests
 from qgs.engine.folder import checkpoint_of
 from qgs.io.checkpoint import load_extra
 
-QUIET = Console(quiet=True)
-
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_training_lowers_the_loss(tiny: Callable[..., Recipe], tmp_path: Path, name: str) -> None:
+def test_training_lowers_the_loss(tiny: Tiny, tmp_path: Path, name: str) -> None:
     recipe = tiny(
         name, "training.steps=40", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0"
     )
-    result = train(recipe, tmp_path / "run", console=QUIET)
+    result = run_anywhere(recipe, tmp_path / "run")
     losses = [record["loss"] for record in result.folder.history()]
     assert result.steps == len(losses) == 40
     assert sum(losses[-10:]) < 0.95 * sum(losses[:10])
 
 
-def test_a_run_leaves_recipe_history_and_checkpoint(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_a_run_leaves_recipe_history_and_checkpoint(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("locus")
-    result = train(recipe, tmp_path / "run", console=QUIET)
+    result = run_anywhere(recipe, tmp_path / "run")
     assert resolve(tmp_path / "run" / "recipe.yaml").tree == recipe.tree
     history = result.folder.history()
     assert [record["step"] for record in history] == [1, 2, 3, 4]
@@ -59,15 +54,13 @@ def test_a_run_leaves_recipe_history_and_checkpoint(
         )
 
 
-def test_the_same_recipe_trains_the_same(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    runs = [train(tiny("locus"), tmp_path / name, console=QUIET) for name in ("a", "b")]
+def test_the_same_recipe_trains_the_same(tiny: Tiny, tmp_path: Path) -> None:
+    runs = [run_anywhere(tiny("locus"), tmp_path / name) for name in ("a", "b")]
     losses = [[record["loss"] for record in run.folder.history()] for run in runs]
     assert losses[0] == losses[1]
 
 
-def test_accumulated_batches_are_one_larger_batch(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_accumulated_batches_are_one_larger_batch(tiny: Tiny, tmp_path: Path) -> None:
     first = []
     for batch_size, accumulate in ((2, 1), (1, 2)):
         recipe = tiny(
@@ -77,21 +70,21 @@ def test_accumulated_batches_are_one_larger_batch(
             "training.steps=1",
             "optimizer.warmup=0",
         )
-        run = train(recipe, tmp_path / str(accumulate), console=QUIET)
-        first.append(run.folder.history()[0])
+        result = run_anywhere(recipe, tmp_path / str(accumulate))
+        first.append(result.folder.history()[0])
     for key in ("loss", "mse", "visibility", "gradient"):
         assert first[0][key] == pytest.approx(first[1][key], rel=1e-4)
 
 
-def test_bf16_trains_with_finite_numbers(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    result = train(tiny("locus", "training.precision=bf16"), tmp_path / "run", console=QUIET)
+def test_bf16_trains_with_finite_numbers(tiny: Tiny, tmp_path: Path) -> None:
+    result = run_anywhere(tiny("locus", "training.precision=bf16"), tmp_path / "run")
     assert all(p.dtype == torch.float32 for p in result.model.parameters())
     assert all(p.isfinite().all() for p in result.model.parameters())
 
 
-def test_a_time_budget_ends_the_run(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_a_time_budget_ends_the_run(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.0")
-    result = train(recipe, tmp_path / "run", console=QUIET)
+    result = run_anywhere(recipe, tmp_path / "run")
     assert 1.0 <= result.seconds < 10.0
     assert 1 < result.steps < 100_000
     history = result.folder.history()
@@ -103,9 +96,7 @@ def test_a_time_budget_ends_the_run(tiny: Callable[..., Recipe], tmp_path: Path)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_ends(
-    tiny: Callable[..., Recipe], tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_signal_saves_and_ends(tiny: Tiny, tmp_path: Path, number: signal.Signals) -> None:
     before = signal.getsignal(number)
     history = tmp_path / "run" / "history.jsonl"
 
@@ -117,7 +108,7 @@ def test_a_signal_saves_and_ends(
 
     thread = threading.Thread(target=interrupt_once_training, daemon=True)
     thread.start()
-    result = train(tiny("tokengs", "training.steps=100000"), history.parent, console=QUIET)
+    result = run_anywhere(tiny("tokengs", "training.steps=100000"), history.parent)
     thread.join(timeout=60)
     assert result.stopped_by == number.name
     assert result.steps == len(result.folder.history())
@@ -125,31 +116,29 @@ def test_a_signal_saves_and_ends(
     assert signal.getsignal(number) is before
 
 
-def test_a_folder_in_use_is_refused_untouched(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_a_folder_in_use_is_refused_untouched(tiny: Tiny, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="never overwrites"):
-        train(tiny("tokengs"), tmp_path, console=QUIET)
+        run_anywhere(tiny("tokengs"), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(FileExistsError, match="is a file"):
         RunFolder(tmp_path / "notes.txt").refuse_other(resume=False)
 
 
-def test_a_start_that_fails_leaves_no_folder(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_a_start_that_fails_leaves_no_folder(tiny: Tiny, tmp_path: Path) -> None:
     out = tmp_path / "run"
     photos = {"type": "qgs/photos", "path": str(tmp_path / "nowhere"), "image_size": [32, 32]}
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        train(resolve({**tiny("tokengs").tree, "data": photos}), out, console=QUIET)
+        run_anywhere(resolve({**tiny("tokengs").tree, "data": photos}), out)
     with pytest.raises(ValueError, match=r"optimizer\.warmup"):
-        train(tiny("tokengs", "optimizer.warmup=4"), out, console=QUIET)
+        run_anywhere(tiny("tokengs", "optimizer.warmup=4"), out)
     with pytest.raises(ValueError, match=r"views\.gap"):
-        train(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out, console=QUIET)
+        run_anywhere(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
     assert not out.exists()
 
 
-def test_the_thread_that_reads_ahead_ends_with_the_run(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
-    train(tiny("tokengs"), tmp_path / "run", console=QUIET)
+def test_the_thread_that_reads_ahead_ends_with_the_run(tiny: Tiny, tmp_path: Path) -> None:
+    run_anywhere(tiny("tokengs"), tmp_path / "run")
     assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
 
 

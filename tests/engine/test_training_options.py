@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
+from training_runs import Tiny, run, same, weights
 
 import qgs
 from qgs.cli.contest import curves_of
@@ -18,26 +18,10 @@ from qgs.composer import Recipe
 from qgs.contracts.component import MissingExtraError
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleStream
-from qgs.engine import NonFiniteError, TrainingResult, train
+from qgs.engine import NonFiniteError
 from qgs.engine import tracking as trackers
 from qgs.engine.checkpoint import read_state
 from qgs.engine.guard import MAX_SKIPPED
-
-QUIET = Console(quiet=True)
-
-
-def run(recipe: Recipe, folder: Path) -> TrainingResult:
-    return train(recipe, folder, console=QUIET, device="cpu")
-
-
-def weights(result: TrainingResult) -> dict[str, torch.Tensor]:
-    return result.model.state_dict()
-
-
-def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
-    return first.keys() == second.keys() and all(
-        torch.equal(t, second[n]) for n, t in first.items()
-    )
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
@@ -68,7 +52,7 @@ def bad_batches(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return spoil
 
 
-def test_rendering_in_parts_trains_the_same(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_rendering_in_parts_trains_the_same(tiny: Tiny, tmp_path: Path) -> None:
     histories = []
     for render_views in (0, 1, 2):
         recipe = tiny("locus", f"training.render_views={render_views}", "views.targets=3")
@@ -81,9 +65,7 @@ def test_rendering_in_parts_trains_the_same(tiny: Callable[..., Recipe], tmp_pat
             )
 
 
-def test_the_average_is_saved_and_judged_at_the_end(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_the_average_is_saved_and_judged_at_the_end(tiny: Tiny, tmp_path: Path) -> None:
     plain = run(tiny("locus"), tmp_path / "plain")
     averaged = run(tiny("locus", "training.ema=0.5"), tmp_path / "ema")
     assert same(weights(plain), weights(averaged))
@@ -98,7 +80,7 @@ def test_the_average_is_saved_and_judged_at_the_end(
     assert not plain.folder.checkpoint_ema.exists()
 
 
-def test_evaluations_do_not_touch_the_training(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_evaluations_do_not_touch_the_training(tiny: Tiny, tmp_path: Path) -> None:
     plain = run(tiny("locus"), tmp_path / "plain")
     watched = run(tiny("locus", "training.evaluate_every=2"), tmp_path / "watched")
     assert same(weights(plain), weights(watched))
@@ -110,7 +92,7 @@ def test_evaluations_do_not_touch_the_training(tiny: Callable[..., Recipe], tmp_
 
 
 def test_a_bad_step_ends_the_run_before_the_optimiser(
-    tiny: Callable[..., Recipe], tmp_path: Path, bad_batches: Callable[..., None]
+    tiny: Tiny, tmp_path: Path, bad_batches: Callable[..., None]
 ) -> None:
     bad_batches(2)
     folder = tmp_path / "run"
@@ -130,7 +112,7 @@ def test_a_bad_step_ends_the_run_before_the_optimiser(
 
 
 def test_a_bad_gradient_ends_the_run_too(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     build = Recipe.build_model
 
@@ -147,7 +129,7 @@ def test_a_bad_gradient_ends_the_run_too(
 
 
 def test_a_bad_step_is_skipped_on_demand(
-    tiny: Callable[..., Recipe],
+    tiny: Tiny,
     tmp_path: Path,
     bad_batches: Callable[..., None],
     caplog: pytest.LogCaptureFixture,
@@ -173,7 +155,7 @@ def test_a_bad_step_is_skipped_on_demand(
 
 
 def test_a_run_that_a_bad_step_ended_goes_on_without_it(
-    tiny: Callable[..., Recipe], tmp_path: Path, bad_batches: Callable[..., None]
+    tiny: Tiny, tmp_path: Path, bad_batches: Callable[..., None]
 ) -> None:
     bad_batches(2)
     options = ("training.steps=6", "training.ema=0.9", "training.save_every=4")
@@ -183,8 +165,8 @@ def test_a_run_that_a_bad_step_ended_goes_on_without_it(
     with pytest.raises(NonFiniteError, match="step 3 is not finite"):
         run(stopping, tmp_path / "stopped")
     with pytest.raises(NonFiniteError, match="step 3 is not finite"):
-        train(stopping, tmp_path / "stopped", console=QUIET, device="cpu", resume=True)
-    again = train(skipping, tmp_path / "stopped", console=QUIET, device="cpu", resume=True)
+        run(stopping, tmp_path / "stopped", resume=True)
+    again = run(skipping, tmp_path / "stopped", resume=True)
     assert again.resumed_at == 2
     assert same(weights(again), weights(through))
     averages = [qgs.load(r.folder.checkpoint_ema).state_dict() for r in (again, through)]
@@ -192,7 +174,7 @@ def test_a_run_that_a_bad_step_ended_goes_on_without_it(
 
 
 def test_skipping_comes_to_an_end(
-    tiny: Callable[..., Recipe], tmp_path: Path, bad_batches: Callable[..., None]
+    tiny: Tiny, tmp_path: Path, bad_batches: Callable[..., None]
 ) -> None:
     bad_batches(*range(1, 100))
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
@@ -203,7 +185,7 @@ def test_skipping_comes_to_an_end(
 
 
 def test_a_missing_tracker_is_told_before_anything_is_made(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"query-gaussians\[tensorboard\]"):
@@ -211,9 +193,7 @@ def test_a_missing_tracker_is_told_before_anything_is_made(
     assert not (tmp_path / "run").exists()
 
 
-def test_tensorboard_gets_what_the_history_gets(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_tensorboard_gets_what_the_history_gets(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

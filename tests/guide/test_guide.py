@@ -32,7 +32,7 @@ def test_messages_are_those_that_are_raised() -> None:
 MESSAGES = (
     "there is no key `",
     "there is no option `",
-    "must be an integer, got",
+    "must be a valid integer, got",
     "there is no component `",
     "belongs in the slot `",
     "names no plugin",

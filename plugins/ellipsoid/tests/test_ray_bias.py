@@ -1,15 +1,14 @@
 """The factored bias against its definition, and the definition against a search along the ray."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_ellipsoid.clamped_ratio import BLOCK, NUMERATOR
 from qgs_ellipsoid.fields import anchor_rotation
 from qgs_ellipsoid.ray_bias import (
+    BLOCK,
+    NUMERATOR,
     anchor_features,
     ellipsoid_bias,
     ellipsoid_bias_direct,
@@ -20,11 +19,6 @@ from qgs_locus.ray_bias import ray_features as isotropic_features
 from torch import Tensor
 
 ONE = torch.ones((), dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def _lines(count: int) -> tuple[Tensor, Tensor]:
