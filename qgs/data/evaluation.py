@@ -51,8 +51,7 @@ _SHOWN = 5
 def read_index(path: str) -> EvaluationIndex:
     """The index in the JSON file `path`, which may be an fsspec URL.
 
-    Raises FileNotFoundError, and ValueError for a file of another form, for a scene that is written
-    twice, and for an index without any scene to judge.
+    Raises FileNotFoundError, and ValueError for another form and for no scene to judge.
     """
     file = opened_path(path)
     if not file.is_file():
@@ -160,10 +159,7 @@ def evaluation_samples(
     evaluation: EvaluationConfig,
     index: EvaluationIndex | None = None,
 ) -> Sequence[Sample]:
-    """All samples of an `EvaluationPlan` at once, for pictures of a few scenes.
-
-    Raises ValueError for the first scene that fails.
-    """
+    """All samples of an `EvaluationPlan`; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
     for sample in EvaluationPlan(source, views, evaluation, index).samples():
         if isinstance(sample, SceneFailure):

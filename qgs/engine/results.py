@@ -41,8 +41,8 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 class SceneScore:
     """One scene. views: input and target frames of each of its samples.
 
-    values: METHOD_METRIC to a mean over the samples; "gaussians_used"; of tuned scenes TUNING. A
-    value is missing where the method or the scene lacks what its metric needs.
+    values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNING; less
+    those whose metric needs what the method or the scene lacks.
     """
 
     scene: str

@@ -36,14 +36,6 @@ class Workload:
         """The context in which the model runs."""
         return torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16")
 
-    def inputs(self) -> Views:
-        """Random photos (batch, views), the same each time."""
-        return posed_photos(self.batch, self.views, self.size, seed=0).to(self.device)
-
-    def supervision(self) -> Views:
-        """Random photos (batch, targets), the same each time."""
-        return posed_photos(self.batch, self.targets, self.size, seed=1).to(self.device)
-
 
 def workload_of(
     recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
@@ -92,7 +84,10 @@ def make_task(
     forward: photos to the last layer's Gaussians, no gradients. render: those Gaussians at the
     targets' cameras, no gradients. step: a whole training step.
     """
-    inputs, targets = workload.inputs(), workload.supervision()
+    inputs, targets = (
+        posed_photos(workload.batch, count, workload.size, seed).to(workload.device)
+        for seed, count in enumerate((workload.views, workload.targets))
+    )
     if operation == "step":
         losses, render_views = recipe.build_losses(), recipe.training.render_views
         objective = Objective(model.train(), losses, render_views).to(workload.device)
