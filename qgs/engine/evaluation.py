@@ -142,8 +142,8 @@ class _Judge:
                 tuning = self._tune(inputs)
                 gaussians = tuning.prediction.gaussians
                 values = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            gaussians = gaussians or self._model(inputs).gaussians
-            values = {**self._values(sample, inputs, gaussians), **values}
+            found: Gaussians = gaussians or self._model(inputs).gaussians
+            values = {**self._values(sample, inputs, found), **values}
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         broken = [name for name, value in values.items() if not math.isfinite(value)]
