@@ -149,8 +149,7 @@ def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
             yield file
         path.fs.mv(temporary.path, path.path)
     except BaseException:
-        if temporary.exists():
-            temporary.unlink()
+        temporary.unlink(missing_ok=True)
         raise
 
 
