@@ -34,6 +34,7 @@ import torch
 from PIL import Image
 from process_memory import megabytes
 from qgs_datatools.entries import chunk_entry
+from qgs_datatools.packing import opened_replacing, write_bytes
 from upath import UPath
 
 from qgs.composer import Recipe, resolve
@@ -44,7 +45,6 @@ from qgs.engine.distributed import make_accelerator
 from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
 from qgs.engine.training import compute_gradients
-from qgs.io.files import opened_replacing, write_bytes
 
 TINY = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 CHUNKS, SCENES, FRAMES = 24, 8, 16

@@ -1,6 +1,8 @@
-"""Median seconds that `import qgs` adds to `import torch`, and that `qgs --help` takes.
+"""Median seconds of starting up, beside `import torch`: importing qgs, and commands that answer.
 
 Usage: python tools/bench_startup.py [REPETITIONS]
+
+Unset PYTHONDONTWRITEBYTECODE, or every start compiles qgs anew.
 """
 
 from __future__ import annotations
@@ -10,6 +12,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+TINY = Path(__file__).parents[1] / "recipes" / "tiny"
+QGS = str(Path(sys.executable).with_name("qgs"))
+TOKENGS, LOCUS = (str(TINY / f"{name}.yaml") for name in ("tokengs", "locus"))
+COMMANDS = (("--help",), ("list",), ("compose", LOCUS), ("diff", TOKENGS, LOCUS))
 
 
 def seconds(*command: str) -> float:
@@ -29,7 +36,7 @@ def main() -> None:
             "-c",
             "import torch, qgs; [getattr(qgs, name) for name in qgs.__all__]",
         ),
-        "qgs --help": (str(Path(sys.executable).with_name("qgs")), "--help"),
+        **{" ".join(("qgs", *words)): (QGS, *words) for words in COMMANDS},
     }
     times: dict[str, list[float]] = {name: [] for name in commands}
     for repetition in range(repetitions + 1):

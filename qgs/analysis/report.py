@@ -34,7 +34,7 @@ from qgs.drawing.queries import (
     support_picture,
     token_picture,
 )
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
 
@@ -220,7 +220,7 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
     """
     figures: dict[str, list[Tile]] = {}
     camera = sample.inputs.cameras[:, :1]
-    photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE, smooth=True)
+    photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE)
     for contender, _ in shown:
         model = contender.model
         prediction = model(sample.inputs, layers=range(1, model.depth + 1))
@@ -247,7 +247,7 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
 def attention(shown: Shown, sample: Sample) -> ReportSection:
     """Where the heaviest token looks in the input views: content, geometry, both; mean of heads."""
     figures: dict[str, list[Tile]] = {}
-    photos = [enlarged(rgb_picture(i), SIDE // 2, smooth=True) for i in sample.inputs.images[0]]
+    photos = [enlarged(rgb_picture(i), SIDE // 2) for i in sample.inputs.images[0]]
     view = sample.targets.cameras[:, :1]
     for contender, prediction in shown:
         model = contender.model

@@ -13,11 +13,6 @@ if TYPE_CHECKING:
     from qgs.testing import CheckResult
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("check-plugin")(check_plugin)
-
-
 def check_plugin(
     name: Annotated[str, typer.Argument(help="Name of the plugin, as in `plugins: [NAME]`.")],
     core: Annotated[bool, typer.Option("--core", help="Leave out the slower checks.")] = False,

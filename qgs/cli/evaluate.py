@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,46 +23,36 @@ if TYPE_CHECKING:
 def evaluate(
     runs: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RUN", help="Run folder or checkpoint file; with --compare several results."
-        ),
+        typer.Argument(metavar="RUN", help="Run folder or checkpoint; several with --compare."),
     ],
     overrides: Overrides = None,
     index: Annotated[
-        str | None,
-        typer.Option(help="JSON file of scenes and frames; short for --set evaluation.index=..."),
+        str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
     ] = None,
     tune: Annotated[
-        int | None,
-        typer.Option(min=0, help="Steps of token tuning on the input views of each scene."),
+        int | None, typer.Option(min=0, help="Steps of token tuning on a scene's input views.")
     ] = None,
-    batch: Annotated[
-        int, typer.Option(min=1, help="Scenes that pass through the model together.")
-    ] = 1,
+    batch: Annotated[int, typer.Option(min=1, help="Scenes passed through the model at once.")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder; default: RUN/evaluation, with other settings the next RUN/evaluation-N."
-        ),
+        typer.Option(help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings."),
     ] = None,
     compare: Annotated[
-        bool,
-        typer.Option("--compare", help="Compare the first RUN's results with those of the others."),
+        bool, typer.Option("--compare", help="Compare the first RUN's results with the others'.")
     ] = False,
     across_protocols: Annotated[
-        bool,
-        typer.Option("--across-protocols", help="Compare results of different protocols."),
+        bool, typer.Option("--across-protocols", help="Compare results of different protocols.")
     ] = False,
     strict: Annotated[
-        bool,
-        typer.Option("--strict", help="Exit with 1 when a scene of the protocol has no score."),
+        bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
     ] = False,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour.
 
-    With --compare nothing is evaluated: the results in several RUNs are compared, scene by scene.
+    With --compare nothing is evaluated: the results in the first RUN are compared with those in
+    each of the others, scene by scene, and written to --out where it is given.
     """
     settings = list(overrides or ())
     if index is not None:
@@ -77,7 +67,15 @@ def evaluate(
                 f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
                 "evaluate each run with these settings first"
             )
-        compare_results(runs, across_protocols, out, console)
+        from qgs.engine.comparison import compare as compared
+        from qgs.engine.results import read_results
+
+        comparisons = compared([read_results(run) for run in runs], across_protocols)
+        comparisons.show(console)
+        if out:
+            comparisons.write(out)
+        end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
+        console.print(end, soft_wrap=True)
         return
     if len(runs) > 1 or across_protocols:
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
@@ -90,7 +88,7 @@ def evaluate(
 
     use_threads(threads)
     for setting in settings:
-        if setting.split(".")[0].split("=")[0] not in SECTIONS:
+        if re.split("[.=]", setting)[0] not in SECTIONS:
             raise ValueError(
                 f"--set {setting} would change the trained model; an evaluation can only set "
                 + ", ".join(SECTIONS)
@@ -107,7 +105,7 @@ def evaluate(
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
         console.print(hint, soft_wrap=True, markup=False)
-    if strict and not evaluation.is_complete:
+    if strict and evaluation.missing:
         raise typer.Exit(1)
 
 
@@ -117,11 +115,11 @@ def evaluation_folder(checkpoint: Path, other: bool) -> Path:
     For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ...
     """
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")
-    name = f"evaluation_{label}" if label else "evaluation"
-    folder, numbers = checkpoint.parent / name, count(2)
-    while other and (folder.name == name or folder.exists()):
-        folder = checkpoint.parent / f"{name}-{next(numbers)}"
-    return folder
+    folder = checkpoint.with_name(f"evaluation_{label}" if label else "evaluation")
+    if not other:
+        return folder
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in count(2))
+    return next(folder for folder in numbered if not folder.exists())
 
 
 def evaluate_into(
@@ -146,23 +144,3 @@ def evaluate_into(
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)
     return evaluation
-
-
-def compare_results(
-    runs: Sequence[Path], across_protocols: bool, out: Path | None, console: Console
-) -> None:
-    """Compare the results in the first folder with those in each of the others.
-
-    out: folder for comparison.json and comparison.md; None writes nothing.
-    """
-    from qgs.engine.comparison import compare
-    from qgs.engine.results import read_results
-
-    results = [read_results(run) for run in runs]
-    comparisons = compare(results, across_protocols)
-    comparisons.show(console)
-    if out is None:
-        console.print("add --out FOLDER to keep this as JSON and Markdown")
-        return
-    comparisons.write(out)
-    console.print(f"written to {out}", soft_wrap=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qgs.cli.options import Device, parse_size
+from qgs.cli.options import Device, Size, parse_size
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,11 +22,6 @@ if TYPE_CHECKING:
     from qgs.types import Gaussians
 
 _SHOWN = 8  # names of scenes in an error
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("reconstruct")(reconstruct)
 
 
 def reconstruct(
@@ -50,12 +45,7 @@ def reconstruct(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
-    size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HxW", help="Height and width of the photos; the recipe's data.image_size."
-        ),
-    ] = None,
+    size: Size = None,
     scene_name: Annotated[
         str | None, typer.Option("--scene", help="Name of the scene, where there are several.")
     ] = None,

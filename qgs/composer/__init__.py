@@ -13,18 +13,10 @@ import torch
 
 from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.recipe import Recipe, resolve
-from qgs.composer.registry import PluginError, plugin_versions
+from qgs.composer.registry import PluginError
 from qgs.model import QueryGaussianModel
 
-__all__ = [
-    "PluginError",
-    "Recipe",
-    "RecipeError",
-    "RecipeProblem",
-    "compose",
-    "plugin_versions",
-    "resolve",
-]
+__all__ = ["PluginError", "Recipe", "RecipeError", "RecipeProblem", "compose", "resolve"]
 
 
 def compose(

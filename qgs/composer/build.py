@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
@@ -15,14 +16,7 @@ from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.flow import fits
 from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
-from qgs.contracts import (
-    ModelComponent,
-    ModelDims,
-    Optimizer,
-    Queries,
-    Refinement,
-    SceneSource,
-)
+from qgs.contracts import ModelComponent, ModelDims, Optimizer, Queries, Refinement, SceneSource
 from qgs.contracts.component import MissingExtraError
 from qgs.model import DecoderLayer, QueryGaussianModel
 from qgs.types import QueryState
@@ -82,8 +76,8 @@ def build_model(
 class _ShapesAlone(TorchFunctionMode):
     """On "meta", makes the results of `randn`, `cat` and arithmetic from their shapes.
 
-    torch's own way to do so imports its compiler, which takes longer than everything else that
-    `qgs compose` does.
+    torch's own way to do so (its `broadcast_shapes` too) imports its compiler or sympy, which
+    takes longer than everything else that `qgs compose` does.
     """
 
     arithmetic = ("add", "sub", "mul", "div", "pow", "__rsub__", "__rdiv__", "__rpow__")
@@ -102,7 +96,7 @@ class _ShapesAlone(TorchFunctionMode):
             dtype = torch.result_type(*args)
             shapes = [x.shape for x in args if isinstance(x, Tensor)]
             if dtype.is_floating_point:
-                return torch.empty(torch.broadcast_shapes(*shapes), dtype=dtype)
+                return torch.empty(np.broadcast_shapes(*shapes), dtype=dtype)
         return func(*args, **(kwargs or {}))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -46,14 +45,8 @@ class Chosen:
         return str(origin) if origin else "default of the slot"
 
 
-def decode_places(
-    places: Mapping[KeyPath, Place], registry: Registry, problems: Problems
-) -> dict[KeyPath, Chosen | None]:
-    """The component of every place; None, with a problem, where there is none to be had."""
-    return {path: _decode_place(place, registry, problems) for path, place in places.items()}
-
-
-def _decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
+def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
+    """The component of a place; None, with a problem, where there is none to be had."""
     path = ".".join(place.source)
     node = MapNode(place.origin) if place.node is None else place.node
     if not isinstance(node, MapNode):
@@ -164,10 +157,9 @@ def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[
         return cause.reason, cause.fix
     if kind == "value_error":
         return str(cause), "change the value so that this holds"
-    reason = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
-    reason = reason.replace(" after validation", "")
-    reason = reason if kind in ("too_long", "too_short") else f"{reason}, got {kind_of(given)}"
-    written = str(given)
+    message = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
+    got = "" if kind in ("too_long", "too_short") else f", got {kind_of(given)}"
+    reason, written = message.replace(" after validation", "") + got, str(given)
     if kind == "bool_type" and written.lower() in _BOOLS:
         word = _BOOLS[written.lower()]
         return reason, f"write `{word}`: in YAML 1.2 `{written}` is a string"

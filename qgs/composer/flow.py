@@ -10,7 +10,6 @@ from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import KeyPath, MapNode, find
 from qgs.composer.registry import (
-    PluginError,
     Registry,
     component_error,
     component_failure,
@@ -38,11 +37,29 @@ _FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "los
 
 def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
     """Report what is wrong with a component's options; whether its declarations can be read."""
-    place = chosen.place
+    component, config, place = chosen.component, chosen.config, chosen.place
+    asked, failure, cause = "requires", None, None
     try:
-        found = _declared_problems(chosen, context)
-    except PluginError as error:
-        problems.add(place.origin, chosen.path, error.reason, error.fix, error)
+        dict(component.requires(config))
+        asked = "provides"
+        provided = component.provides(config)
+        beyond = provided.keys() - _writable(component, provided)
+        if issubclass(component, Supervision):
+            asked = "weights"
+            dict(component(config).weights())
+        asked = "problems"
+        found = list(component.problems(config, context))
+        odd = [type(problem).__name__ for problem in found if not isinstance(problem, Problem)]
+        if odd:
+            raise TypeError(f"it gives {odd[0]}, not qgs.contracts.Problem")
+        if beyond:
+            fault = f"says that it provides {', '.join(beyond)}, which a component of the slot"
+            told = f"`{chosen.type}` {fault} `{component.slot}` has no way to write"
+            failure = component_error(chosen.installed, told)
+    except Exception as error:
+        failure, cause = component_failure(chosen.type, asked, error, chosen.installed), error
+    if failure:
+        problems.add(place.origin, chosen.path, failure.reason, failure.fix, cause)
         return False
     for problem in found:
         node = place.node if isinstance(place.node, MapNode) else MapNode(place.origin)
@@ -52,42 +69,10 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
     return True
 
 
-def _declared_problems(chosen: Chosen, context: RecipeContext) -> list[Problem]:
-    """The `problems` of a component that declares its fields soundly.
-
-    Raises PluginError, which names the distribution, if its code fails, or if it says that it
-    provides what no component of its slot can write.
-    """
-    component, config, asked = chosen.component, chosen.config, "requires"
-    try:
-        dict(component.requires(config))
-        asked = "provides"
-        provided = dict(component.provides(config))
-        if issubclass(component, Supervision):
-            asked = "weights"
-            dict(component(config).weights())
-        asked = "problems"
-        found = list(component.problems(config, context))
-        odd = [type(problem).__name__ for problem in found if not isinstance(problem, Problem)]
-        if odd:
-            raise TypeError(f"it gives {odd[0]}, not qgs.contracts.Problem")
-    except Exception as error:
-        raise component_failure(chosen.type, asked, error, chosen.installed) from error
-    writable = _writable(component)
-    beyond = [] if writable is None else [name for name in provided if name not in writable]
-    if beyond:
-        raise component_error(
-            chosen.installed,
-            f"`{chosen.type}` says that it provides {', '.join(beyond)}, which a component of the "
-            f"slot `{component.slot}` has no way to write",
-        )
-    return found
-
-
-def _writable(component: type[Component]) -> Collection[str] | None:
-    """Names of the fields that a component of this slot can write; None for any."""
+def _writable(component: type[Component], provided: Fields) -> Collection[str]:
+    """Names of the fields among `provided` that a component of this slot can write."""
     if issubclass(component, Queries | Refinement):
-        return None
+        return provided
     if issubclass(component, Encoder):
         return MEMORY_FIELDS
     return Renderer.provides(Renderer.Config()) if issubclass(component, Renderer) else ()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
-from qgs.composer.errors import Problems, did_you_mean, nearest
+from qgs.composer.errors import Problems, nearest
 from qgs.composer.files import merge
 from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, kind_of
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot, slot_at
@@ -33,8 +33,12 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
     template = [_place(tree, ("model", "decoder", name)) for name in LAYER_SLOTS]
     places += template
     layers = tree.child("model", "decoder", "layers")
-    _check_layers(layers, depth, problems)
-    for index in map(str, range(depth)):
+    indices = [str(index) for index in range(depth)]
+    for key, _, origin in layers.without(*indices).entries():
+        reason = f"there is no layer `{key}` in a decoder of depth {depth}"
+        fix = f"name layers by their index, 0 to {depth - 1}"
+        problems.add(origin, f"model.decoder.layers.{key}", reason, fix)
+    for index in indices:
         places += [_layer_place(place, index, layers.child(index)) for place in template]
     for name, section in SECTIONS.items():
         if section.named:
@@ -62,23 +66,6 @@ def _layer_place(template: Place, index: str, layer: MapNode) -> Place:
     if isinstance(node, MapNode) and (base is None or isinstance(base, MapNode)):
         node = merge(MapNode(template.origin) if base is None else base, node, path)
     return Place(path, path, template.slot, node, layer.origins[name])
-
-
-def _check_layers(written: MapNode, depth: int, problems: Problems) -> None:
-    """Report overrides of layers or slots that do not exist."""
-    for key, node, origin in written.entries():
-        path = f"model.decoder.layers.{key}"
-        if key not in map(str, range(depth)):
-            reason = f"there is no layer `{key}` in a decoder of depth {depth}"
-            problems.add(origin, path, reason, f"name layers by their index, 0 to {depth - 1}")
-        elif isinstance(node, MapNode):
-            for name, _, place in node.without(*LAYER_SLOTS).entries():
-                reason = f"`{name}` is no slot of a decoder layer"
-                fix = did_you_mean(name, LAYER_SLOTS, "slots")
-                problems.add(place, f"{path}.{name}", reason, fix)
-        elif node is not None:
-            reason = "a layer's overrides are a mapping from slot to component"
-            problems.add(origin, path, reason, "write `SLOT: {type: NAME}` below it")
 
 
 def apply_swaps(

@@ -11,7 +11,7 @@ import torch
 
 from qgs import contracts
 from qgs.composer.build import build, build_model
-from qgs.composer.decode import Chosen, decode_places
+from qgs.composer.decode import Chosen, decode_place
 from qgs.composer.errors import Problems
 from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import check_flow, check_options
@@ -100,7 +100,7 @@ def resolve(
     dims = contracts.ModelDims(model.width, model.heads, decoder.depth)
     registry = load_plugins(tree, problems, plugins)
     places = apply_swaps(tree.child("swap"), expand(tree, dims.depth, problems), problems)
-    parts = decode_places(places, registry, problems)
+    parts = {path: decode_place(place, registry, problems) for path, place in places.items()}
     if sizes_known:
         data = parts.get(("data",))
         source = data.config if data else None
@@ -181,17 +181,19 @@ def _spell_out(
     put_settings("model")
     for name in MODEL_SLOTS[:2]:
         put_component(("model", name), parts["model", name])
-    put_settings("model", "decoder")
+    decoder = ("model", "decoder")
+    put_settings(*decoder)
     # The template, then every layer that differs; a template that no layer uses gives way.
     layers = {path: part for path, part in parts.items() if len(path) == 5}
     templates = {}
     for name in LAYER_SLOTS:
-        first, *others = [part for path, part in layers.items() if path[-1] == name]
-        same = all(_same(first, other) for other in others)
-        templates[name] = first if same else parts["model", "decoder", name]
-        put_component(("model", "decoder", name), templates[name])
+        alike = [(part.type, part.config) for path, part in layers.items() if path[-1] == name]
+        same = alike.count(alike[0]) == len(alike)
+        path = (*decoder, "layers", "0", name) if same else (*decoder, name)
+        put_component((*decoder, name), parts[path])
+        templates[name] = (parts[path].type, parts[path].config)
     for path, part in layers.items():
-        if not _same(part, templates[path[-1]]):
+        if (part.type, part.config) != templates[path[-1]]:
             put_component(path, part)
     for name in MODEL_SLOTS[2:]:
         put_component(("model", name), parts["model", name])
@@ -207,10 +209,6 @@ def _spell_out(
     for name in ("views", "training", "evaluation"):
         put_settings(name)
     return tree, provenance
-
-
-def _same(a: Chosen, b: Chosen) -> bool:
-    return a.type == b.type and a.config == b.config
 
 
 def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:

@@ -43,8 +43,6 @@ BUILTIN = Plugin(
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
     ),
 )
-NAME = re.compile(r"[^\s/]+")
-"""Of a component: `type: PLUGIN/NAME` must be read as it was written."""
 DEVICES = ("cpu", "cuda", "mps")
 """Types of the devices that a renderer can render on."""
 
@@ -60,10 +58,7 @@ class PluginError(ValueError):
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A plugin that is loaded and sound, and the distribution it came with.
-
-    editable: whether its user is its author, who installed it from its source tree.
-    """
+    """A sound plugin and its distribution. editable: installed by its author, with `pip -e`."""
 
     plugin: Plugin
     distribution: str
@@ -83,10 +78,7 @@ class InstalledPlugin:
 
 @dataclass(frozen=True)
 class Registry:
-    """The components of the plugins that one recipe uses.
-
-    unusable: plugins that it names and that could not be loaded.
-    """
+    """The plugins that one recipe uses. unusable: those that could not be loaded."""
 
     plugins: Mapping[str, InstalledPlugin]
     unusable: frozenset[str] = frozenset()
@@ -137,11 +129,6 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
         except PluginError as error:
             broken.append(str(error))
     return Registry(plugins), broken
-
-
-def plugin_versions(names: Iterable[str]) -> dict[str, str]:
-    """Plugin name to the version of its distribution, `qgs` included; raises PluginError."""
-    return {name: plugin.version for name, plugin in load_registry(names).plugins.items()}
 
 
 def load_plugin(name: str) -> InstalledPlugin:
@@ -236,13 +223,12 @@ def component_fault(component: object) -> str:
     """Why nothing can be built of `component`; "" if it can."""
     if not (inspect.isclass(component) and issubclass(component, Component)):
         return "which is no qgs component"
-    slot = SLOTS.get(getattr(component, "slot", ""))
+    slot, name = SLOTS.get(getattr(component, "slot", "")), getattr(component, "name", None)
     if slot is None or not issubclass(component, slot.contract):
         return "which implements no slot's contract"
-    name = getattr(component, "name", None)
     if not isinstance(name, str):
         return "which has no `name`"
-    if not NAME.fullmatch(name):
+    if not re.fullmatch(r"[^\s/]+", name):  # else `type: PLUGIN/NAME` could not be told apart
         return f"whose name {name!r} is empty or has a slash or a blank"
     if inspect.isabstract(component):
         return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
@@ -262,17 +248,13 @@ def component_fault(component: object) -> str:
 def _schema_fault(config: type[ComponentConfig]) -> str:
     try:
         config.model_json_schema()
+        return ""
     except Exception as error:
-        first_line = str(error).splitlines()[0]
-        return f"whose Config has options that YAML cannot express: {first_line}"
-    return ""
+        return f"whose Config has options that YAML cannot express: {str(error).splitlines()[0]}"
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """The options that `component` has by default.
-
-    None if an option must be given, or if a plugin's own validator fails.
-    """
+    """Its default options; None if one must be given, or if a plugin's own validator fails."""
     try:
         return component.Config()
     except (Exception, SystemExit):
@@ -280,10 +262,7 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
 
 
 def component_error(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
-    """A component of `installed` breaks its contract; `fault` says which one, and how.
-
-    place: FILE:LINE in its code, "" for none.
-    """
+    """A component of `installed` breaks its contract. place: FILE:LINE in its code, or ""."""
     origin = f" of {installed.released_as}" if installed.distribution else ""
     at = f" (at {place})" if place else ""
     reason = f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}"

@@ -60,21 +60,24 @@ _BESIDE: dict[KeyPath, tuple[str, ...]] = {
 }
 """Keys that stand beside the settings of a section."""
 _KEYS = {path: {*SETTINGS[path].model_fields, *keys} for path, keys in _BESIDE.items()}
+_LAYERS: KeyPath = ("model", "decoder", "layers")
 _MAPPINGS: set[KeyPath] = {
-    *(("swap",), ("model", "decoder", "layers"), *SETTINGS),
+    *(("swap",), _LAYERS, *SETTINGS),
     *((name,) for name, section in SECTIONS.items() if section.named),
 }
 
 
 def check_tree(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode:
     """Report unknown keys and sections that are no mappings; the tree without them."""
+    known = {*LAYER_SLOTS} if path[:-1] == _LAYERS else _KEYS.get(path)
     checked = []
     for key, node, origin in tree.entries():
-        below, known = (*path, key), _KEYS.get(path)
+        below = (*path, key)
         if known is not None and key not in known:
-            reason = f"there is no key `{key}` here"
-            problems.add(origin, ".".join(below), reason, _right_key(key, path, known))
-        elif below not in _MAPPINGS:
+            homes = [".".join((*home, key)) for home, keys in _KEYS.items() if key in keys]
+            fix = f"did you mean `{homes[0]}`?" if homes else did_you_mean(key, known, "keys")
+            problems.add(origin, ".".join(below), f"there is no key `{key}` here", fix)
+        elif below not in _MAPPINGS and path != _LAYERS:
             checked.append((key, node, origin))
         elif isinstance(node, MapNode):
             checked.append((key, check_tree(node, problems, below), origin))
@@ -83,14 +86,6 @@ def check_tree(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode
             fix = f"write `key: value` lines below `{key}:`"
             problems.add(origin, ".".join(below), reason, fix)
     return MapNode(tree.origin, checked)
-
-
-def _right_key(key: str, path: KeyPath, known: set[str]) -> str:
-    """A fix for the unknown `key` at `path`: the section that has it, or a similar key."""
-    for home, keys in _KEYS.items():
-        if home != path and key in keys:
-            return f"did you mean `{'.'.join((*home, key))}`?"
-    return did_you_mean(key, known, "keys")
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, Any], bool]:

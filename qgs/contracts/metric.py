@@ -65,11 +65,10 @@ class MetricInput(TensorContainer):
 class Metric(Component, torch.nn.Module):
     """MetricInput -> values. Called without gradients, for every sample and every method.
 
-    definition: what is measured, in words. It is part of the evaluation protocol, as the options
-    are: change it when values change. not_in_protocol: options that change no value, such as where
-    a file lies. needs: parts of the input that must not be None; where one is, there is no value.
-    column: how the value is shown. unavailable: set by `__init__` to the reason why there are no
-    values on this machine, such as a missing file of weights; evaluations show it.
+    definition: what is measured, in words; part of the evaluation protocol, as the options are:
+    change it when values change. not_in_protocol: options that change no value, such as a path.
+    needs: parts of the input without which there is no value. column: how the value is shown.
+    unavailable: set by `__init__` to why there are no values here, such as a missing file.
     """
 
     slot: ClassVar[str] = "metrics"

@@ -252,39 +252,35 @@ def _why(error: Exception) -> str:
 
 
 class Chunk:
-    """An open chunk: its scenes by key, parsed when asked for."""
+    """An open chunk. entries: its scenes by key, as stored."""
 
     def __init__(self, path: UPath) -> None:
         self.path = path
-        self._entries: dict[str, Any] = {}
+        self.entries: dict[str, Any] = {}
         self._parsed: dict[str, Record] = {}
         for place, entry in enumerate(load_chunk(path)):
             key = entry.get("key") if isinstance(entry, dict) else None
             if not isinstance(key, str):
                 parse_record(f"{path}: entry {place}", entry)  # raises
-            elif key in self._entries:
+            elif key in self.entries:
                 raise ValueError(
                     f"{path} holds the scene {key!r} twice: pack the data set again with "
                     "`qgs data pack`"
                 )
             else:
-                self._entries[key] = entry
-
-    @property
-    def keys(self) -> list[str]:
-        """Keys in the file's order."""
-        return list(self._entries)
+                self.entries[key] = entry
 
     def record(self, key: str) -> Record:
         """A scene. Raises ValueError when it is not in this chunk or is malformed."""
-        if key not in self._entries:
+        if key not in self.entries:
+            keys = list(self.entries)
             raise ValueError(
                 f"{self.path} does not hold the scene {key!r}, which index.json places there: it "
-                f"holds {', '.join(self.keys[:5])}{', ...' if len(self.keys) > 5 else ''}. Remove "
+                f"holds {', '.join(keys[:5])}{', ...' if len(keys) > 5 else ''}. Remove "
                 "index.json to have the chunks read instead, or pack the data set again"
             )
         if key not in self._parsed:
-            self._parsed[key] = parse_record(str(self.path), self._entries[key])
+            self._parsed[key] = parse_record(str(self.path), self.entries[key])
         return self._parsed[key]
 
 
@@ -353,7 +349,7 @@ def _scanned(folder: UPath) -> dict[str, UPath]:
         )
     files: dict[str, UPath] = {}
     for path in paths:
-        for key in Chunk(path).keys:
+        for key in Chunk(path).entries:
             if key in files:
                 raise ValueError(
                     f"the scene {key!r} is in {files[key].name} and in {path.name} of {folder}: "

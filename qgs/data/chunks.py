@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
@@ -13,11 +13,18 @@ from pydantic import Field
 from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import Scene, SceneSource, Split
+from qgs.contracts import SceneSource, Split
 from qgs.data.chunk_files import SUFFIX, Chunk, Record, has_chunks, list_scenes, require_usable
 from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
 from qgs.data.paths import opened_path
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, warn_once
+from qgs.data.scenes import (
+    BoundedCache,
+    EncodedFrame,
+    EncodedScene,
+    LazyScenes,
+    LazySource,
+    warn_once,
+)
 from qgs.types import Cameras
 
 _OPEN = 4  # chunks kept open
@@ -48,10 +55,9 @@ class ChunkScene(EncodedScene):
     """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
 
     def __init__(
-        self, chunks: BoundedCache[Chunk], file: UPath, key: str, config: ChunksConfig
+        self, name: str, file: UPath, config: ChunksConfig, chunks: BoundedCache[Chunk]
     ) -> None:
-        self.name = key
-        self._chunks, self._file, self._config = chunks, file, config
+        self.name, self._file, self._config, self._chunks = name, file, config, chunks
 
     @property
     def _record(self) -> Record:
@@ -146,31 +152,7 @@ class ChunkScene(EncodedScene):
         return CropResize((mask.height, mask.width), self._config.image_size).image(mask)
 
 
-class ChunkScenes(LazyScenes):
-    """The scenes of a split, made when they are asked for."""
-
-    def __init__(
-        self, chunks: BoundedCache[Chunk], files: Mapping[str, UPath], config: ChunksConfig
-    ) -> None:
-        self._chunks, self._files, self._config = chunks, list(files.items()), config
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def scene(self, place: int) -> ChunkScene:
-        """See `LazyScenes`."""
-        key, file = self._files[place]
-        return ChunkScene(self._chunks, file, key, self._config)
-
-    def groups(self) -> list[list[int]]:
-        """Indices of the scenes of each file."""
-        by_file: dict[str, list[int]] = {}
-        for place, (_, file) in enumerate(self._files):
-            by_file.setdefault(str(file), []).append(place)
-        return list(by_file.values())
-
-
-class ChunksSource(SceneSource):
+class ChunksSource(LazySource):
     """Chunks under PATH/train and PATH/test; a folder without these is the training split.
 
     A data set without test chunks is evaluated on the held-out frames of its training scenes,
@@ -183,12 +165,13 @@ class ChunksSource(SceneSource):
 
     def __init__(self, config: ChunksConfig) -> None:
         super().__init__(config)
-        chunks: BoundedCache[Chunk] = BoundedCache(_OPEN)
-        self._splits: dict[Split, ChunkScenes] = {
-            split: ChunkScenes(chunks, _chosen(chunks, folder, config), config)
-            for split, folder in _folders(opened_path(config.path)).items()
-        }
-        self._nothing = ChunkScenes(chunks, {}, config)
+        opener = partial(ChunkScene, config=config, chunks=BoundedCache(_OPEN))
+        self._nothing = LazyScenes({}, opener)
+        splits: dict[Split, LazyScenes] = {"train": self._nothing}
+        for split, folder in _folders(opened_path(config.path)).items():
+            files = _long_enough(folder, config, opener)
+            splits[split] = LazyScenes(files, opener, config.max_scenes)
+        self.splits = splits
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
@@ -197,23 +180,22 @@ class ChunksSource(SceneSource):
         splits = [item for item in inside if item.name in ("train", "test")]
         return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
-    def scenes(self, split: Split) -> Sequence[Scene]:
+    def scenes(self, split: Split) -> LazyScenes:
         """See `SceneSource`.
 
         Without test chunks, the first training chunk is opened to see whether it holds out frames.
         """
-        return self._split(split)
-
-    def _split(self, split: Split) -> ChunkScenes:
-        train = self._splits.get("train", self._nothing)
-        if split == "train" or split in self._splits:
-            return self._splits.get(split, train)
-        first = next(iter(train.groups()), [])
-        return train if any(train[index].held_out for index in first) else self._nothing
+        if split in self.splits:
+            return self.splits[split]
+        train, first = self.splits["train"], self.groups("train")[:1]
+        return train if any(train[i].held_out for group in first for i in group) else self._nothing
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
         """See `SceneSource`: one group for each chunk file."""
-        return self._split(split).groups()
+        by_file: dict[str, list[int]] = {}
+        for index, file in enumerate(self.scenes(split).places.values()):
+            by_file.setdefault(str(file), []).append(index)
+        return list(by_file.values())
 
 
 def _folders(path: UPath) -> dict[Split, UPath]:
@@ -234,18 +216,20 @@ def _folders(path: UPath) -> dict[Split, UPath]:
     return found
 
 
-def _chosen(chunks: BoundedCache[Chunk], folder: UPath, config: ChunksConfig) -> dict[str, UPath]:
-    """The scenes that the options leave; those with too few frames are counted and named."""
+def _long_enough(
+    folder: UPath, config: ChunksConfig, opener: Callable[[str, UPath], ChunkScene]
+) -> dict[str, UPath]:
+    """The scenes with `min_frames` frames; the others are counted and named."""
     files = list_scenes(folder)
-    if config.min_frames:
-        by_file = sorted(files.items(), key=lambda item: str(item[1]))
-        frames = {key: len(ChunkScene(chunks, file, key, config)) for key, file in by_file}
-        short = {key: count for key, count in frames.items() if count < config.min_frames}
-        if short:
-            names = ", ".join(f"{key} ({count})" for key, count in short.items())
-            warn_once(
-                f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
-                f"{config.min_frames} frames (min_frames) and are left out: {names}"
-            )
-        files = {key: file for key, file in files.items() if key not in short}
-    return dict(list(files.items())[: config.max_scenes or None])
+    if not config.min_frames:
+        return files
+    by_file = sorted(files.items(), key=lambda item: str(item[1]))
+    frames = {key: len(opener(key, file)) for key, file in by_file}
+    short = {key: count for key, count in frames.items() if count < config.min_frames}
+    if short:
+        names = ", ".join(f"{key} ({count})" for key, count in short.items())
+        warn_once(
+            f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
+            f"{config.min_frames} frames (min_frames) and are left out: {names}"
+        )
+    return {key: file for key, file in files.items() if key not in short}

@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar, TypeAlias, cast
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, ClassVar, TypeAlias, cast
 
 from pydantic import Field
 from upath import UPath
 
-from qgs.contracts import Scene, SceneSource, Split
+from qgs.contracts import SceneSource
 from qgs.data.paths import ArchivePath, opened_path
 from qgs.data.photos import formats_of
-from qgs.data.photos.source import PhotoScene, PhotoScenes, PhotosConfig
-from qgs.data.scenes import warn_once
+from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
+from qgs.data.scenes import LazyScenes, LazySource, warn_once
 
 LISTING = "transforms.json"
 _INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
@@ -48,21 +49,7 @@ class Dl3dvConfig(SceneSource.Config):
     """RGB in [0, 1] behind transparent pixels."""
 
 
-class Dl3dvScenes(PhotoScenes):
-    """The scenes of a split, each read when it is asked for."""
-
-    def __init__(self, places: Mapping[str, Place], config: Dl3dvConfig) -> None:
-        wanted = dict(list(places.items())[: config.max_scenes or None])
-        same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
-        photos = PhotosConfig(format="nerfstudio", **same)
-        super().__init__(cast(Mapping[str, UPath], wanted), photos, cache_bytes=0)
-
-    def open(self, name: str, folder: UPath) -> PhotoScene:
-        """See `PhotoScenes`; raises as `scene_folder` too."""
-        return super().open(name, scene_folder(folder))
-
-
-class Dl3dvSource(SceneSource):
+class Dl3dvSource(LazySource):
     """Scenes of DL3DV, read in place: archives are not unpacked.
 
     Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
@@ -85,7 +72,13 @@ class Dl3dvSource(SceneSource):
             if absent:
                 names = ", ".join(absent)
                 warn_once(f"{len(absent)} of {len(listed)} test scenes are not there: {names}")
-        self._splits = {"train": Dl3dvScenes(train, config), "test": Dl3dvScenes(test, config)}
+        same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
+        photos = PhotosConfig(format="nerfstudio", **same)
+        opener = partial(_opened, config=photos, cache=image_cache(0))
+        self.splits = {
+            "train": LazyScenes(train, opener, config.max_scenes),
+            "test": LazyScenes(test, opener, config.max_scenes),
+        }
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
@@ -99,13 +92,9 @@ class Dl3dvSource(SceneSource):
             for name, place in _places(path, _DEPTH)
         )
 
-    def scenes(self, split: Split) -> Sequence[Scene]:
-        """See `SceneSource`."""
-        return self._splits[split]
 
-    def names(self, split: Split) -> Sequence[str]:
-        """See `SceneSource`."""
-        return self._splits[split].names
+def _opened(name: str, place: Place, **options: Any) -> PhotoScene:
+    return PhotoScene(name, scene_folder(place), **options)
 
 
 def find_scenes(path: UPath) -> dict[str, Place]:

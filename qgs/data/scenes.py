@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -13,24 +13,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from qgs.contracts import Scene
+from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.lenses import Intrinsics, Lens, Size
 
 Value = TypeVar("Value")
 _log = logging.getLogger(__name__)
-
-
-class LazyScenes(Sequence[Scene]):
-    """Scenes that are made or opened when they are indexed."""
-
-    @abstractmethod
-    def scene(self, place: int) -> Scene:
-        """The scene at `place`, from 0 to below the number of scenes."""
-
-    def __getitem__(self, index: Any) -> Any:
-        """The scene at an index, or scenes at a slice of them."""
-        places = range(len(self))[index]  # raises IndexError
-        return [self.scene(i) for i in places] if isinstance(places, range) else self.scene(places)
 
 
 @dataclass(frozen=True)
@@ -90,6 +77,45 @@ class BoundedCache(Generic[Value]):
             while self._total > self._limit:
                 self._total -= self._kept.popitem(last=False)[1][1]
         return value
+
+
+class LazyScenes(Sequence[Scene]):
+    """Scenes by name, opened when they are indexed; the last 64 stay open.
+
+    places: name to where or what the scene is, of which only the first `limit` are taken; 0 for
+    all. open: makes the scene of a name and its place; picklable.
+    """
+
+    def __init__(
+        self, places: Mapping[str, Any], open: Callable[[str, Any], Scene], limit: int = 0
+    ) -> None:
+        self.names, self._open = list(places)[: limit or None], open
+        self.places = {name: places[name] for name in self.names}
+        self._opened: BoundedCache[Scene] = BoundedCache(64)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: Any) -> Any:
+        """The scene at an index, or the scenes at a slice."""
+        name = self.names[index]
+        if isinstance(name, list):
+            return [self[place] for place in range(len(self))[index]]
+        return self._opened.get(name, lambda: self._open(name, self.places[name]))
+
+
+class LazySource(SceneSource):
+    """A source of `LazyScenes`. splits: both of them, set by `__init__`."""
+
+    splits: Mapping[Split, LazyScenes]
+
+    def scenes(self, split: Split) -> LazyScenes:
+        """See `SceneSource`."""
+        return self.splits[split]
+
+    def names(self, split: Split) -> Sequence[str]:
+        """See `SceneSource`."""
+        return self.scenes(split).names
 
 
 @lru_cache(maxsize=4096)

@@ -111,13 +111,12 @@ def _checked(picture: Picture) -> Image.Image:
     return Image.fromarray(picture)
 
 
-def enlarged(picture: Picture, side: int, *, smooth: bool = False) -> Picture:
-    """The picture with its longer side at `side` pixels; sharp pixels unless `smooth`."""
+def enlarged(picture: Picture, side: int) -> Picture:
+    """The picture with its longer side at `side` pixels, smooth."""
     height, width = picture.shape[:2]
     factor = side / max(height, width)
     size = (round(width * factor), round(height * factor))
-    resample = Image.Resampling.BICUBIC if smooth else Image.Resampling.NEAREST
-    return np.asarray(Image.fromarray(picture).resize(size, resample))
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
 
 def finer(cameras: Cameras, side: int) -> Cameras:

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, on disk and behind URLs; files of JSON records."""
+"""Files and folders that appear whole or not at all; files of JSON records."""
 
 import json
 import logging
@@ -8,11 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any
-
-from upath import UPath
-
-from qgs.data.paths import is_local
+from typing import Any
 
 _log = logging.getLogger(__name__)
 
@@ -129,31 +125,3 @@ def read_records(path: Path) -> list[dict[str, Any]]:
         except (ValueError, TypeError, KeyError):
             _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
     return records
-
-
-@contextmanager
-def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
-    """A file to write, which takes the place of `path` when the block ends well.
-
-    Makes missing parent folders. Object stores show an object when it is complete, so moving it is
-    as atomic as their copying. When the block raises, `path` stays as it was.
-    """
-    if is_local(path):
-        with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:
-            yield file
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-        path.fs.mv(temporary.path, path.path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
-def write_bytes(path: UPath, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all."""
-    with opened_replacing(path) as file:
-        file.write(data)

@@ -140,13 +140,12 @@ class Maker:
         sizes = self.sizes
         return self.normal(sizes.batch, sizes.queries, sizes.gaussians, 3)
 
-    def cameras(self, views: int | None = None, image: tuple[int, int] | None = None) -> Cameras:
+    def cameras(self, image: tuple[int, int] | None = None) -> Cameras:
         """Cameras side by side that look along z, a little inwards."""
         height, width = image or self.image
-        count = self.sizes.views if views is None else views
-        scene, view = torch.arange(self.sizes.batch)[:, None], torch.arange(count)
+        scene, view = torch.arange(self.sizes.batch)[:, None], torch.arange(self.sizes.views)
         angle = -0.06 * view - 0.02 * scene
-        c2w = torch.eye(4).repeat(self.sizes.batch, count, 1, 1)
+        c2w = torch.eye(4).repeat(*angle.shape, 1, 1)
         c2w[..., 0, 0] = c2w[..., 2, 2] = angle.cos()
         c2w[..., 0, 2], c2w[..., 2, 0] = angle.sin(), -angle.sin()
         c2w[..., 0, 3], c2w[..., 1, 3] = 0.2 * view, 0.05 * scene

@@ -37,11 +37,6 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
     return dict(module.named_parameters()) | dict(module.named_buffers())
 
 
-def is_torchs_own(part: nn.Module) -> bool:
-    """Whether the class of a module is defined by torch and not by a component's author."""
-    return type(part).__module__.partition(".")[0] == "torch"
-
-
 def attributes(module: nn.Module) -> dict[str, Any]:
     """Comparable values of what a module keeps besides parameters, buffers and submodules.
 

@@ -28,11 +28,10 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
     """
     plugin = installed.plugin
     for example in plugin.examples:
-        if not isinstance(example, ComponentConfig):
-            fault = f"{example!r} is not a component's options; list MyComponent.Config()"
+        component = getattr(type(example), "__component__", None)
+        if component is None or component not in plugin.components:
+            fault = f"{example!r} is not options of its components, such as MyComponent.Config()"
             raise _unsound(installed, "examples", fault)
-        if type(example).__component__ not in plugin.components:
-            raise _unsound(installed, "examples", f"{example!r} is of no component of the plugin")
     defaults = [default_config(component) for component in plugin.components]
     configs = [config for config in defaults if config is not None]
     configs += [example for example in plugin.examples if example not in configs]

@@ -125,21 +125,13 @@ def refuse_unexpectable(expected: Mapping[str, Any], cases: Iterable[Case]) -> N
         reason = _reason(why)
         if not (isinstance(reason, str) and reason.strip()):
             raise ValueError(f"the expected failure of `{name}` needs a reason, as a text")
-        if isinstance(why, ExpectedError) and not _names_errors(why.error):
+        kinds = why.error if isinstance(why, ExpectedError) else OSError
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+        if not kinds or any(issubclass(ContractError, kind) for kind in kinds):
             raise ValueError(
-                f"the expected error of `{name}` is {why.error!r}; name a class that neither every "
+                f"the expected error of `{name}` is {kinds!r}; name a class that neither every "
                 "error nor a broken contract (ContractError) is"
             )
-
-
-def _names_errors(kinds: Any) -> bool:
-    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
-    return bool(kinds) and all(
-        isinstance(kind, type)
-        and issubclass(kind, Exception)
-        and not issubclass(ContractError, kind)
-        for kind in kinds
-    )
 
 
 def _reason(expected: Expected) -> str:

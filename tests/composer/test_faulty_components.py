@@ -1,91 +1,59 @@
-"""Components of sound plugins whose own code fails, or does not do what it says."""
+"""Code of plugins that fails or does not do what it says: its author is shown the line, its user
+the release."""
 
 from __future__ import annotations
 
 import re
+import sys
+import traceback
+from pathlib import Path
 
 import pytest
 import torch
 
 from qgs.composer import PluginError, RecipeError, compose
+from qgs.composer.build import build
 from qgs.composer.recipe import resolve
 from qgs.contracts import Plugin, Queries
 from qgs.types import Cameras, QueryState, Views
 
-
-def test_config_whose_code_fails_is_reported_with_its_distribution(write, install):
-    install(
-        "qgs-faulty",
-        "faulty",
-        """
-        from pydantic import field_validator
-        from qgs.contracts import ComponentConfig, Plugin, Refinement
-        class Faulty(Refinement):
-            name = "faulty"
-            class Config(ComponentConfig):
-                step: int = 1
-                @field_validator("step")
-                @classmethod
-                def _check(cls, step):
-                    raise KeyError("oops")
-            def forward(self, state):
-                return state
-        plugin = Plugin("faulty", 1, (Faulty,))
-        """,
-    )
-    decoder = "model: {decoder: {refinement: {type: faulty/faulty, step: 2}}}\n"
-    with pytest.raises(RecipeError, match=r"qgs-faulty 1\.2 fails: `Config` of `faulty/faulty`"):
-        resolve(write("recipe: 1\nplugins: [faulty]\n" + decoder))
-
-
-@pytest.mark.parametrize("name", ["requires", "provides", "problems"])
-def test_component_whose_code_fails_is_reported_with_its_distribution(name, write, install):
-    install(
-        "qgs-faulty",
-        "faulty",
-        f"""
-        from qgs.contracts import Plugin, Refinement
-        class Faulty(Refinement):
-            name = "faulty"
-            @classmethod
-            def {name}(cls, *anything):
-                raise KeyError("oops")
-            def forward(self, state):
-                return state
-        plugin = Plugin("faulty", 1, (Faulty,))
-        """,
-        version="0.3",
-    )
-    decoder = "model: {decoder: {refinement: {type: faulty/faulty}}}\n"
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [faulty]\n" + decoder))
-    (problem,) = caught.value.problems
-    assert (problem.line, problem.option) == (3, "model.decoder.refinement")
-    assert f"`{name}` of `faulty/faulty` raises KeyError: 'oops'" in problem.reason
-    assert "qgs-faulty 0.3" in problem.reason
-    assert "qgs-faulty 0.3" in problem.fix
-
-
-FAULTY = """
-from qgs.contracts import CrossAttention, FieldSpec, Loss, Plugin, Queries, Refinement
-from qgs.contracts import SceneSource
+SOURCE = """
+from pydantic import field_validator
+from qgs.contracts import ComponentConfig, CrossAttention, FieldSpec, Loss, Plugin, Queries
+from qgs.contracts import Refinement, SceneSource
 from qgs.types import QueryState
 import torch
 
-PLACE = {"place": FieldSpec((3,))}
+def look_up(name):
+    return {}[name]  # line 9
 
-class Exploding(Queries):
-    name = "exploding"
-    count = 3
+class Faulty(Refinement):
+    name = "faulty"
+    class Config(ComponentConfig):
+        at: str = "nowhere"
+        @field_validator("at")
+        @classmethod
+        def _check(cls, at):
+            return look_up("x") if at == "Config" else at
     def __init__(self, config, dims):
-        raise ValueError("no luck")
-    def forward(self, batch_size):
-        raise NotImplementedError
+        super().__init__(config, dims)
+        look_up("x") if config.at == "__init__" else None
+    @classmethod
+    def requires(cls, config):
+        return look_up("x") if config.at == "requires" else {}
+    @classmethod
+    def provides(cls, config):
+        return look_up("x") if config.at == "provides" else {}
+    @classmethod
+    def problems(cls, config, context):
+        return look_up("x") if config.at == "problems" else ()
+    def forward(self, state):
+        return state
 
 class ExplodingLoss(Loss):
     name = "exploding"
     def __init__(self, config):
-        raise RuntimeError("no luck")
+        look_up("x")
     def forward(self, prediction, rendering, target):
         raise NotImplementedError
 
@@ -95,6 +63,8 @@ class Closed(SceneSource):
         raise FileNotFoundError("photos/ is not there")
     def scenes(self, split):
         raise NotImplementedError
+
+PLACE = {"place": FieldSpec((3,))}
 
 class Silent(Queries):
     name = "silent"
@@ -107,9 +77,7 @@ class Silent(Queries):
 
 class Shapeless(Refinement):
     name = "shapeless"
-    @classmethod
-    def provides(cls, config):
-        return PLACE
+    provides = Silent.provides
     def forward(self, state):
         return state.replace(fields={"place": state.features[..., :2]})
 
@@ -134,48 +102,99 @@ class Bare(Queries):
 
 class Boasting(CrossAttention):
     name = "boasting"
-    @classmethod
-    def provides(cls, config):
-        return PLACE
+    provides = Silent.provides
     def forward(self, state, memory):
         return state.features
 
 STATES = (Silent, Shapeless, Losing, Placed, Bare, Boasting)
-plugin = Plugin("faulty", 1, (Exploding, ExplodingLoss, Closed, *STATES))
+plugin = Plugin("faulty", 1, (Faulty, ExplodingLoss, Closed, *STATES))
 """
 
-TINY = """
-recipe: 1
-plugins: [faulty]
-model: {width: 16, heads: 2, encoder: {depth: 1}, queries: {count: 3},
-        decoder: {depth: 1}, supervision: {layers: [1]}, head: {gaussians_per_query: 2}}
+HEAD = "recipe: 1\nplugins: [faulty]\n"
+TINY = f"""{HEAD}
+model: {{width: 16, heads: 2, encoder: {{depth: 1}}, queries: {{count: 3}},
+         decoder: {{depth: 1}}, supervision: {{layers: [1]}}, head: {{gaussians_per_query: 2}}}}
 """
 
 
 @pytest.fixture
 def faulty(install) -> None:
-    install("qgs-faulty", "faulty", FAULTY, version="0.3")
+    install("qgs-faulty", "faulty", SOURCE, version="0.3")
 
 
-def test_what_a_constructor_raises_is_reported_with_its_distribution(write, faulty):
-    queries = "model: {queries: {type: faulty/exploding}}\n"
-    recipe = resolve(write("recipe: 1\nplugins: [faulty]\n" + queries))
+def file_of_the_plugin() -> str:
+    return str(Path(sys.path[0], "_test_qgs_faulty.py"))
+
+
+def problem_of(write, text, build=resolve):
     with pytest.raises(RecipeError) as caught:
-        recipe.build_model("meta")
+        build(write(HEAD + text))
     (problem,) = caught.value.problems
-    assert (problem.file, problem.line, problem.option) == ("recipe.yaml", 3, "model.queries")
-    assert "qgs-faulty 0.3" in problem.reason
-    assert "`__init__` of `faulty/exploding` raises ValueError: no luck" in problem.reason
+    return problem, "".join(traceback.format_exception(caught.value))
+
+
+AT_IMPORT = {
+    "error": ("import math\n\nTABLE = {}\nTABLE['x']\n", 4, "KeyError: 'x'"),
+    "syntax": ("import math\n\ndef f(:\n    pass\n", 3, "SyntaxError: invalid syntax"),
+    "deep": ("import json\n\nx = 1\n\njson.loads('}')\n", 5, "JSONDecodeError"),
+    "exit": ("\nraise SystemExit(3)\n", 2, "SystemExit: 3"),
+    "part that is not there": ("\n\nimport _test_qgs_faulty.part\n", 3, "ModuleNotFoundError"),
+}
+
+
+@pytest.mark.parametrize("editable", [True, False])
+@pytest.mark.parametrize("name", AT_IMPORT)
+def test_an_import_that_fails_is_placed(name, editable, write, install):
+    source, line, told = AT_IMPORT[name]
+    install("qgs-faulty", "faulty", source, editable=editable)
+    problem, shown = problem_of(write, "")
+    place = f"{file_of_the_plugin()}:{line}"
+    assert told in problem.reason
+    assert problem.reason.endswith(f"(at {place})")
+    assert problem.fix.startswith(f"mend {place}," if editable else "update qgs-faulty 1.2,")
+    assert f'File "{file_of_the_plugin()}", line {line}' in shown
+
+
+def test_a_module_without_the_plugin_has_no_place(write, install):
+    install("qgs-faulty", "faulty", "other = 1", editable=True)
+    problem, _ = problem_of(write, "")
+    assert problem.fix.startswith("mend `_test_qgs_faulty:plugin`, or do without")
+
+
+@pytest.mark.parametrize("editable", [True, False])
+@pytest.mark.parametrize("at", ["Config", "requires", "provides", "problems", "__init__"])
+def test_a_component_that_fails_is_placed(at, editable, write, install):
+    install("qgs-faulty", "faulty", SOURCE, version="0.3", editable=editable)
+    model = f"model:\n  decoder: {{refinement: {{type: faulty/faulty, at: {at}}}}}\n"
+    problem, shown = problem_of(write, model, compose)
+    assert (problem.line, problem.option) == (4, "model.decoder.refinement")
+    place = f"{file_of_the_plugin()}:9"
+    assert problem.reason == (
+        f"the plugin `faulty` of qgs-faulty 0.3 fails: `{at}` of `faulty/faulty` raises "
+        f"KeyError: 'x' (at {place})"
+    )
+    assert problem.fix.startswith(f"mend {place}," if editable else "update qgs-faulty 0.3,")
+    assert f'File "{file_of_the_plugin()}", line 9' in shown
+
+
+def test_the_tracebacks_of_several_plugins_are_all_shown(write, install):
+    install("qgs-first", "first", "{}['x']\n")
+    install("qgs-second", "second", "[][1]\n")
+    with pytest.raises(RecipeError) as caught:
+        resolve(write("recipe: 1\nplugins: [first, second]\n"))
+    shown = "".join(traceback.format_exception(caught.value))
+    assert "_test_qgs_first.py" in shown
+    assert "_test_qgs_second.py" in shown
 
 
 def test_what_a_loss_raises_when_built_is_reported_with_its_distribution(write, faulty):
-    recipe = resolve(write("recipe: 1\nplugins: [faulty]\nlosses: {x: {type: faulty/exploding}}\n"))
+    recipe = resolve(write(HEAD + "losses: {x: {type: faulty/exploding}}\n"))
     with pytest.raises(RecipeError, match=r"losses\.x\n.*qgs-faulty 0\.3"):
         recipe.build_losses()
 
 
 def test_data_that_cannot_be_opened_is_told_as_it_is(write, faulty):
-    recipe = resolve(write("recipe: 1\nplugins: [faulty]\ndata: {type: faulty/closed}\n"))
+    recipe = resolve(write(HEAD + "data: {type: faulty/closed}\n"))
     with pytest.raises(FileNotFoundError, match="photos/ is not there"):
         recipe.build_data()
 
@@ -201,13 +220,38 @@ LIES = {
 @pytest.mark.parametrize("name", LIES)
 def test_a_component_that_does_not_give_the_state_it_must_is_reported(name, write, faulty):
     overrides, told = LIES[name]
-    model = compose(write(TINY), overrides)
     cameras = Cameras(torch.eye(4).expand(1, 1, 4, 4), torch.full((1, 1, 4), 8.0), (16, 16))
-    with pytest.raises(PluginError, match=told) as caught:
-        model(Views(torch.rand(1, 1, 3, 16, 16), cameras))
+    views = Views(torch.rand(1, 1, 3, 16, 16), cameras)
+    model = compose(write(TINY), overrides)
+    for _ in range(2):
+        with pytest.raises(PluginError, match=told) as caught:
+            model(views)
     assert f"qgs-faulty 0.3 fails: `faulty/{name}`" in caught.value.reason
-    model = compose(write(TINY))
-    assert model(Views(torch.rand(1, 1, 3, 16, 16), cameras)).gaussians.means.isfinite().all()
+    sound = compose(write(TINY))
+    assert sound(views).gaussians.means.isfinite().all()
+    assert not any(module._forward_hooks for module in sound.modules())
+
+
+def test_a_broken_promise_is_placed_at_its_forward(write, install):
+    source = """
+    from qgs.contracts import Plugin, Refinement
+    from qgs.geometry.precision import full_precision
+
+    class Empty(Refinement):
+        name = "empty"
+
+        @full_precision
+        def forward(self, state):  # line 9, its decorator 8
+            return None
+
+    plugin = Plugin("faulty", 1, (Empty,))
+    """
+    install("qgs-faulty", "faulty", source, editable=True)
+    recipe = resolve(write(HEAD + "model: {decoder: {refinement: {type: faulty/empty}}}\n"))
+    refine = build(recipe.parts["model", "decoder", "layers", "0", "refinement"], recipe.dims)
+    with pytest.raises(PluginError, match="returns NoneType, not a QueryState") as caught:
+        refine(QueryState(torch.zeros(1, 2, recipe.dims.width)))
+    assert caught.value.fix == f"mend {file_of_the_plugin()}:8, or choose another component"
 
 
 def test_a_plugin_in_memory_is_reported_without_a_distribution():
@@ -232,9 +276,7 @@ def test_a_plugin_in_memory_is_reported_without_a_distribution():
 
 
 def test_a_component_that_could_never_provide_what_it_says_is_refused(write, faulty):
-    decoder = "model: {decoder: {cross_attention: {type: faulty/boasting}}}\n"
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [faulty]\n" + decoder))
-    (problem,) = caught.value.problems
+    model = "model: {decoder: {cross_attention: {type: faulty/boasting}}}\n"
+    problem, _ = problem_of(write, model)
     assert "qgs-faulty 0.3" in problem.reason
     assert "`cross_attention` has no way to write" in problem.reason

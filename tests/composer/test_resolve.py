@@ -10,7 +10,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from qgs.composer import RecipeError, compose, plugin_versions, resolve
+from qgs.composer import RecipeError, compose, resolve
 from qgs.composer.errors import Problems
 from qgs.composer.files import merge
 from qgs.composer.nodes import Origin, from_plain
@@ -227,10 +227,7 @@ def test_swap_changes_every_place_and_gives_a_readable_tree(write):
     assert tree["model"]["decoder"]["feed_forward"]["ratio"] == 2
     assert "layers" not in tree["model"]["decoder"]
     assert "swap" not in tree
-    once = resolve(
-        everywhere,
-        ["swap={model.decoder.layers.*.feed_forward: null}"],
-    )
+    once = resolve(everywhere, ["swap={model.decoder.layers.*.feed_forward: null}"])
     assert once.tree["model"]["decoder"]["feed_forward"]["ratio"] == 4
     some = resolve(
         {"recipe": 1, "swap": {"decoder.layers.[13].feed_forward": {"type": "qgs/mlp", "ratio": 3}}}
@@ -283,12 +280,6 @@ def test_refinement_that_is_not_shared(install):
 
 def test_null_type_is_the_default_of_the_slot():
     assert resolve(SMALL, ["model.queries.type=null"]).tree == resolve(SMALL).tree
-
-
-def test_plugin_versions(spatial):
-    assert plugin_versions(["spatial"])["spatial"] == "1.2"
-    with pytest.raises(ValueError, match="no installed distribution offers a plugin `absent`"):
-        plugin_versions(["absent"])
 
 
 def test_recipe_without_data_says_so():

@@ -17,7 +17,7 @@ from PIL import Image
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, SceneSource, SceneSourceConfig, ViewsConfig
 from qgs.data.sampling import Batch
-from qgs.data.stream import SampleError, SceneOrder, Share, training_batches
+from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
 from qgs.types import Cameras
 
 TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"
@@ -178,9 +178,7 @@ def test_groups_must_hold_every_scene_once():
 
 
 def test_fingerprints_tell_stores_apart():
-    prints = {
-        SceneOrder(groups, 6, seed=1).fingerprint
-        for groups in ([range(6)], [range(3), range(3, 6)], [range(4), range(4, 6)])
-    }
-    assert len(prints) == 3
-    assert SceneOrder([[0, 1]], 2, 1).fingerprint == SceneOrder([range(2)], 2, 5).fingerprint
+    stores = ([range(6)], [range(3), range(3, 6)], [range(4), range(4, 6)])
+    assert len({scenes_fingerprint(Grouped(6, groups)) for groups in stores}) == 3
+    same = ([[0, 1]], [range(2)], [range(2), []])
+    assert len({scenes_fingerprint(Grouped(2, groups)) for groups in same}) == 1

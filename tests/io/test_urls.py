@@ -1,32 +1,8 @@
 import sys
 
 import pytest
-from upath import UPath
 
 from qgs.data.paths import is_local, opened_path, stays_inside
-from qgs.io.files import opened_replacing, write_bytes
-
-
-@pytest.fixture(params=["{}", "file://{}", "memory://urls{}"])
-def folder(request, tmp_path) -> UPath:
-    return opened_path(request.param.format(tmp_path / "folder"))
-
-
-def write_half(file: UPath) -> None:
-    with opened_replacing(file) as opened:
-        opened.write(b"half")
-        raise KeyError
-
-
-def test_files_appear_whole_or_not_at_all(folder):
-    file = folder / "a.bin"
-    write_bytes(file, b"first")
-    with pytest.raises(KeyError):
-        write_half(file)
-    assert file.read_bytes() == b"first"
-    write_bytes(file, b"second")
-    assert file.read_bytes() == b"second"
-    assert [item.name for item in folder.iterdir()] == ["a.bin"]
 
 
 def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):

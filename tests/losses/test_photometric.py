@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from qgs.losses import Photometric
-from qgs.metrics import ssim
+from qgs.metrics.images import ssim
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
 

@@ -135,10 +135,10 @@ def test_unsound_exemptions_are_told_by_distribution(monkeypatch, exemptions, me
 @pytest.mark.parametrize(
     ("example", "message"),
     [
-        (FreeCenters, r"FreeCenters'> is not a component's options; list MyComponent.Config\(\)"),
-        ({"z_offset": 1.0}, r"not a component's options; list MyComponent.Config\(\)"),
-        (ViewsConfig(), "is of no component of the plugin"),
-        (GaussianHead.Config(), "is of no component of the plugin"),
+        (FreeCenters, r"FreeCenters'> is not options of its components, such as MyComponent"),
+        ({"z_offset": 1.0}, "is not options of its components"),
+        (ViewsConfig(), "is not options of its components"),
+        (GaussianHead.Config(), "is not options of its components"),
     ],
 )
 def test_unsound_examples_are_told_by_distribution(example, message) -> None:

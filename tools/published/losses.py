@@ -18,7 +18,7 @@ from published.options import ReleasedOptions
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 from qgs.types import (
     Cameras,
     Gaussians,

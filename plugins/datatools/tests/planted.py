@@ -1,9 +1,10 @@
 """Sound data sets of several formats, and copies of them to plant faults in."""
 
 import json
-import zipfile
+import shutil
 
 import numpy as np
+import photo_formats
 import torch
 from qgs_datatools.check import Options, check
 from textured_room import INTRINSICS, SIZE
@@ -14,33 +15,25 @@ HASH = "0123456789abcdef" * 4
 FRAMES = 6
 
 
+def photo_set(folder, shots, poses=None) -> photo_formats.PhotoSet:
+    """JPEG files of `shots`, and their poses or the given ones."""
+    folder.mkdir(parents=True)
+    files = tuple(folder / f"{number}.jpg" for number in range(len(shots)))
+    for file, shot in zip(files, shots, strict=True):
+        file.write_bytes(shot.encoded())
+    c2w = np.stack([shot.c2w for shot in shots] if poses is None else poses)
+    return photo_formats.PhotoSet(files, c2w, INTRINSICS, SIZE)
+
+
 def good_sets(root, shots) -> None:
     """A nerfstudio folder, chunks with two scenes and an index, and an archive, all sound."""
-    listing = json.dumps(transforms(shots))
-    (root / "room" / "images").mkdir(parents=True)
-    (root / "room" / "transforms.json").write_text(listing)
-    for number, shot in enumerate(shots):
-        (root / "room" / "images" / f"{number}.jpg").write_bytes(shot.encoded())
+    photo_formats.write_nerfstudio(root / "room", photo_set(root / "shots", shots))
+    shutil.make_archive(str(root / "archives" / HASH), "zip", root / "room")
     (root / "chunks" / "test").mkdir(parents=True)
     save(root / "chunks", [record("a", shots), record("b", shots[:3])])
     (root / "chunks" / "test" / "index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
     index = {"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}
     (root / "chunks" / "evaluation.json").write_text(json.dumps(index))
-    (root / "archives").mkdir()
-    with zipfile.ZipFile(root / "archives" / f"{HASH}.zip", "w") as archive:
-        archive.writestr("transforms.json", listing)
-        for number, shot in enumerate(shots):
-            archive.writestr(f"images/{number}.jpg", shot.encoded())
-
-
-def transforms(shots) -> dict:
-    fx, fy, cx, cy = INTRINSICS
-    top = {"w": SIZE[1], "h": SIZE[0], "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    frames = [
-        {"file_path": f"images/{number}.jpg", "transform_matrix": (shot.c2w @ FLIP).tolist()}
-        for number, shot in enumerate(shots)
-    ]
-    return {**top, "frames": frames}
 
 
 def record(key: str, shots) -> dict:

@@ -1,6 +1,5 @@
 """What is odd but may be meant, what is not done, and what is told of it."""
 
-import io
 import shutil
 
 import pytest
@@ -10,9 +9,11 @@ from qgs_datatools.check import Options, check
 from textured_room import SIZE
 from upath import UPath
 
+SIDES = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+
 
 def test_a_scaled_copy_passes(room):
-    room.listing(lambda data: data.update({key: 4 * data[key] for key in data if key != "frames"}))
+    room.listing(lambda data: data.update({key: 4 * data[key] for key in SIDES}))
     (room.path / "images").rename(room.path / "images_4")
     assert told(room.path) == []
 
@@ -67,15 +68,9 @@ def test_what_is_not_done_is_told(good):
 def test_masks_that_are_missing_or_damaged(room):
     (room.path / "masks").mkdir()
     (room.path / "masks" / "1.png").write_bytes(b"no image")
-    file = io.BytesIO()
-    Image.new("L", SIZE[::-1], 255).save(file, "PNG")
-    (room.path / "masks" / "2.png").write_bytes(file.getvalue())
-
-    def masked(data):
-        for number in (0, 1, 2):
-            data["frames"][number]["mask_path"] = f"masks/{number}.png"
-
-    room.listing(masked)
+    Image.new("L", SIZE[::-1], 255).save(room.path / "masks" / "2.png")
+    masks = enumerate(f"masks/{number}.png" for number in range(3))
+    room.listing(lambda data: [data["frames"][i].update(mask_path=mask) for i, mask in masks])
     first, second = told(room.path, geometry=0)
     assert first == (
         "error: room, frame 0 (images/0.jpg): its mask does not exist in masks: add it, or list no "
@@ -86,12 +81,10 @@ def test_masks_that_are_missing_or_damaged(room):
 
 
 def test_many_missing_masks_are_one_line_that_names_no_single_one(room):
-    room.listing(
-        lambda data: [
-            frame.update(mask_path=frame["file_path"].replace("images", "masks"))
-            for frame in data["frames"]
-        ]
-    )
+    def masked(frame):
+        frame["mask_path"] = frame["file_path"].replace("images", "masks")
+
+    room.listing(lambda data: [masked(frame) for frame in data["frames"]])
     (line,) = told(room.path, geometry=0)
     assert line == (
         "error: room, frames 0-5 (images/0.jpg to images/5.jpg): its mask does not exist in masks: "

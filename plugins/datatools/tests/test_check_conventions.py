@@ -3,12 +3,12 @@
 import numpy as np
 import photo_formats
 import pytest
+from planted import FLIP, photo_set
 from qgs_datatools.check import Options, check
 from qgs_datatools.conventions import LLFF, OPENCV, OPENGL
-from textured_room import INTRINSICS, SIZE, walk
+from textured_room import walk
 from upath import UPath
 
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 WRITTEN_AND_READ = [
     (OPENGL, "flipped", lambda c2w: c2w),
     (OPENGL, "inverted", np.linalg.inv),
@@ -37,7 +37,7 @@ def read(convention, stored: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("convention", "name", "write"), WRITTEN_AND_READ)
 def test_a_misreading_gives_the_true_poses_back(convention, name, write):
     first, second = (shot.c2w for shot in walk(2))
-    meant = convention.misreadings[name].meant
+    meant = convention[name].meant
     as_meant = [meant(read(convention, write(pose))) for pose in (first, second)]
     relative = np.linalg.inv(as_meant[1]) @ as_meant[0]
     assert relative == pytest.approx(np.linalg.inv(second) @ first)
@@ -46,13 +46,9 @@ def test_a_misreading_gives_the_true_poses_back(convention, name, write):
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> photo_formats.PhotoSet:
     """Three photos, and their poses with OpenGL's axes where OpenCV's are expected."""
-    folder = tmp_path_factory.mktemp("photos")
-    files = tuple(folder / f"{number}.jpg" for number in range(3))
     shots = walk(6)[:3]
-    for file, shot in zip(files, shots, strict=True):
-        file.write_bytes(shot.encoded())
-    c2w = np.stack([shot.c2w @ FLIP for shot in shots])
-    return photo_formats.PhotoSet(files, c2w, INTRINSICS, SIZE)
+    poses = [shot.c2w @ FLIP for shot in shots]
+    return photo_set(tmp_path_factory.mktemp("photos") / "files", shots, poses)
 
 
 def told(path) -> str:

@@ -15,6 +15,7 @@ from upath import UPath
 
 from qgs.cli import app
 from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
+from qgs.data.paths import opened_path
 
 SIZE = (24, 32)
 GIVEN = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 25.0}
@@ -30,16 +31,12 @@ def photos(path, frames: int = 4, suffix=".png", convert=lambda image: image, ma
     entries = []
     (path / "images").mkdir(parents=True, exist_ok=True)
     for i in range(frames):
-        file = io.BytesIO()
-        convert(noise(i)).save(file, Image.registered_extensions()[suffix])
-        (path / "images" / f"{i}{suffix}").write_bytes(file.getvalue())
+        convert(noise(i)).save(path / "images" / f"{i}{suffix}")
         pose = np.eye(4)
         pose[:3, 3] = 0.3 * i, 5.1, -1000.7
         entry = {"file_path": f"images/{i}{suffix}", "transform_matrix": pose.tolist()}
         if mask and i % 2:
-            file = io.BytesIO()
-            noise(100 + i).convert("L").save(file, "PNG")
-            (path / f"mask{i}.png").write_bytes(file.getvalue())
+            noise(100 + i).convert("L").save(path / f"mask{i}.png")
             entry["mask_path"] = f"mask{i}.png"
         entries.append(entry)
     (path / "transforms.json").write_text(json.dumps({**GIVEN, **top, "frames": entries}))
@@ -321,3 +318,25 @@ def test_the_command_packs_the_data_of_a_recipe(tmp_path):
     for split in ("train", "test"):
         for one, other in zip(before.scenes(split), after.scenes(split), strict=True):
             same(one, other, 1e-6)
+
+
+@pytest.fixture(params=["{}", "file://{}", "memory://urls{}"])
+def folder(request, tmp_path) -> UPath:
+    return opened_path(request.param.format(tmp_path / "folder"))
+
+
+def write_half(file: UPath) -> None:
+    with packing.opened_replacing(file) as opened:
+        opened.write(b"half")
+        raise KeyError
+
+
+def test_files_appear_whole_or_not_at_all(folder):
+    file = folder / "a.bin"
+    packing.write_bytes(file, b"first")
+    with pytest.raises(KeyError):
+        write_half(file)
+    assert file.read_bytes() == b"first"
+    packing.write_bytes(file, b"second")
+    assert file.read_bytes() == b"second"
+    assert [item.name for item in folder.iterdir()] == ["a.bin"]

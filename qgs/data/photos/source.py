@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import ClassVar
@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.contracts import SceneSource, SceneSourceConfig
 from qgs.data.images import (
     CropResize,
     alpha_mask,
@@ -31,10 +31,15 @@ from qgs.data.paths import opened_path
 from qgs.data.photos import Format, formats_of, read_listing
 from qgs.data.photos.checks import require_sound, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, warn_once
+from qgs.data.scenes import (
+    BoundedCache,
+    EncodedFrame,
+    EncodedScene,
+    LazyScenes,
+    LazySource,
+    warn_once,
+)
 from qgs.types import Cameras, Views
-
-_OPEN_SCENES = 64
 
 
 class PhotosConfig(SceneSource.Config):
@@ -60,10 +65,15 @@ class PhotosConfig(SceneSource.Config):
     """World units per number of a depth map; nerfstudio writes millimetres (0.001)."""
 
 
+def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
+    """A cache of decoded images, up to so many bytes."""
+    return BoundedCache(limit, attrgetter("nbytes"))
+
+
 class PhotoScene(EncodedScene):
     """The photos of one listing, in its order. World: that of the listing's poses.
 
-    cache: of decoded images, shared by the scenes of a source. Raises as `present_frames`.
+    cache: an `image_cache` shared by scenes of different names. Raises as `present_frames`.
     """
 
     def __init__(
@@ -177,31 +187,7 @@ def _checked(size: tuple[int, ...], frame: PhotoFrame, file: UPath) -> Size:
     return height, width
 
 
-class PhotoScenes(LazyScenes):
-    """Scenes by name, opened when asked for; the last ones stay open."""
-
-    def __init__(
-        self, folders: Mapping[str, UPath], config: PhotosConfig, cache_bytes: int = 512 * 2**20
-    ) -> None:
-        self._folders, self._config = dict(folders), config
-        self._opened: BoundedCache[PhotoScene] = BoundedCache(_OPEN_SCENES)
-        self._images: BoundedCache[np.ndarray] = BoundedCache(cache_bytes, attrgetter("nbytes"))
-        self.names = list(folders)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def scene(self, place: int) -> PhotoScene:
-        """See `LazyScenes`."""
-        name = self.names[place]
-        return self._opened.get(name, lambda: self.open(name, self._folders[name]))
-
-    def open(self, name: str, folder: UPath) -> PhotoScene:
-        """The scene in `folder`. Raises as `present_frames`."""
-        return PhotoScene(name, folder, self._config, self._images)
-
-
-class PhotosSource(SceneSource):
+class PhotosSource(LazySource):
     """Photos of one scene or of many; both splits are the same scenes, with held-out frames.
 
     Only where the folder has scenes in `train` and `test`, the splits are those. A single scene is
@@ -219,11 +205,13 @@ class PhotosSource(SceneSource):
             train, test = (_folders(root / part, config) for part in ("train", "test"))
             if not (train and test):
                 train = test = _folders(root, config) or {folder_name(root): root}
-        scenes = PhotoScenes(train, config)
-        if train is test and len(scenes) == 1:
-            _ = scenes[0].cameras  # tells at once what is wrong
-        others = scenes if train is test else PhotoScenes(test, config)
-        self._scenes = {"train": scenes, "test": others}
+        scenes = LazyScenes(train, partial(PhotoScene, config=config, cache=image_cache()))
+        self.splits = {"train": scenes, "test": scenes}
+        if train is not test:
+            opener = partial(PhotoScene, config=config, cache=image_cache())
+            self.splits["test"] = LazyScenes(test, opener)
+        elif len(scenes) == 1:
+            _ = scenes[0].cameras  # raises at once what is wrong
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
@@ -245,14 +233,6 @@ class PhotosSource(SceneSource):
         """See `SceneSource`; no frame is held out."""
         config = super().config_for(path, image_size, trained)
         return config.model_copy(update={"holdout": 0})
-
-    def scenes(self, split: Split) -> Sequence[Scene]:
-        """See `SceneSource`."""
-        return self._scenes[split]
-
-    def names(self, split: Split) -> Sequence[str]:
-        """See `SceneSource`."""
-        return self._scenes[split].names
 
 
 def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
@@ -326,7 +306,7 @@ def read_photos(
     """
     folder = opened_path(path)
     config = PhotosConfig(path=str(path), image_size=image_size, format=format)
-    scene = PhotoScenes({folder_name(folder): folder}, config).scene(0)
+    scene = PhotoScene(folder_name(folder), folder, config, image_cache())
     chosen = list(range(len(scene))) if frames is None else list(frames)
     outside = [frame for frame in chosen if not 0 <= frame < len(scene)]
     if outside:

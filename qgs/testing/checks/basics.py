@@ -53,10 +53,7 @@ SLACK = 2
 
 @check(ALL_SLOTS)
 def check_builds(case: Case) -> None:
-    """A component can be built from its options, in which its `problems` finds none.
-
-    Those with parameters are built with the sizes of the model.
-    """
+    """A component can be built from its options, in which its `problems` finds none."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
     expect(not found, f"the options of this case are refused: {', '.join(found)}")
     try:

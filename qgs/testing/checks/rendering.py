@@ -21,18 +21,6 @@ from qgs.testing.registry import check
 from qgs.testing.trees import gradients, leaves, mapped, not_finite, scalar, tracked
 from qgs.types import map_tensors
 
-ALONG_GRADIENT = 0.03
-"""Length of the step of all numbers of a tensor along their gradient."""
-CHANNEL = 0.01
-"""Step of one channel of all Gaussians."""
-POSE = 0.02
-"""World units, and radians."""
-LENS = 0.5
-"""Pixels."""
-
-HIT = 0.05
-"""Alpha above which a depth is looked at."""
-
 CAMERA_TENSORS = ("c2w", "intrinsics")
 
 
@@ -79,7 +67,7 @@ def check_depth_is_expected(case: Case) -> None:
     eyes, axes = cameras.c2w[..., :3, 3], cameras.c2w[..., :3, 2]
     z = ((pair.means[:, None] - eyes[:, :, None]) * axes[:, :, None]).sum(-1)[..., None, None]
     expected = (front * z[:, :, :1] + behind * z[:, :, 1:]) / (front + behind).clamp_min(1e-6)
-    off = (out.depth - expected)[front + behind > HIT].abs().max().item()
+    off = (out.depth - expected)[front + behind > 0.05].abs().max().item()
     expect(off < 1e-3, f"depth is off by up to {off:.3g}")
 
 
@@ -160,17 +148,17 @@ def _moves(name: str, x: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Ten
             motion = torch.zeros(4, 4).to(x)
             axis, one, other = index % 3, (index + 1) % 3, (index + 2) % 3
             if index < 3:
-                motion[axis, 3] = POSE
+                motion[axis, 3] = 0.02
             else:
-                motion[other, one], motion[one, other] = POSE, -POSE
+                motion[other, one], motion[one, other] = 0.02, -0.02  # radians
             there, back = (x @ torch.linalg.matrix_exp(sign * motion) for sign in (1, -1))
             yield there, back, ((x @ motion) * gradient).sum().item()
         return
     channels = torch.eye(x[0, 0].numel()).to(x).reshape(-1, *x[0, 0].shape)
-    steps = [LENS * channel for channel in channels]
+    steps = [0.5 * channel for channel in channels]  # pixels
     if name.startswith("gaussians"):
-        steps = [CHANNEL * channel for channel in channels]
-        steps.append(ALONG_GRADIENT * gradient / gradient.norm().clamp_min(1e-12))
+        steps = [0.01 * channel for channel in channels]
+        steps.append(0.03 * gradient / gradient.norm().clamp_min(1e-12))
     for step in steps:
         yield x + step, x - step, (gradient * step).sum().item()
 

@@ -28,20 +28,7 @@ from qgs.testing.registry import check
 from qgs.testing.trees import cloned, described, difference, mapped, not_finite
 from qgs.types import GaussianAttributes, ImageMemory, Views, map_tensors
 
-FACTORS = (0.0, 1.0, 100.0)
-"""Of the features that a head which has learned must turn into valid Gaussians."""
-
-PATCHES = 12
-"""How many patches are changed, one at a time."""
-
-CLOSE = 1e-3
-"""How far attention weights, or their logarithms, may be from those that are recomputed."""
-
-NEGLIGIBLE = 1e-6
-"""Weights below which a token counts for hidden from a query."""
-
-Patch = tuple[int, int, int]
-"""View, row and column."""
+Patch = tuple[int, int, int]  # view, row and column
 
 
 @check({"head"})
@@ -51,7 +38,8 @@ def check_head_gives_gaussians(case: Case) -> None:
     With initial parameters too, for ordinary features.
     """
     modules = [(case.build(), 1.0, "with initial parameters,")]
-    modules += [(case.lively(), factor, f"for features times {factor:g}") for factor in FACTORS]
+    for factor in (0.0, 1.0, 100.0):
+        modules.append((case.lively(), factor, f"for features times {factor:g}"))
     state = inputs_of(case)["state"]
     for module, factor, where in modules:
         for mode in each_mode(module):
@@ -176,7 +164,7 @@ def check_metric_gives_its_columns(case: Case) -> None:
     """
     module = _metric(case)
     for noise in (0.0, 0.2):
-        given = _metric_input(case, noise)
+        given = _metric_input(case, module, noise)
         before = cloned(given)
         values, again = (_values(module, given) for _ in range(2))
         keys = sorted(module.columns())
@@ -192,7 +180,7 @@ def check_metric_gives_its_columns(case: Case) -> None:
 def check_truth_scores_best(case: Case) -> None:
     """What equals the true images scores no worse than what does not, as `better` says."""
     module = _metric(case)
-    true, false = (_values(module, _metric_input(case, noise)) for noise in (0.0, 0.2))
+    true, false = (_values(module, _metric_input(case, module, noise)) for noise in (0.0, 0.2))
     for key, column in module.columns().items():
         pair = true[key].mean().item(), false[key].mean().item()
         seen = f"{column.heading} is {pair[0]:.4g} for the truth, {pair[1]:.4g} for a noisy image"
@@ -206,10 +194,10 @@ def _metric(case: Case) -> Metric:
     return module.eval()
 
 
-def _metric_input(case: Case, noise: float) -> MetricInput:
+def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
     """True views, and images and depth that are off by `noise`; only what the metric needs."""
     maker = Maker(case, Sizes(batch=1), torch.Generator().manual_seed(0))
-    needs, target = case.component.needs, maker.target()
+    needs, target = module.needs, maker.target()
     depth = maker.uniform(1, 2, 1, 2, 1, *maker.image)
     off = noise * maker.normal(*target.images.shape)
     return MetricInput(
@@ -317,7 +305,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         memory = module(views)
         patch, grid = _patch_size(where, views, memory), memory.grid
         tokens = torch.randperm(math.prod(grid), generator=torch.Generator().manual_seed(0))
-        places = _places(tokens[:PATCHES], grid)
+        places = _places(tokens[:12], grid)
         changed = module(_one_patch_each(views, places, patch))
         for name in ("keys", "values", "features"):
             change = (getattr(changed, name) - getattr(memory, name)).square().sum(-1)
@@ -396,7 +384,7 @@ def check_explanation_is_a_softmax(case: Case) -> None:
     weights, shape = logits.softmax(-1), described(given.weights)
     expect(given.weights.shape == weights.shape, f"weights are {shape}, logits {described(logits)}")
     off = (given.weights - weights).abs().max().item()
-    expect(off < CLOSE, f"weights are off the softmax of content and geometry by up to {off:.3g}")
+    expect(off < 1e-3, f"weights are off the softmax of content and geometry by up to {off:.3g}")
 
 
 @check({"cross_attention"})
@@ -422,12 +410,13 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
     if not lengths.any():
         return  # it reads no values, as another check says
     off = (lengths.log() - given.weights.log()).diff(dim=2)
-    visible = torch.minimum(given.weights[:, :, 1:], given.weights[:, :, :-1]) > NEGLIGIBLE
+    weights = torch.minimum(given.weights[:, :, 1:], given.weights[:, :, :-1])
+    visible = weights > 1e-6  # less is no more than a rounding error
     high = off.where(visible, -torch.inf).amax(-1)
     low = off.where(visible, torch.inf).amin(-1)
     worst = (high - low).where(visible.any(-1), 0.0).max().item()
     seen = "the weights change otherwise than the forward pass from one query to the next"
-    expect(worst < CLOSE, f"{seen}, in their logarithms by up to {worst:.3g}")
+    expect(worst < 1e-3, f"{seen}, in their logarithms by up to {worst:.3g}")
 
 
 def _lengths(update: Tensor, values: Tensor) -> Tensor:

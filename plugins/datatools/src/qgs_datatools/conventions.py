@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-
-Reading = Callable[[np.ndarray], np.ndarray]
-
-AS_READ = "as read"
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])  # about the camera's y axis
@@ -35,96 +31,77 @@ class Misreading:
         return (np.linalg.inv(pose) if self.inverted else pose) @ self.axes
 
 
-@dataclass(frozen=True)
-class Convention:
-    """How a format writes poses. misreadings: what else its files may hold by mistake, by name."""
+Convention = Mapping[str, Misreading]
+"""A way of writing poses: what else files that are said to follow it may hold by mistake."""
 
-    name: str
-    misreadings: Mapping[str, Misreading]
+OPENGL: Convention = {
+    "flipped": Misreading(
+        "these look like OpenCV poses read as OpenGL",
+        "negate columns 1 and 2 (the camera's y and z axes) of every transform_matrix",
+        _FLIP,
+    ),
+    "inverted": Misreading(
+        "these look like OpenCV world-to-camera matrices read as OpenGL camera-to-world",
+        "invert every transform_matrix, then negate its columns 1 and 2",
+        inverted=True,
+    ),
+    "inverted and flipped": Misreading(
+        "these look like world-to-camera matrices read as camera-to-world",
+        "invert every transform_matrix",
+        _FLIP,
+        inverted=True,
+    ),
+}
+"""OpenGL camera-to-world: transforms.json of nerfstudio, Blender and DL3DV."""
 
-    @property
-    def readings(self) -> Mapping[str, Reading]:
-        """Every way in which poses may have been meant, as they are read first."""
-        return {AS_READ: np.asarray} | {name: m.meant for name, m in self.misreadings.items()}
+OPENCV: Convention = {
+    "flipped": Misreading(
+        "these look like OpenGL poses read as OpenCV",
+        "negate rows 1 and 2 (the camera's y and z axes) of every world-to-camera matrix",
+        _FLIP,
+    ),
+    "inverted": Misreading(
+        "these look like camera-to-world matrices read as world-to-camera",
+        "invert every matrix",
+        inverted=True,
+    ),
+    "inverted and flipped": Misreading(
+        "these look like OpenGL camera-to-world matrices read as OpenCV world-to-camera",
+        "negate columns 1 and 2 of every matrix, then invert it",
+        _FLIP,
+        inverted=True,
+    ),
+}
+"""OpenCV world-to-camera: chunks and COLMAP models."""
 
-
-OPENGL = Convention(
-    "OpenGL camera-to-world",
-    {
-        "flipped": Misreading(
-            "these look like OpenCV poses read as OpenGL",
-            "negate columns 1 and 2 (the camera's y and z axes) of every transform_matrix",
-            _FLIP,
-        ),
-        "inverted": Misreading(
-            "these look like OpenCV world-to-camera matrices read as OpenGL camera-to-world",
-            "invert every transform_matrix, then negate its columns 1 and 2",
-            inverted=True,
-        ),
-        "inverted and flipped": Misreading(
-            "these look like world-to-camera matrices read as camera-to-world",
-            "invert every transform_matrix",
-            _FLIP,
-            inverted=True,
-        ),
-    },
-)
-"""transforms.json of nerfstudio, Blender and DL3DV."""
-
-OPENCV = Convention(
-    "OpenCV world-to-camera",
-    {
-        "flipped": Misreading(
-            "these look like OpenGL poses read as OpenCV",
-            "negate rows 1 and 2 (the camera's y and z axes) of every world-to-camera matrix",
-            _FLIP,
-        ),
-        "inverted": Misreading(
-            "these look like camera-to-world matrices read as world-to-camera",
-            "invert every matrix",
-            inverted=True,
-        ),
-        "inverted and flipped": Misreading(
-            "these look like OpenGL camera-to-world matrices read as OpenCV world-to-camera",
-            "negate columns 1 and 2 of every matrix, then invert it",
-            _FLIP,
-            inverted=True,
-        ),
-    },
-)
-"""Chunks and COLMAP models."""
-
-LLFF = Convention(
-    "LLFF camera-to-world with axes (down, right, back)",
-    {
-        "OpenGL axes": Misreading(
-            "these look like OpenGL poses (axes right, up, back), not LLFF's (down, right, back)",
-            "write the columns as (-up, right, back)",
-            _RIGHT_UP_BACK,
-        ),
-        "OpenCV axes": Misreading(
-            "these look like OpenCV poses (axes right, down, forward), not OpenGL's nor LLFF's "
-            "(down, right, back)",
-            "write the columns as (down, right, -forward)",
-            _RIGHT_DOWN_FORWARD,
-        ),
-        "flipped": Misreading(
-            "the axes look like (up, right, forward), OpenGL and OpenCV mixed, and LLFF's are "
-            "(down, right, back)",
-            "negate columns 0 and 2 of every pose",
-            _FLIP,
-        ),
-        "turned": Misreading(
-            "the axes look like (down, left, forward), OpenGL and OpenCV mixed, and LLFF's are "
-            "(down, right, back)",
-            "negate columns 1 and 2 of every pose",
-            _HALF_TURN,
-        ),
-        "inverted": Misreading(
-            "these look like world-to-camera matrices read as camera-to-world",
-            "invert every pose, and write its columns as (down, right, back)",
-            inverted=True,
-        ),
-    },
-)
-"""poses_bounds.npy."""
+LLFF: Convention = {
+    "OpenGL axes": Misreading(
+        "these look like OpenGL poses (axes right, up, back), not LLFF's (down, right, back)",
+        "write the columns as (-up, right, back)",
+        _RIGHT_UP_BACK,
+    ),
+    "OpenCV axes": Misreading(
+        "these look like OpenCV poses (axes right, down, forward), not OpenGL's nor LLFF's "
+        "(down, right, back)",
+        "write the columns as (down, right, -forward)",
+        _RIGHT_DOWN_FORWARD,
+    ),
+    "flipped": Misreading(
+        "the axes look like (up, right, forward), OpenGL and OpenCV mixed, and LLFF's are "
+        "(down, right, back)",
+        "negate columns 0 and 2 of every pose",
+        _FLIP,
+    ),
+    "turned": Misreading(
+        "the axes look like (down, left, forward), OpenGL and OpenCV mixed, and LLFF's are "
+        "(down, right, back)",
+        "negate columns 1 and 2 of every pose",
+        _HALF_TURN,
+    ),
+    "inverted": Misreading(
+        "these look like world-to-camera matrices read as camera-to-world",
+        "invert every pose, and write its columns as (down, right, back)",
+        inverted=True,
+    ),
+}
+"""LLFF camera-to-world with axes (down, right, back): poses_bounds.npy."""

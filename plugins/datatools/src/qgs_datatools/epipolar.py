@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from skimage.feature import SIFT, match_descriptors
 from skimage.measure import ransac
 from skimage.transform import FundamentalMatrixTransform
 
-from qgs_datatools.conventions import Reading
+Reading: TypeAlias = Callable[[np.ndarray], np.ndarray]
+"""What a pose (4, 4) that was read may have been meant as."""
 
 MIN_MATCHES = 24
 """Fewer matches than this say nothing about a pair of photos."""

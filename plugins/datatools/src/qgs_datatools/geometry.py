@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from qgs_datatools.conventions import AS_READ, Convention
+from qgs_datatools.conventions import Convention
 from qgs_datatools.decoding import DecodedScene
 from qgs_datatools.epipolar import MIN_MATCHES, Features, Pair, detect, match
 from qgs_datatools.findings import Finding
+
+AS_READ = "as read"
+"""The reading of poses that changes nothing."""
 
 SIDE = 400
 """Pixels on the longer side of the photos that are matched."""
@@ -82,9 +85,10 @@ def judge_scene(scene: DecodedScene, sound: Sequence[int], convention: Conventio
     if not pairs:
         return Geometry(unjudged=TOO_FEW)
     pairs.sort(key=lambda pair: -pair.distance())
+    readings = {AS_READ: np.asarray, **{name: m.meant for name, m in convention.items()}}
     distances = {
         name: float(np.median([pair.distance(reading) for pair in pairs]))
-        for name, reading in convention.readings.items()
+        for name, reading in readings.items()
     }
     photos = tuple(matcher.picture(frame)[0] for frame in pairs[0].frames)
     size = scene.decoded[pairs[0].frames[0]].size
@@ -153,7 +157,7 @@ def geometry_findings(
         f"median of {len(geometry.pairs)} pairs"
     )
     if geometry.better is not None:
-        misreading = convention.misreadings[geometry.better]
+        misreading = convention[geometry.better]
         after = geometry.distances[geometry.better] * geometry.diagonal
         reason = f"{misreading.reason} ({off}; {after:.1f} when read so)"
         yield scene.finding(frames, reason, misreading.fix)

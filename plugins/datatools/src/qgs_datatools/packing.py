@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, TypeAlias, get_args
+from pathlib import Path
+from typing import IO, Any, TypeAlias, get_args
 
 import torch
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.chunk_files import INDEX, SUFFIX
-from qgs.io.files import opened_replacing, write_bytes
+from qgs.data.paths import is_local
+from qgs.io.files import replacing
 from qgs_datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames, stored_bytes
 
 CHUNK_BYTES = 100 * 2**20
@@ -241,3 +245,32 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
         total += size
     if chunk:
         yield chunk
+
+
+@contextmanager
+def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
+    """A file to write, which takes the place of `path` when the block ends well.
+
+    Makes missing parent folders. Object stores show an object when it is complete, so moving it is
+    as atomic as their copying. When the block raises, `path` stays as it was.
+    """
+    if is_local(path):
+        with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:
+            yield file
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+        path.fs.mv(temporary.path, path.path)
+    except BaseException:
+        if temporary.exists():
+            temporary.unlink()
+        raise
+
+
+def write_bytes(path: UPath, data: bytes) -> None:
+    """Write `data` to `path`, whole or not at all."""
+    with opened_replacing(path) as file:
+        file.write(data)

@@ -41,9 +41,10 @@ class EllipsoidQueries(Queries):
         super().__init__(config, dims)
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
         self.center = nn.Parameter(config.center_init.sample(config.count))
-        raw = torch.tensor([raw_radius_of(radius) for radius in config.init_radii])
-        self.rotation = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(config.count, 1))
-        self.raw_radii = nn.Parameter(raw.repeat(config.count, 1))
+        identity = [torch.ones(config.count, 1), torch.zeros(config.count, 3)]
+        self.rotation = nn.Parameter(torch.cat(identity, -1))
+        raw = [torch.full((config.count, 1), raw_radius_of(r)) for r in config.init_radii]
+        self.raw_radii = nn.Parameter(torch.cat(raw, -1))
 
     @classmethod
     def provides(cls, config: Config) -> Fields:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from random import Random
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.scenes import LazyScenes
+from qgs.data.scenes import LazyScenes, LazySource
 from qgs.types import Cameras
 from qgs_rooms.path import camera_path
 from qgs_rooms.plan import furnish
@@ -123,22 +123,11 @@ class RoomScene(Scene):
         return torch.from_numpy(cast_depths(self.room, *cameras, self._config.image_size))[:, None]
 
 
-class RoomScenes(LazyScenes):
-    """The rooms of a split, made when they are asked for."""
-
-    def __init__(self, config: RoomsConfig, split: Split, count: int, cache: ImageCache) -> None:
-        self._config, self._count, self._cache = config, count, cache
-        self._split: Split = split
-
-    def __len__(self) -> int:
-        return self._count
-
-    def scene(self, place: int) -> RoomScene:
-        """See `LazyScenes`."""
-        return RoomScene(self._config, self._split, place, self._cache)
+def _room(name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache) -> RoomScene:
+    return RoomScene(config, split, index, cache)
 
 
-class RoomsSource(SceneSource):
+class RoomsSource(LazySource):
     """Endless procedural rooms; room i of a split is a function of (seed, split, i) alone."""
 
     name = "procedural"
@@ -148,8 +137,10 @@ class RoomsSource(SceneSource):
         super().__init__(config)
         cache: ImageCache = {}
         counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
-        self._scenes = {split: RoomScenes(config, split, n, cache) for split, n in counts.items()}
-
-    def scenes(self, split: Split) -> Sequence[Scene]:
-        """See `SceneSource`."""
-        return self._scenes[split]
+        self.splits = {
+            split: LazyScenes(
+                {f"{split}/{index:06d}": index for index in range(count)},
+                partial(_room, config=config, split=split, cache=cache),
+            )
+            for split, count in counts.items()
+        }
