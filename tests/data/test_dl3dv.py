@@ -1,14 +1,14 @@
-import io
 import json
 import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
+import photo_formats
 import pytest
 import torch
-from PIL import Image
+from photo_formats import row_of_frames
 from upath import UPath
 
 from qgs.data import paths
@@ -23,19 +23,12 @@ def photo(number: int, size=(32, 18)) -> bytes:
     pixels = np.zeros((size[1], size[0], 3), np.uint8)
     pixels[..., 0] = 10 * number
     pixels[..., 2] = np.linspace(0, 255, size[0])
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "PNG")
-    return file.getvalue()
+    return photo_formats.encoded(pixels)
 
 
 def listing(frames: int = 4, **top) -> str:
-    poses = []
-    for i in range(frames):
-        pose = np.eye(4)
-        pose[0, 3] = i
-        poses.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
     given = {"w": 128, "h": 72, "fl_x": 100.0, "fl_y": 101.0, "cx": 60.0, "cy": 37.0}
-    return json.dumps({**given, **top, "frames": poses})
+    return json.dumps(row_of_frames(frames, **given | top))
 
 
 def scene_files(inside: str = "", images: str = "images_4", **top) -> dict[str, bytes]:
@@ -56,9 +49,7 @@ def folder(path, files: dict[str, bytes]) -> None:
         (path / name).write_bytes(data)
 
 
-def opened(path, **options) -> Dl3dvSource:
-    return Dl3dvSource(Dl3dvSource.Config(path=str(path), **{"image_size": (9, 16), **options}))
-
+opened = partial(photo_formats.opened, size=(9, 16), source=Dl3dvSource)
 
 LAYOUTS = {
     "archive": lambda path: archive(path / "1K" / "abc.zip", scene_files("abc/")),
