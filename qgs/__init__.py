@@ -35,21 +35,16 @@ os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 """PyTorch's CPU allocator then asks for huge pages for large tensors, if qgs is imported before it
 has allocated any; with 4 KiB pages a forward pass takes some 5 % longer. Set it to 0 to refuse."""
 
-_PUBLIC = {
+_ELSEWHERE = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
-    "Cameras": "qgs.types",
-    "Gaussians": "qgs.types",
     "Plugin": "qgs.contracts.plugin",
-    "Prediction": "qgs.types",
     "QueryGaussianModel": "qgs.model",
-    "QueryState": "qgs.types",
-    "Rendering": "qgs.types",
-    "Views": "qgs.types",
     "compose": "qgs.composer",
     "load": "qgs.io.checkpoint",
     "save": "qgs.io.checkpoint",
     "trace": "qgs.analysis.trace",
 }
+"""Where public names come from that are not of `qgs.types`."""
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -70,10 +65,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import public names on first use, so that `import qgs` stays cheap."""
-    if name not in _PUBLIC:
+    if name not in __all__:
         raise AttributeError(f"module 'qgs' has no attribute {name!r}")
-    return getattr(import_module(_PUBLIC[name]), name)
+    return getattr(import_module(_ELSEWHERE.get(name, "qgs.types")), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_PUBLIC])
+    return sorted({*globals(), *__all__})

@@ -1,7 +1,5 @@
 """The model: views to image memory, queries through the decoder layers, states to Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -121,36 +119,6 @@ class QueryGaussianModel(nn.Module):
             supervised ones in training, and for the last alone in evaluation.
         Raises ValueError for a layer that does not exist and for another number of scenes.
         """
-        wanted = self._decoded_layers(layers)
-        scenes, given = memory.features.shape[0], state.features.shape[0]
-        if scenes != given:
-            raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
-        decoded: dict[int, LayerPrediction] = {}
-        for number, layer in enumerate(self.decoder, start=1):
-            refine = self.refinements[self._refinement_of[number - 1]]
-            state = refine(layer(state, memory))
-            if number in wanted:
-                decoded[number] = LayerPrediction(self.decode(state), state)
-        return Prediction(decoded[self.depth].gaussians, state, decoded)
-
-    def decode(self, state: QueryState) -> Gaussians:
-        """The Gaussians of a state, ordered query by query."""
-        attributes = self.head(state)
-        return Gaussians(
-            means=self.centers(attributes.offsets, state).flatten(1, 2),  # N, K -> G
-            scales=attributes.scales.flatten(1, 2),
-            quats=attributes.quats.flatten(1, 2),
-            opacities=attributes.opacities.flatten(1, 2),
-            colors=attributes.colors.flatten(1, 2),
-        )
-
-    def render(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
-    ) -> Rendering:
-        """Render (B, G) Gaussians from (B, V) cameras, see `qgs.contracts.Renderer`."""
-        return self.renderer(gaussians, cameras, background)
-
-    def _decoded_layers(self, layers: Collection[int] | None) -> set[int]:
         if layers is None:
             layers = self.supervision.weights().keys() if self.training else ()
         unknown = sorted(n for n in layers if not 1 <= n <= self.depth)
@@ -158,4 +126,26 @@ class QueryGaussianModel(nn.Module):
             raise ValueError(
                 f"layers {unknown} do not exist; this model has layers 1..{self.depth}"
             )
-        return {*layers, self.depth}
+        scenes, given = memory.features.shape[0], state.features.shape[0]
+        if scenes != given:
+            raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
+        decoded: dict[int, LayerPrediction] = {}
+        for number, layer in enumerate(self.decoder, start=1):
+            refine = self.refinements[self._refinement_of[number - 1]]
+            state = refine(layer(state, memory))
+            if number in layers or number == self.depth:
+                decoded[number] = LayerPrediction(self.decode(state), state)
+        return Prediction(decoded[self.depth].gaussians, state, decoded)
+
+    def decode(self, state: QueryState) -> Gaussians:
+        """The Gaussians of a state, ordered query by query."""
+        attributes = self.head(state)
+        means = self.centers(attributes.offsets, state)
+        others = (attributes.scales, attributes.quats, attributes.opacities, attributes.colors)
+        return Gaussians(*(x.flatten(1, 2) for x in (means, *others)))  # N, K -> G
+
+    def render(
+        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    ) -> Rendering:
+        """Render (B, G) Gaussians from (B, V) cameras, see `qgs.contracts.Renderer`."""
+        return self.renderer(gaussians, cameras, background)

@@ -11,8 +11,6 @@ Frames: "world" is the frame of the first input camera once poses are normalised
 Containers are frozen. A component returns a new one and never writes into the one it was given.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -35,10 +33,9 @@ class TensorContainer:
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """`value` with `function(tensor)` in place of every tensor.
+    """`value` with `function(tensor)` for each tensor in containers, mappings, lists and tuples.
 
-    Goes into containers, mappings, lists and tuples. A part in which no tensor changes is returned
-    itself, not copied.
+    A part in which no tensor changes is returned itself, not copied.
     """
     if isinstance(value, Tensor):
         return function(value)
@@ -56,10 +53,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """Every tensor in `value` with its dotted name, such as `gaussians.means`.
-
-    Goes where `map_tensors` goes. name: that of `value` itself, put before the others.
-    """
+    """Every tensor that `map_tensors` finds, with its dotted name; `name` is that of `value`."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, TensorContainer | Mapping | list | tuple):
@@ -75,7 +69,7 @@ def _items(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _check_shapes(
-    container: TensorContainer, known: Mapping[str, int] | None = None, **shapes: str
+    container: TensorContainer, known: Mapping[str, int] | None = None, /, **shapes: str
 ) -> None:
     """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
 
@@ -132,7 +126,7 @@ class Cameras(TensorContainer):
         translation = -rotation @ self.c2w[..., :3, 3:]
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
 
-    def __getitem__(self, index: Any) -> Cameras:
+    def __getitem__(self, index: Any) -> Self:
         return map_tensors(lambda x: x[index], self)
 
 
@@ -162,7 +156,7 @@ class Views(TensorContainer):
                 f"Views.cameras {tuple(self.cameras.shape)}"
             )
 
-    def select(self, index: Any) -> Views:
+    def select(self, index: Any) -> Self:
         """The views at `index` of every scene (a slice or a list of ints)."""
         return map_tensors(lambda x: x[:, index], self)
 
@@ -233,11 +227,14 @@ class QueryState(TensorContainer):
 
     def replace(
         self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
-    ) -> QueryState:
+    ) -> "QueryState":
         """A new state with other features and with `fields` added or replaced."""
         return QueryState(
             self.features if features is None else features, {**self.fields, **(fields or {})}
         )
+
+
+_OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "colors": "... 3"}
 
 
 @dataclass(frozen=True)
@@ -256,9 +253,7 @@ class GaussianAttributes(TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        _check_shapes(
-            self, offsets="... 3", scales="... 3", quats="... 4", opacities="...", colors="... 3"
-        )
+        _check_shapes(self, offsets="... 3", **_OF_GAUSSIANS)
 
 
 @dataclass(frozen=True)
@@ -276,16 +271,14 @@ class Gaussians(TensorContainer):
     colors: Tensor
 
     def __post_init__(self) -> None:
-        _check_shapes(
-            self, means="... 3", scales="... 3", quats="... 4", opacities="...", colors="... 3"
-        )
+        _check_shapes(self, means="... 3", **_OF_GAUSSIANS)
 
     @property
     def count(self) -> int:
         """Gaussians per scene."""
         return self.means.shape[-2]
 
-    def __getitem__(self, index: Any) -> Gaussians:
+    def __getitem__(self, index: Any) -> Self:
         return map_tensors(lambda x: x[index], self)
 
 

@@ -1,9 +1,13 @@
-"""What tools/environment.sh does to a folder that is in its way."""
+"""What tools/environment.sh does to a folder in its way, and how tools/test runs pytest."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 from pathlib import Path
+
+import pytest
 
 ENVIRONMENT = Path(__file__).parents[1] / "tools" / "environment.sh"
 FAKE_PYTHON = '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$3/bin"; fi\n'
@@ -47,3 +51,23 @@ def test_a_first_environment_is_stamped(tmp_path: Path) -> None:
     result = make_environment(tmp_path / ".venv")
     assert result.returncode == 0, result.stderr
     assert (tmp_path / ".venv" / ".qgs-made").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "processes"),
+    [("", True), ("tests/golden -x", True), ("tests/test_a.py -x", False), ("-m slow", False)],
+)
+def test_files_and_markers_are_run_in_one_process(
+    tmp_path: Path, arguments: str, processes: bool
+) -> None:
+    shutil.copy(ENVIRONMENT.with_name("test"), tmp_path)
+    (tmp_path / "environment.sh").write_text(f"root={tmp_path}\nuse_environment() {{ :; }}\n")
+    (tmp_path / "python").write_text('#!/bin/sh\necho "${OMP_NUM_THREADS-all}" "$@"\n')
+    (tmp_path / "python").chmod(0o755)
+    variables = {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    command = ["bash", str(tmp_path / "test"), *arguments.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=variables)
+    first = (
+        "1 -m pytest -n auto --maxprocesses 8 --dist worksteal" if processes else "all -m pytest"
+    )
+    assert done.stdout == f"{first} {arguments}".rstrip() + "\n"

@@ -1,7 +1,5 @@
 """The model as a whole, composed from the tiny recipes made smaller still."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Parameters of every published model at its published size, composed without allocating one."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Containers refuse what does not fit together, where it is made."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -19,6 +17,9 @@ from qgs.types import (
     named_tensors,
 )
 
+THREE, FOUR, ONE = torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 5, 4), torch.zeros(1, 2, 5)
+RGB, ALPHA = torch.zeros(1, 2, 3, 4, 5), torch.zeros(1, 2, 1, 4, 5)
+
 
 @pytest.fixture
 def memory() -> ImageMemory:
@@ -31,10 +32,39 @@ def memory() -> ImageMemory:
     )
 
 
-def test_8_bit_images_are_refused_with_the_remedy() -> None:
-    cameras = Cameras(torch.eye(4)[None, None], torch.ones(1, 1, 4), (8, 8))
-    with pytest.raises(ValueError, match=r"divide 8-bit images by 255"):
-        Views(torch.zeros(1, 1, 3, 8, 8, dtype=torch.uint8), cameras)
+def zeros(*shape: int) -> torch.Tensor:
+    return torch.zeros(shape)
+
+
+@pytest.mark.parametrize(
+    ("make", "parts", "message"),
+    [
+        (QueryState, [zeros(3, 4)], r"features must have shape \(B, N, D\)"),
+        (QueryState, [zeros(2, 3, 4), {"place": zeros(2, 4, 3)}], "the field place must have sh"),
+        (
+            Cameras,
+            [zeros(2, 3, 4, 4), zeros(3, 4), (8, 8)],
+            r"\.intrinsics .*\(2, 3, 4\), got",
+        ),
+        (Cameras, [torch.eye(3), zeros(4), (8, 8)], r"Cameras\.c2w .*\(\.\.\., 4, 4\), got"),
+        (
+            Views,
+            [
+                zeros(1, 1, 3, 8, 8).byte(),
+                Cameras(torch.eye(4)[None, None], zeros(1, 1, 4), (8, 8)),
+            ],
+            "divide 8-bit images by 255",
+        ),
+        (GaussianAttributes, [THREE, THREE, THREE, ONE, THREE], r"GaussianAttributes\.quats"),
+        (GaussianAttributes, [THREE, THREE, FOUR, ONE[..., None], THREE], r"utes\.opacities"),
+        (Rendering, [RGB, ALPHA, ALPHA[..., :4]], r"Rendering\.depth"),
+        (Rendering, [RGB[0], ALPHA[0], ALPHA[0]], r"\.rgb .*add a leading dimension for a single"),
+        (SpatialSupport, [zeros(1, 2, 3), zeros(1, 2, 3)], r"SpatialSupport\.axes"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(make: type, parts: list, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(*parts)
 
 
 @pytest.mark.parametrize(
@@ -62,42 +92,6 @@ def test_memo_does_not_leak_between_gradient_modes(memory: ImageMemory) -> None:
         assert doubled().is_inference()
     assert doubled().requires_grad
     assert doubled() is doubled()
-
-
-def test_state_fields_share_scenes_and_queries() -> None:
-    with pytest.raises(ValueError, match=r"features must have shape \(B, N, D\)"):
-        QueryState(torch.zeros(3, 4))
-    with pytest.raises(ValueError, match=r"the field place must have shape"):
-        QueryState(torch.zeros(2, 3, 4), {"place": torch.zeros(2, 4, 3)})
-
-
-def test_cameras_share_their_leading_axes() -> None:
-    with pytest.raises(ValueError, match=r"Cameras\.intrinsics must have shape \(2, 3, 4\), got"):
-        Cameras(torch.eye(4).expand(2, 3, 4, 4), torch.ones(3, 4), (8, 8))
-    with pytest.raises(ValueError, match=r"Cameras\.c2w must have shape \(\.\.\., 4, 4\), got"):
-        Cameras(torch.eye(3), torch.ones(4), (8, 8))
-
-
-def test_attributes_share_scenes_queries_and_gaussians() -> None:
-    three, four, one = torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 5, 4), torch.zeros(1, 2, 5)
-    GaussianAttributes(three, three, four, one, three)
-    with pytest.raises(ValueError, match=r"GaussianAttributes\.quats"):
-        GaussianAttributes(three, three, three, one, three)
-    with pytest.raises(ValueError, match=r"GaussianAttributes\.opacities"):
-        GaussianAttributes(three, three, four, one[..., None], three)
-
-
-def test_images_of_a_rendering_have_one_size() -> None:
-    rgb, alpha = torch.zeros(1, 2, 3, 4, 5), torch.zeros(1, 2, 1, 4, 5)
-    with pytest.raises(ValueError, match=r"Rendering\.depth"):
-        Rendering(rgb, alpha, alpha[..., :4])
-    with pytest.raises(ValueError, match=r"Rendering\.rgb .*add a leading dimension for a single"):
-        Rendering(rgb[0], alpha[0], alpha[0])
-
-
-def test_support_has_three_axes() -> None:
-    with pytest.raises(ValueError, match=r"SpatialSupport\.axes"):
-        SpatialSupport(torch.zeros(1, 2, 3), torch.zeros(1, 2, 3))
 
 
 def test_a_state_knows_its_fields_by_name() -> None:

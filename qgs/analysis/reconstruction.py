@@ -27,7 +27,8 @@ from qgs.drawing.images import (
 )
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
-from qgs.metrics import mean_colour, nearest_input, psnr
+from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering
 

@@ -34,7 +34,7 @@ from qgs.drawing.queries import (
     support_picture,
     token_picture,
 )
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
 

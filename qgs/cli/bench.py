@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
-
-if TYPE_CHECKING:
-    from qgs.engine.bench.run import Report, Spread
-    from qgs.engine.bench.work import Operation
 
 MEBIBYTE = 2**20
 TITLES = {
@@ -61,6 +56,8 @@ def bench(
     from qgs.engine.bench.run import bench as measure
     from qgs.engine.bench.work import workload_of
     from qgs.engine.distributed import choose_device
+    from qgs.engine.results import as_json
+    from qgs.io.files import write_text
 
     if json is not None:
         refuse_other_file(json)
@@ -72,73 +69,62 @@ def bench(
     work["device"] = choose_device(device, console.print)
     resolved = [(str(path), resolve(path, overrides or ())) for path in recipes]
     subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
+    options: dict[str, Any] = {"step": step, "memory": memory, "renderer": renderer}
+    options |= {"rounds": rounds, "warmup": warmup, "overrides": overrides or ()}
     with console.status("composing") as status:
-        report = measure(
-            subjects,
-            step=step,
-            memory=memory,
-            renderer=renderer,
-            rounds=rounds,
-            warmup=warmup,
-            overrides=overrides or (),
-            say=status.update,
-        )
-    console.print(_headline(report), markup=False)
-    for table in _tables(report):
-        console.print(table)
+        report = measure(subjects, say=status.update, **options)
+    _show(report, console)
     if json is not None:
-        report.write(json)
+        write_text(json, as_json(report))
         console.print(f"written to {json}")
 
 
-def _headline(report: Report) -> str:
-    machine, work = report.machine, report.results[0].workload
-    threads = "" if work.device == "cuda" else f", {machine['threads']} threads"
-    return (
-        f"{work.device} ({machine['processor']}{threads}), {work.precision}, "
-        f"torch {machine['torch']}; {report.rounds} rounds after {report.warmup} of warm-up, "
-        "ratios to the first recipe"
-    )
-
-
-def _tables(report: Report) -> list[Table]:
+def _show(report: dict[str, Any], console: Console) -> None:
     """The models, then one table for each thing that was measured of them."""
-    base = report.results[0]
+    from qgs.engine.results import print_table
+
+    recipes, machine = report["recipes"], report["machine"]
+    base = recipes[0]
+    threads = "" if base["device"] == "cuda" else f", {machine['threads']} threads"
+    console.print(
+        f"{base['device']} ({machine['processor']}{threads}), {base['precision']}, "
+        f"torch {machine['torch']}; {report['rounds']} rounds after {report['warmup']} of warm-up, "
+        "ratios to the first recipe",
+        markup=False,
+    )
+    names = [escape(name) for name in short_names([recipe["recipe"] for recipe in recipes])]
+
+    def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        lines = [[name, *row] for name, row in zip(names, rows, strict=True)]
+        print_table(console, title, [["recipe", *headers], *lines])
+
     headers = ("V x H x W", "Gaussians", "parameters", "ratio", "weights, MiB")
     rows = [
         (
-            " x ".join(map(str, (result.workload.views, *result.workload.size))),
-            f"{result.gaussians:,}",
-            f"{result.parameters:,}",
-            f"{result.parameters / base.parameters:.3f}",
-            f"{result.weight_bytes / MEBIBYTE:,.2f}",
+            " x ".join(map(str, (recipe["views"], *recipe["size"]))),
+            f"{recipe['gaussians']:,}",
+            f"{recipe['parameters']['count']:,}",
+            f"{recipe['parameters']['ratio']:.3f}",
+            f"{recipe['parameters']['weight_bytes'] / MEBIBYTE:,.2f}",
         )
-        for result in report.results
+        for recipe in recipes
     ]
-    tables = [_table(report, f"models, batch {base.workload.batch}", headers, rows)]
-    tables += [_seconds(report, operation) for operation in base.times]
-    return [*tables, *(_memory(report, operation) for operation in base.peaks)]
-
-
-def _table(
-    report: Report, title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]
-) -> Table:
-    """`rows` of numbers, each behind the name of its recipe."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("recipe", overflow="fold")
-    for header in headers:
-        table.add_column(header, justify="right")
-    names = short_names([result.recipe for result in report.results])
-    for name, row in zip(names, rows, strict=True):
-        table.add_row(escape(name), *row)
-    return table
+    table(f"models, batch {base['batch']}", headers, rows)
+    for operation, first in base["seconds"].items():
+        unit, scale = ("s", 1.0) if first["median"] >= 10 else ("ms", 1000.0)
+        headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")
+        times = [recipe["seconds"][operation] for recipe in recipes]
+        rows = [(*_cells(found, scale), *_cells(found["ratio"], 1.0)) for found in times]
+        table(TITLES[operation], headers, rows)
+    for operation in base["memory"]:
+        peaks = [recipe["memory"][operation] for recipe in recipes]
+        sizes = [[f"{p[k] / MEBIBYTE:,.1f}" for k in ("peak_bytes", "idle_bytes")] for p in peaks]
+        rows = [(*size, f"{p['ratio']:.3f}") for size, p in zip(sizes, peaks, strict=True)]
+        table(f"memory: {TITLES[operation]}", ("peak, MiB", "before the model", "ratio"), rows)
 
 
 def short_names(paths: Sequence[str]) -> list[str]:
-    """Paths without the folders that all of them share, and without their suffix.
-
-    A path that comes again is numbered.
-    """
+    """Paths without shared folders and suffix; one that comes again is numbered."""
     files = [Path(os.path.abspath(path)) for path in paths]
     shared = os.path.commonpath([file.parent for file in files])
     names = [file.relative_to(shared).with_suffix("").as_posix() for file in files]
@@ -146,34 +132,10 @@ def short_names(paths: Sequence[str]) -> list[str]:
     return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
-def _seconds(report: Report, operation: Operation) -> Table:
-    base = report.results[0].times[operation]
-    unit, scale = ("s", 1.0) if base.quartiles[1] >= 10 else ("ms", 1000.0)
-    headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")
-    times = [result.times[operation] for result in report.results]
-    rows = [(*_cells(spread, scale), *_cells(spread.over(base), 1.0)) for spread in times]
-    return _table(report, TITLES[operation], headers, rows)
-
-
-def _memory(report: Report, operation: Operation) -> Table:
-    base = report.results[0].peaks[operation].peak_bytes
-    peaks = [result.peaks[operation] for result in report.results]
-    rows = [
-        (
-            f"{peak.peak_bytes / MEBIBYTE:,.1f}",
-            f"{peak.idle_bytes / MEBIBYTE:,.1f}",
-            f"{peak.peak_bytes / base:.3f}",
-        )
-        for peak in peaks
-    ]
-    headers = ("peak, MiB", "before the model", "ratio")
-    return _table(report, f"memory: {TITLES[operation]}", headers, rows)
-
-
-def _cells(spread: Spread, scale: float) -> tuple[str, str]:
+def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
     """Median and quartiles, four digits each."""
     lower, median, upper = (
         f"{value:,.{max(0, 4 - len(str(int(value))))}f}"
-        for value in (quartile * scale for quartile in spread.quartiles)
+        for value in (found[k] * scale for k in ("lower_quartile", "median", "upper_quartile"))
     )
     return median, f"{lower} .. {upper}"

@@ -82,15 +82,14 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
 def curves_of(folder: RunFolder) -> Curves:
     """The history of a run, but for steps that were skipped."""
     names = ("seconds", "loss", "psnr")
-    records = (record for record in folder.history() if not record.get("skipped"))
-    history = [record for record in records if record.keys() >= set(names)]
-    return Curves(*([record[name] for record in history] for name in names))
+    steps = [r for r in folder.history() if not r.get("skipped") and r.keys() >= set(names)]
+    return Curves(*([step[name] for step in steps] for name in names))
 
 
 def baselines(entry: Entry) -> list[Baseline]:
     """What needs no model, on the views that `entry` was judged on."""
-    named = (("Nearest input", "nearest_input"), ("Mean colour", "mean_colour"))
-    return [Baseline(name, entry.evaluation.means(method)) for name, method in named]
+    named = {"Nearest input": "nearest_input", "Mean colour": "mean_colour"}
+    return [Baseline(name, entry.evaluation.means(method)) for name, method in named.items()]
 
 
 def table_of(entries: Sequence[Entry]) -> Table:
@@ -120,12 +119,18 @@ def table_of(entries: Sequence[Entry]) -> Table:
 
 
 def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
-    """The comparison, pictured on the first test scenes."""
+    """The comparison, pictured on the first three test scenes."""
     recipe = entries[0].recipe
-    few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
+    few = recipe.evaluation.model_copy(update={"scenes": 3, "samples": 1})
     source = recipe.build_data()
-    samples = evaluation_samples(source, recipe.views, few)[:PICTURED_SCENES]
+    samples = evaluation_samples(source, recipe.views, few)[:3]
     names = [entry.contender.name for entry in entries]
+    height, width = recipe.tree["data"]["image_size"]
+    plugins = {name: v for entry in entries for name, v in entry.recipe.plugin_versions.items()}
+    software = {"torch": torch.__version__, **plugins}
+    device = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
+    if torch.cuda.is_available():
+        device = torch.cuda.get_device_name()
     return Report(
         columns=entries[0].evaluation.columns,
         title=" and ".join(names) + f", {seconds:g} seconds of training each",
@@ -133,7 +138,13 @@ def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
         baselines=baselines(entries[0]),
         samples=samples,
         depths=[true_depth(source, sample) for sample in samples],
-        facts=_facts([entry.recipe for entry in entries], seconds, seed),
+        facts={
+            "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
+            "Views": f"{recipe.views.inputs} inputs, judged on the views between them",
+            "Budget": f"{seconds:g} seconds of training each, seed {seed}",
+            "Machine": f"{device}, {torch.get_num_threads()} threads, {platform.system()}",
+            "Software": ", ".join(f"{name} {version}" for name, version in software.items()),
+        },
     )
 
 
@@ -143,20 +154,3 @@ def write_examples(report: Report, target: Path) -> None:
     for contender in report.contenders:
         gaussians = contender.model(report.samples[0].inputs).gaussians
         write_ply(gaussians, target / contender.name / "example.ply")
-
-
-def _facts(recipes: Sequence[Recipe], seconds: float, seed: int) -> dict[str, str]:
-    data, views = recipes[0].tree["data"], recipes[0].views
-    height, width = data["image_size"]
-    plugins = {name: version for r in recipes for name, version in r.plugin_versions.items()}
-    versions = [f"{name} {version}" for name, version in plugins.items()]
-    device = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
-    if torch.cuda.is_available():
-        device = torch.cuda.get_device_name()
-    return {
-        "Data": f"{data['type']}, {width} × {height} pixels",
-        "Views": f"{views.inputs} inputs, judged on the views between them",
-        "Budget": f"{seconds:g} seconds of training each, seed {seed}",
-        "Machine": f"{device}, {torch.get_num_threads()} threads, {platform.system()}",
-        "Software": ", ".join([f"torch {torch.__version__}", *versions]),
-    }

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import signal
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+import qgs
 from qgs.cli.options import Device
 
 DEFAULT_RECIPES = ("tokengs.yaml", "locus.yaml")
@@ -68,25 +69,22 @@ def default_recipes(folder: Path | None) -> list[Path]:
 
     Raises FileNotFoundError that names every place where they were looked for.
     """
-    import qgs
-
     clone = Path(qgs.__file__).parents[1]
     places = [folder] if folder else [Path("recipes/tiny"), clone / "recipes" / "tiny"]
     for place in places:
         files = [place / name for name in DEFAULT_RECIPES]
         if all(file.is_file() for file in files):
             return files
-    looked = ", ".join(map(str, places))
     raise FileNotFoundError(
-        f"found no {' and '.join(DEFAULT_RECIPES)} in {looked}; run this in a clone of the "
-        "repository, or give --recipe-folder FOLDER or the recipe files themselves"
+        f"found no {' and '.join(DEFAULT_RECIPES)} in {', '.join(map(str, places))}; run this in a "
+        "clone of the repository, or give --recipe-folder FOLDER or the recipe files themselves"
     )
 
 
 def new_folder(out: Path | None) -> Path:
     """`out`, refused when it holds anything; None takes the first of demo, demo-2, ... not used."""
     if out is None:
-        names = (Path("demo" if number == 1 else f"demo-{number}") for number in count(1))
+        names = map(Path, chain(["demo"], (f"demo-{number}" for number in count(2))))
         return next(name for name in names if not name.exists())
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")

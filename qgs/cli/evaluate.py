@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,39 +23,28 @@ if TYPE_CHECKING:
 def evaluate(
     runs: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RUN", help="Run folder or checkpoint file; with --compare several results."
-        ),
+        typer.Argument(metavar="RUN", help="Run folder or checkpoint; several with --compare."),
     ],
     overrides: Overrides = None,
     index: Annotated[
-        str | None,
-        typer.Option(help="JSON file of scenes and frames; short for --set evaluation.index=..."),
+        str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
     ] = None,
     tune: Annotated[
-        int | None,
-        typer.Option(min=0, help="Steps of token tuning on the input views of each scene."),
+        int | None, typer.Option(min=0, help="Steps of token tuning on a scene's input views.")
     ] = None,
-    batch: Annotated[
-        int, typer.Option(min=1, help="Scenes that pass through the model together.")
-    ] = 1,
+    batch: Annotated[int, typer.Option(min=1, help="Scenes passed through the model at once.")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder; default: RUN/evaluation, with other settings the next RUN/evaluation-N."
-        ),
+        typer.Option(help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings."),
     ] = None,
     compare: Annotated[
-        bool,
-        typer.Option("--compare", help="Compare the first RUN's results with those of the others."),
+        bool, typer.Option("--compare", help="Compare the first RUN's results with the others'.")
     ] = False,
     across_protocols: Annotated[
-        bool,
-        typer.Option("--across-protocols", help="Compare results of different protocols."),
+        bool, typer.Option("--across-protocols", help="Compare results of different protocols.")
     ] = False,
     strict: Annotated[
-        bool,
-        typer.Option("--strict", help="Exit with 1 when a scene of the protocol has no score."),
+        bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
     ] = False,
     threads: Threads = None,
     device: Device = "auto",
@@ -98,7 +88,7 @@ def evaluate(
 
     use_threads(threads)
     for setting in settings:
-        if setting.split(".")[0].split("=")[0] not in SECTIONS:
+        if re.split("[.=]", setting)[0] not in SECTIONS:
             raise ValueError(
                 f"--set {setting} would change the trained model; an evaluation can only set "
                 + ", ".join(SECTIONS)
@@ -115,7 +105,7 @@ def evaluate(
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
         console.print(hint, soft_wrap=True, markup=False)
-    if strict and not evaluation.is_complete:
+    if strict and evaluation.missing:
         raise typer.Exit(1)
 
 
@@ -125,11 +115,11 @@ def evaluation_folder(checkpoint: Path, other: bool) -> Path:
     For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ...
     """
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")
-    name = f"evaluation_{label}" if label else "evaluation"
-    folder, numbers = checkpoint.parent / name, count(2)
-    while other and (folder.name == name or folder.exists()):
-        folder = checkpoint.parent / f"{name}-{next(numbers)}"
-    return folder
+    folder = checkpoint.with_name(f"evaluation_{label}" if label else "evaluation")
+    if not other:
+        return folder
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in count(2))
+    return next(folder for folder in numbered if not folder.exists())
 
 
 def evaluate_into(

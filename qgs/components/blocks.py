@@ -3,8 +3,6 @@
 Axes: B scenes, T tokens, N queries, M image tokens, Q chosen queries, D width, h heads, d = D/h.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from einops import rearrange
@@ -24,7 +22,6 @@ class LayerScale(nn.Module):
         self.gamma = nn.Parameter(torch.full((width,), init))
 
     def forward(self, update: Tensor) -> Tensor:
-        """The scaled update."""
         return update * self.gamma
 
 
@@ -37,7 +34,6 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(hidden, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., inputs) -> (..., outputs)."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -78,7 +74,6 @@ class SelfAttentionCore(nn.Module):
         return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
     def forward(self, x_BTD: Tensor) -> Tensor:
-        """(B, T, D) -> (B, T, D)."""
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
         return self.proj(merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd)))
 

@@ -1,7 +1,5 @@
 """`qgs/free`: means straight from the head's offsets, anywhere in the world (TokenGS)."""
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 
@@ -49,6 +47,5 @@ class FreeCenters(Centers):
     config: Config
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
         means = posact(offsets, self.config.input_limit, self.config.output_limit)
         return means + torch.tensor([0.0, 0.0, self.config.z_offset]).to(means)

@@ -1,7 +1,5 @@
 """The default decoder layer: attention by content alone, an MLP, no refinement (TokenGS)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field
@@ -9,16 +7,16 @@ from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, CrossAttentionCore, Mlp, SelfAttentionCore
 from qgs.contracts import (
+    MEMORY_FIELDS,
     AttentionWeights,
     ComponentConfig,
     CrossAttention,
     FeedForward,
+    Fields,
     ModelDims,
     Refinement,
     SelfAttention,
 )
-from qgs.contracts.component import Fields
-from qgs.contracts.encoder import MEMORY_FIELDS
 from qgs.types import ImageMemory, QueryState
 
 
@@ -39,15 +37,12 @@ class ContentCrossAttention(CrossAttention):
 
     @classmethod
     def requires(cls, config: ComponentConfig) -> Fields:
-        """Keys and values."""
         return {name: MEMORY_FIELDS[name] for name in ("memory.keys", "memory.values")}
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        """The update (B, N, D)."""
         return self.core(state.features, memory.keys, memory.values)
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
-        """Attention over image tokens."""
         return self.core.explain(state.features, memory.keys, queries)
 
 
@@ -68,11 +63,9 @@ class ContentSelfAttention(SelfAttention):
         self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
 
     def forward(self, state: QueryState) -> Tensor:
-        """The update (B, N, D)."""
         return self.attention(self.norm(state.features))
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Attention over queries."""
         return self.attention.explain(self.norm(state.features), queries)
 
 
@@ -93,7 +86,6 @@ class MlpFeedForward(FeedForward):
         self.mlp = Mlp(dims.width, int(config.ratio * dims.width), dims.width)
 
     def forward(self, features: Tensor) -> Tensor:
-        """The update (B, N, D)."""
         return self.mlp(self.norm(features))
 
 
@@ -103,5 +95,4 @@ class NoRefinement(Refinement):
     name: ClassVar[str] = "none"
 
     def forward(self, state: QueryState) -> QueryState:
-        """The same state."""
         return state

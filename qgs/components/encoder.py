@@ -1,7 +1,5 @@
 """`qgs/multiview_vit`: a small ViT over the patches of all views together (TokenGS release)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -31,7 +29,6 @@ class PatchEmbedding(nn.Module):
         self.norm = nn.LayerNorm(width, norm_eps)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(X, C, H, W) -> (X, H/P*W/P, D), row by row."""
         return self.norm(rearrange(self.proj(images), "x d h w -> x (h w) d"))
 
 
@@ -50,7 +47,6 @@ class EncoderBlock(nn.Module):
         self.scale2 = LayerScale(width, layer_scale)
 
     def forward(self, x_BMD: Tensor) -> Tensor:
-        """(B, M, D) -> (B, M, D)."""
         x_BMD = x_BMD + self.scale1(self.attention(self.norm1(x_BMD)))
         return x_BMD + self.scale2(self.mlp(self.norm2(x_BMD)))
 
@@ -87,7 +83,6 @@ class MultiViewViT(Encoder):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """A patch that does not divide both sides of the image."""
         size, patch = context.image_size, config.patch_size
         if size and any(side % patch for side in size):
             nearest = [max(round(side / patch), 1) * patch for side in size]

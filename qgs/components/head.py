@@ -1,7 +1,5 @@
 """`qgs/gaussian_head`: one linear layer from a query to its Gaussians (TokenGS, LocusGS)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import ClassVar
@@ -14,7 +12,7 @@ from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS
 from qgs.contracts import ComponentConfig, Head, ModelDims, Problem, RecipeContext, without_effect
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.geometry.precision import at_least_float32
 from qgs.types import GaussianAttributes, QueryState
 
 CHANNELS = (3, 3, 3, 4, 1)
@@ -64,35 +62,28 @@ class GaussianHead(Head):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options of a norm that there is not."""
         if not config.norm:
             yield from without_effect(config, ("norm_eps",), "`norm` is false")
 
     @property
     def gaussians_per_query(self) -> int:
-        """K."""
         return self.config.gaussians_per_query
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """(B, N, D) -> attributes of (B, N, K) Gaussians."""
         raw_BNC = self.linear(self.norm(state.features))
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
         """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
         offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
+        cap, limit = self.config.scale_cap, self.config.scale_input_limit
+        if limit is not None:
+            scale = scale.clamp(-limit, limit)
         return GaussianAttributes(
             offsets=offsets,
-            scales=capped_exp(scale, self.config.scale_cap, self.config.scale_input_limit),
+            # cap / e at 0, never above the cap (TokenGS release)
+            scales=torch.exp(scale - (1 - math.log(cap))).clamp_max(cap),
             quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
             opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
             colors=(torch.tanh(rgb) + 1) / 2,
         )
-
-
-@full_precision
-def capped_exp(t: Tensor, cap: float, input_limit: float | None) -> Tensor:
-    """min(exp(t - (1 - ln c)), c): c/e at t = 0, never above c (TokenGS release)."""
-    if input_limit is not None:
-        t = t.clamp(-input_limit, input_limit)
-    return torch.exp(t - (1 - math.log(cap))).clamp_max(cap)

@@ -1,7 +1,5 @@
 """AdamW with a one-cycle learning rate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeAlias
@@ -50,6 +48,7 @@ class OneCycleAdamW(Optimizer):
         self.peak = config.learning_rate
         self.first = config.learning_rate / config.initial_divisor
         self.last = self.first / config.final_divisor
+        self.budget = self.training.seconds or math.inf
         self._descent_starts: float | None = None
         steps = self.training.steps
         if self.training.seconds is None and config.warmup >= steps:
@@ -81,20 +80,16 @@ class OneCycleAdamW(Optimizer):
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Fall from where `state` started to."""
         self._descent_starts = state["descent_starts"]
 
     def _warmed(self, step: int, seconds: float) -> float:
         """Fraction of the warm-up that is over; may exceed 1."""
-        top, budget = self.options.warmup - 1, self.training.seconds
-        of_seconds = seconds / (WARMUP_TIME * budget) if budget else 0.0
-        return max(step / top if top > 0 else 1.0, of_seconds)
+        top = self.options.warmup - 1
+        return max(step / top if top > 0 else 1.0, seconds / (WARMUP_TIME * self.budget))
 
     def _used(self, step: int, seconds: float) -> float:
         """Fraction of the budget that is used."""
-        budget = self.training.seconds
-        of_seconds = seconds / budget if budget else 0.0
-        return min(max(step / max(self.training.steps - 1, 1), of_seconds), 1.0)
+        return min(max(step / max(self.training.steps - 1, 1), seconds / self.budget), 1.0)
 
 
 def _cosine(start: float, end: float, part: float) -> float:

@@ -1,7 +1,5 @@
 """`qgs/latent`: learned queries without a position (TokenGS)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch
@@ -29,9 +27,7 @@ class LatentQueries(Queries):
 
     @property
     def count(self) -> int:
-        """N."""
         return self.features.shape[0]
 
     def forward(self, batch_size: int) -> QueryState:
-        """Features (B, N, D), no fields."""
         return QueryState(self.features.expand(batch_size, -1, -1))

@@ -1,7 +1,5 @@
 """`qgs/layers`: a set of supervised layers, later ones weighing more (LocusGS)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
@@ -34,7 +32,6 @@ class LayerSupervision(Supervision):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Layers that do not exist."""
         beyond = [number for number in config.layers if number > context.dims.depth]
         if beyond:
             yield Problem(
@@ -44,7 +41,6 @@ class LayerSupervision(Supervision):
             )
 
     def weights(self) -> Mapping[int, float]:
-        """Layer number to weight."""
         count = len(self.config.layers)
         total = count * (count + 1) / 2
         return {number: rank / total for rank, number in enumerate(self.config.layers, start=1)}

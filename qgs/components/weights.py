@@ -1,7 +1,5 @@
 """The weights of TokenGS: published names, and the recipe that fits a state dict."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from qgs.components.head import CHANNELS

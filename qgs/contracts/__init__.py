@@ -26,13 +26,7 @@ from qgs.contracts.head import Centers, Head
 from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
 from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
-from qgs.contracts.plugin import (
-    CONTRACT_VERSION,
-    ENTRY_POINT_GROUP,
-    Expected,
-    ExpectedError,
-    Plugin,
-)
+from qgs.contracts.plugin import CONTRACT_VERSION, Expected, ExpectedError, Plugin
 from qgs.contracts.queries import Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
@@ -40,7 +34,6 @@ from qgs.contracts.weights import LayoutError, Rename, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",
-    "ENTRY_POINT_GROUP",
     "MEMORY_FIELDS",
     "AttentionWeights",
     "Centers",

@@ -1,7 +1,5 @@
 """What all components share: a name, a Config, the fields they read and write, problems."""
 
-from __future__ import annotations
-
 from abc import ABC
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -26,7 +24,7 @@ class ComponentConfig(BaseModel):
     Document every option with a docstring below it: meaning, unit, what null or 0 means.
     """
 
-    __component__: ClassVar[type[Component] | None] = None
+    __component__: ClassVar["type[Component] | None"] = None
     """The component that has these options; None for settings of a section of a recipe."""
 
     model_config = ConfigDict(

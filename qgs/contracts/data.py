@@ -1,7 +1,5 @@
 """Slot `data`: where scenes come from."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal, TypeAlias
@@ -21,10 +19,8 @@ class Scene(ABC):
     """Frames of one scene, decoded only when asked for."""
 
     name: str
-
     held_out: Sequence[int] = ()
     """Frames that training never sees, so that evaluation can target them."""
-
     missing: Sequence[str] = ()
     """Images that are listed and do not exist; they are no frames, so later ones move up."""
 
@@ -63,11 +59,9 @@ class SceneSourceConfig(ComponentConfig):
     unhashed_options: ClassVar[frozenset[str]] = frozenset({"path"})
     """Options that change no scene, image or camera: where files lie, how they are kept in memory.
     Hashes of evaluation protocols leave them out."""
-
     split_options: ClassVar[frozenset[str]] = frozenset()
     """Options that only choose which scenes and frames are trained on, and which are judged. Where
     an evaluation index names these, hashes of protocols leave them out too."""
-
     image_size: tuple[Side, Side] = (64, 64)
     """(H, W) of every delivered image, in pixels."""
 
@@ -77,9 +71,6 @@ class SceneSource(Component):
 
     Opening a source reads what it needs to list its scenes and raises FileNotFoundError or
     ValueError with the path and the remedy; images are decoded by `Scene.images`.
-
-    A source of files says which paths it reads (`recognises`), so that `qgs reconstruct` and `qgs
-    data` open them without a recipe.
     """
 
     slot: ClassVar[str] = "data"
@@ -87,23 +78,19 @@ class SceneSource(Component):
     class Config(SceneSourceConfig):
         """The common settings."""
 
-    def __init__(self, config: SceneSourceConfig) -> None:
-        self.config = config
+    config: SceneSourceConfig
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Whether the folder or file `path`, which exists, looks like data of this source.
+        """Whether the existing `path` looks like data of this source, by its names of files.
 
-        Told by names of files; nothing is decoded. By default no path is.
+        So that `qgs reconstruct` and `qgs data` open it without a recipe. By default no path does.
         """
         return False
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """Whether the training data of this source at `root` is `path`, or has it as one scene.
-
-        Both are absolute.
-        """
+        """Whether the training data at `root` is `path` or has it as a scene, both absolute."""
         return path == root
 
     @classmethod

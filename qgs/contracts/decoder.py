@@ -4,8 +4,6 @@ An attention or feed-forward component holds its norms and its output projection
 adds LayerScale and the residual sum.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Slot `encoder`: posed photos to image memory."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import ClassVar
 

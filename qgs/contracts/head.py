@@ -1,7 +1,5 @@
 """Slots `head` and `centers`: from query features to Gaussians."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import ClassVar
 

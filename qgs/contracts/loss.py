@@ -1,18 +1,14 @@
 """Slots `losses` and `supervision`: what training minimises, and after which layers."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from qgs.contracts.component import Component
 from qgs.types import LayerPrediction, Rendering, Views
-
-Renderings: TypeAlias = Literal["each", "all", "none"]
 
 
 class Loss(Component, torch.nn.Module):
@@ -29,7 +25,7 @@ class Loss(Component, torch.nn.Module):
     """
 
     slot: ClassVar[str] = "losses"
-    renderings: ClassVar[Renderings] = "all"
+    renderings: ClassVar[Literal["each", "all", "none"]] = "all"
 
     @abstractmethod
     def forward(

@@ -1,19 +1,15 @@
 """Slot `metrics`: how good a reconstruction is."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from qgs.contracts.component import Component, ComponentConfig
+from qgs.contracts.component import Component
 from qgs.types import Gaussians, TensorContainer, Views
-
-Need: TypeAlias = Literal["masks", "gaussians", "depth", "true_depth"]
 
 
 @dataclass(frozen=True)
@@ -69,23 +65,18 @@ class MetricInput(TensorContainer):
 class Metric(Component, torch.nn.Module):
     """MetricInput -> values. Called without gradients, for every sample and every method.
 
-    definition: what is measured, in words. It is part of the evaluation protocol, as the options
-    are: change it when values change. not_in_protocol: options that change no value, such as where
-    a file lies. needs: parts of the input that must not be None; where one is, there is no value.
-    column: how the value is shown. unavailable: set by `__init__` to the reason why there are no
-    values on this machine, such as a missing file of weights; evaluations show it.
+    definition: what is measured, in words; part of the evaluation protocol, as the options are:
+    change it when values change. not_in_protocol: options that change no value, such as a path.
+    needs: parts of the input without which there is no value. column: how the value is shown.
+    unavailable: set by `__init__` to why there are no values here, such as a missing file.
     """
 
     slot: ClassVar[str] = "metrics"
     definition: ClassVar[str] = ""
     not_in_protocol: ClassVar[frozenset[str]] = frozenset()
-    needs: ClassVar[tuple[Need, ...]] = ()
+    needs: ClassVar[tuple[Literal["masks", "gaussians", "depth", "true_depth"], ...]] = ()
     column: ClassVar[Column]
     unavailable: str = ""
-
-    def __init__(self, config: ComponentConfig) -> None:
-        torch.nn.Module.__init__(self)
-        self.config = config
 
     def columns(self) -> Mapping[str, Column]:
         """How values are shown, by key. Override it for several values, or headings by option.

@@ -1,10 +1,8 @@
 """Slot `optimizer`: how gradients change the weights, and how fast."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeAlias, TypedDict
+from typing import Annotated, Any, ClassVar, TypedDict
 
 import torch
 from pydantic import Field
@@ -12,8 +10,6 @@ from torch import nn
 
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.settings import TrainingConfig
-
-Factor: TypeAlias = Annotated[float, Field(ge=0)]
 
 
 class OptimizerConfig(ComponentConfig):
@@ -25,7 +21,7 @@ class OptimizerConfig(ComponentConfig):
     counts; one that matches nothing is an error.
     """
 
-    parts: dict[str, Factor] = Field(default={})
+    parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={})
     """Parts of the model to factors of the learning rate: `{"encoder": 0.1}`; 0 freezes a part."""
 
 

@@ -1,7 +1,5 @@
 """What a distribution offers to recipes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias

@@ -1,7 +1,5 @@
 """Slot `queries`: the learned state that every scene starts from."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar

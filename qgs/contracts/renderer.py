@@ -1,7 +1,5 @@
 """Slot `renderer`: Gaussians to images."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import Annotated, ClassVar, TypeAlias
 

@@ -1,7 +1,5 @@
 """Sections of a recipe that are not components: views, training, evaluation."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, field_validator
@@ -79,23 +77,17 @@ class EvaluationConfig(ComponentConfig):
 
     scenes: int = Field(default=32, ge=1)
     """Test scenes that are judged, at most; without effect beside `index`."""
-
     samples: int = Field(default=1, ge=1)
     """View samples drawn from each scene; without effect beside `index`."""
-
     seed: int = Field(default=0, ge=0)
     """Of the views that are drawn; without effect beside `index`."""
-
     index: str | None = None
     """JSON file {scene: null | {"context": [frames], "target": [frames]}} of the views to judge
     (pixelSplat's format), relative to the working directory; null draws them."""
-
     protocol: str | None = None
     """Name of these settings in tables; null takes the name of the index file."""
-
     tuning_steps: int = Field(default=0, ge=0)
     """Steps of token tuning on the input views of each scene before it is judged, with the recipe's
     photometric loss (TokenGS: 50); 0 for none."""
-
     tuning_rate: float = Field(default=1e-4, gt=0)
     """Learning rate of token tuning, by Adam (TokenGS: 1e-4)."""

@@ -1,7 +1,5 @@
 """Weights that other codebases publish: their names for our parameters, and recipes that fit."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -42,7 +40,7 @@ class WeightLayout:
     name: what the codebase calls its model. source: where it is published.
     components: slot to the component types that the codebase has; other slots may hold any.
     renames: the first that applies to a name counts.
-    marks: published names that tell this layout from others.
+    marks: published names that tell this layout from others; a file of it has them all.
     unused: from a published name to that of a parameter stored beside it, which their code ignores.
     read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
         raises LayoutError.
@@ -68,10 +66,6 @@ class WeightLayout:
         """Published parameters that are stored beside `theirs` and never used."""
         found = (rule.renamed(name) for name in theirs for rule in self.unused)
         return [name for name in found if name is not None]
-
-    def marks_all_in(self, names: Iterable[str]) -> bool:
-        """Whether a state dict with these published names has this layout."""
-        return set(self.marks) <= set(names)
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:

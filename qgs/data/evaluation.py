@@ -31,21 +31,16 @@ class IndexEntry(BaseModel):
     target: FrameList
     """The frames that are judged."""
 
-    @property
-    def both(self) -> tuple[int, ...]:
-        """Frames that are context and target, in order; see `given_targets`."""
-        return given_targets(self.context, self.target)
-
 
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
 GIVEN = "frames as context and as target"
-"""What `given_targets` are, in words; a score on them means nothing."""
+"""What `given_targets` are; a score on them means nothing, the nearest input view is perfect."""
 
 
 def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
-    """Frames, in order, that a model is given and judged on; the nearest input view is perfect."""
+    """Frames, in order, that a model is given and judged on."""
     return tuple(sorted(set(inputs) & set(targets)))
 
 
@@ -56,8 +51,8 @@ _SHOWN = 5
 def read_index(path: str) -> EvaluationIndex:
     """The index in the JSON file `path`, which may be an fsspec URL.
 
-    Raises FileNotFoundError, and ValueError for a file of another form, for a scene that is
-    written twice, and for an index without any scene to judge.
+    Raises FileNotFoundError, and ValueError for a file of another form, for a scene that is written
+    twice, and for an index without any scene to judge.
     """
     file = opened_path(path)
     if not file.is_file():
@@ -70,7 +65,13 @@ def read_index(path: str) -> EvaluationIndex:
         written = json.loads(text, object_pairs_hook=_without_repeats)
         index = TypeAdapter(dict[str, IndexEntry | None]).validate_python(written)
     except ValueError as error:
-        reason = _reasons(error) if isinstance(error, ValidationError) else error
+        reason: object = error
+        if isinstance(error, ValidationError):
+            wrong = [
+                f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()
+            ]
+            more = f"; and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
+            reason = "; ".join(wrong[:_SHOWN]) + more
         raise ValueError(f"{path} is no evaluation index {_FORM}: {reason}") from error
     if not any(index.values()):
         raise ValueError(f"the evaluation index {path} names no scene to judge")
@@ -81,16 +82,6 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if repeated := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
         raise ValueError(f"written twice: {', '.join(repeated[:_SHOWN])}")
     return dict(pairs)
-
-
-def _reasons(error: ValidationError) -> str:
-    found = [f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()]
-    more = len(found) - _SHOWN
-    return "; ".join(found[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
-
-
-FrameChoice: TypeAlias = tuple[Frames, Frames]
-"""Input and target frames."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +100,7 @@ class EvaluationPlan:
     the others `evaluation.samples` samples, inputs drawn as in training with `evaluation.seed`,
     targets the other frames of the span.
 
-    wanted: names of the scenes that are to be judged, in order. null: scenes that the index lists
-    without frames. unlisted: scenes of the split that the index lacks.
-    Raises ValueError when the test split is empty.
+    wanted, null, unlisted: as in `qgs.engine.Evaluation`. Raises ValueError without test scenes.
     """
 
     def __init__(
@@ -128,13 +117,10 @@ class EvaluationPlan:
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
         self._times = Counter(names)
-        self.wanted: tuple[str, ...] = tuple(dict.fromkeys(names[: evaluation.scenes]))
-        self.null: tuple[str, ...] = ()
-        self.unlisted: tuple[str, ...] = ()
-        if index is not None:
-            self.wanted = tuple(name for name, entry in index.items() if entry)
-            self.null = tuple(name for name, entry in index.items() if not entry)
-            self.unlisted = tuple(name for name in self._places if name not in index)
+        listed = dict.fromkeys(names[: evaluation.scenes], True) if index is None else index
+        self.wanted = tuple(name for name, entry in listed.items() if entry)
+        self.null = tuple(name for name, entry in listed.items() if not entry)
+        self.unlisted = tuple(name for name in self._places if index and name not in index)
 
     def samples(self) -> Iterator[Sample | SceneFailure]:
         """The samples, one decoded at a time; a scene that fails ends with its failure."""
@@ -151,13 +137,14 @@ class EvaluationPlan:
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 
-    def _choices(self, scene: Scene, place: int) -> Iterator[FrameChoice]:
-        limit = self._evaluation.scenes
+    def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
+        """Input and target frames of each sample."""
         if self._index is not None:
             yield _named(scene, self._index)
         elif scene.held_out:
             windows = held_out_windows(scene, self._views)
-            kept = np.linspace(0, len(windows) - 1, min(limit, len(windows))).round().astype(int)
+            count = min(self._evaluation.scenes, len(windows))
+            kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
             yield from (windows[i] for i in kept)
         else:
             for k in range(self._evaluation.samples):
@@ -204,7 +191,7 @@ def one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 
-def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
+def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
     """Input and target frames such that every held-out frame is a target once.
 
     For the first held-out frame not yet covered, a window of the largest gap (counted in training
@@ -214,7 +201,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
     """
     usable = np.array(training_frames(scene))
     gap = gap_range(len(usable), views, scene.name)[1]
-    windows: list[FrameChoice] = []
+    windows: list[tuple[Frames, Frames]] = []
     covered: set[int] = set()
     for frame in sorted(scene.held_out):
         if frame in covered:
@@ -222,9 +209,8 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
         centre = int(np.searchsorted(usable, frame))
         first = min(max(centre - (gap + 1) // 2, 0), len(usable) - 1 - gap)
         span = usable[first : first + gap + 1]
-        inputs = span[np.linspace(0, gap, views.inputs).round().astype(int)]
-        if views.inputs == 1:
-            inputs = span[[gap // 2]]
+        places = np.linspace(0, gap, views.inputs) if views.inputs > 1 else np.array([gap // 2])
+        inputs = span[places.round().astype(int)]
         inside = {f for f in scene.held_out if span[0] < f < span[-1]} | {frame}
         targets = sorted(inside - covered)
         covered.update(targets)
@@ -232,7 +218,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[FrameChoice]:
     return windows
 
 
-def _named(scene: Scene, index: EvaluationIndex) -> FrameChoice:
+def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
     """The frames of `scene` that `index` names; raises ValueError where it lacks one."""
     entry = index[scene.name]
     assert entry is not None

@@ -15,18 +15,18 @@ from qgs.contracts import Column
 from qgs.engine.results import (
     StoredResults,
     as_json,
-    listed,
+    bullets,
     markdown_table,
     print_lines,
     print_table,
 )
+from qgs.io.differences import listed
 from qgs.io.files import write_text
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
 _SEED = 0
-_AT_A_TIME = 1_000_000
-"""Numbers that the bootstrap draws at a time, which bounds its memory."""
+_AT_A_TIME = 1_000_000  # numbers that the bootstrap draws, which bounds its memory
 
 
 @dataclass(frozen=True)
@@ -51,46 +51,33 @@ class Difference:
     def cells(self) -> list[str]:
         """A row of the table, one digit finer than an evaluation's."""
         digits, interval = self.column.digits + 1, "–"
-        if self.low is not None and self.high is not None:
+        if self.low is not None:
             interval = f"[{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
-        first, second = f"{self.first:.{digits}f}", f"{self.second:.{digits}f}"
+        means = [f"{self.first:.{digits}f}", f"{self.second:.{digits}f}"]
         apart, score = f"{self.difference:+.{digits}f}", f"{self.wins} : {self.losses}"
-        return [self.column.title, first, second, apart, interval, score]
+        return [self.column.title, *means, apart, interval, score]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The first results against others. shared: the scenes that both judged."""
+    """Two results. shared: the scenes that both judged. moved: those on different frames."""
 
     first: StoredResults
     second: StoredResults
     shared: Sequence[str]
+    moved: Sequence[str]
     differences: Sequence[Difference]
 
-    @property
-    def same_protocol(self) -> bool:
-        """Whether both were judged alike."""
-        return self.first.sha256 == self.second.sha256
-
-    @property
-    def other_frames(self) -> list[str]:
-        """Shared scenes that were judged on different frames."""
-        return [name for name in self.shared if self.first.frames[name] != self.second.frames[name]]
-
     def record(self) -> dict[str, Any]:
-        """Plain values for JSON.
-
-        wanted: how many scenes the protocols name. null: scenes that an index lists without frames.
-        only: scenes that one alone judged. empty: headings of metrics that have no scene in both.
-        """
+        """Plain values for JSON. empty: headings of metrics that have no scene in both."""
         first, second = self.first, self.second
         compared = {difference.metric for difference in self.differences}
         columns = {**first.columns, **second.columns}
         return {
             "first": first.name,
             "second": second.name,
-            "same_protocol": self.same_protocol,
-            "other_frames": self.other_frames,
+            "same_protocol": first.sha256 == second.sha256,
+            "other_frames": list(self.moved),
             "differences": [asdict(difference) for difference in self.differences],
             "wanted": max(first.wanted, second.wanted),
             "missing_first": list(first.missing),
@@ -104,18 +91,17 @@ class Comparison:
     @property
     def title(self) -> str:
         """Who is compared, over how many scenes."""
-        count, wanted = len(self.shared), max(self.first.wanted, self.second.wanted)
+        first, second, count = self.first, self.second, len(self.shared)
         scenes = f"{count} scene{'s' if count > 1 else ''}"
-        if count < wanted:
-            missing = list(dict.fromkeys([*self.first.missing, *self.second.missing]))
+        if count < (wanted := max(first.wanted, second.wanted)):
+            missing = list(dict.fromkeys([*first.missing, *second.missing]))
             names = f" (missing: {listed(missing)})" if missing else ""
             scenes = f"{count} of {wanted} scenes{names}"
-        return f"{self.first.name} against {self.second.name}, {scenes}"
+        return f"{first.name} against {second.name}, {scenes}"
 
     def rows(self) -> list[list[str]]:
         """The table, headers first."""
-        percent = f"{100 * CONFIDENCE:.0f} % interval"
-        header = ["metric", "first", "second", "difference", percent, "won : lost"]
+        header = ["metric", "first", "second", "difference", "95 % interval", "won : lost"]
         return [header, *(difference.cells() for difference in self.differences)]
 
     def notes(self) -> Iterator[str]:
@@ -127,9 +113,9 @@ class Comparison:
         )
         if len(self.shared) == 1:
             yield "one scene is too few for an interval"
-        for result in (first, second):
-            if result.missing:
-                yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
+        for r in (first, second):
+            if r.missing:
+                yield f"{r.name} is incomplete: no score of {listed(r.missing)}"
         if null := facts["null"]:
             yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
         for result, only in ((first, facts["only_first"]), (second, facts["only_second"])):
@@ -142,15 +128,15 @@ class Comparison:
                 yield f"{d.column.heading} in {first.name} is {other} in {second.name}"
         if facts["empty"]:
             yield f"not in both, left out: {', '.join(facts['empty'])}"
-        if not self.same_protocol:
+        if not facts["same_protocol"]:
             yield "the protocols differ: the scores do not measure the same"
-        if moved := self.other_frames:
-            yield f"{len(moved)} scenes judged on different frames: {listed(moved)}"
+        if self.moved:
+            yield f"{len(self.moved)} scenes judged on different frames: {listed(self.moved)}"
 
 
 @dataclass(frozen=True)
 class Comparisons:
-    """Results against each of others. protocols: result to the name and hash of its protocol."""
+    """The first results against each other. protocols: result to its protocol's name and hash."""
 
     protocols: Mapping[str, str]
     pairs: Sequence[Comparison]
@@ -177,23 +163,20 @@ class Comparisons:
         """The tables and what is to be known beside them."""
         parts = []
         for pair in self.pairs:
-            notes = "\n".join(f"- {line}" for line in pair.notes())
-            parts += [f"**{pair.title}**", markdown_table(pair.rows()), notes]
-        parts.append("\n".join(f"- {line}" for line in self._protocol_lines()))
-        return "\n\n".join(parts) + "\n"
+            parts += [f"**{pair.title}**", markdown_table(pair.rows()), bullets(pair.notes())]
+        return "\n\n".join([*parts, bullets(self._protocol_lines())]) + "\n"
 
     def _protocol_lines(self) -> list[str]:
-        if len(set(self.protocols.values())) == 1:
-            return [f"protocol {next(iter(self.protocols.values()))}"]
+        if len(same := set(self.protocols.values())) == 1:
+            return [f"protocol {same.pop()}"]
         return [f"protocol of {name}: {protocol}" for name, protocol in self.protocols.items()]
 
 
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Comparisons:
     """Compare the first of `results` with each of the others.
 
-    Raises ValueError for fewer than two, for one folder twice, for results without a scene in
-    common, and unless `across_protocols` for results of different protocols and for scenes that
-    were judged on different frames.
+    Raises ValueError for fewer than two, one folder twice and no scene in common, and unless
+    `across_protocols` for different protocols and scenes judged on different frames.
     """
     names = [result.name for result in results]
     if len(names) < 2 or len(set(names)) < len(names):
@@ -213,17 +196,16 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         shared = [name for name in first.scenes if name in other.scenes]
         if not shared:
             raise ValueError(f"{first.name} and {other.name} have no scene in common")
+        moved = [name for name in shared if first.frames[name] != other.frames[name]]
+        if moved and not across_protocols:
+            raise ValueError(
+                f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, "
+                f"although their protocols agree: {listed(moved)}. The data, or how views are "
+                "drawn, changed between them: evaluate both again, or add --across-protocols"
+            )
         metrics = [name for name in first.columns if name in other.columns]
         found = (_difference(metric, first, other, shared) for metric in metrics)
-        pair = Comparison(first, other, shared, [d for d in found if d])
-        if pair.other_frames and not across_protocols:
-            raise ValueError(
-                f"{first.name} and {other.name} judged {len(pair.other_frames)} scenes on "
-                f"different frames, although their protocols agree: {listed(pair.other_frames)}. "
-                "The data, or how views are drawn, changed between them: evaluate both again, or "
-                "add --across-protocols"
-            )
-        pairs.append(pair)
+        pairs.append(Comparison(first, other, shared, moved, [d for d in found if d]))
     protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
     return Comparisons(protocols, pairs)
 
@@ -238,14 +220,10 @@ def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
         return None
     rng = np.random.default_rng(_SEED)
     step = max(_AT_A_TIME // count, 1)
-    means = np.concatenate(
-        [
-            differences[rng.integers(0, count, (min(step, RESAMPLES - start), count))].mean(1)
-            for start in range(0, RESAMPLES, step)
-        ]
-    )
+    sizes = [min(step, RESAMPLES - start) for start in range(0, RESAMPLES, step)]
+    drawn = [differences[rng.integers(0, count, (size, count))].mean(1) for size in sizes]
     tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(means, [tail, 1 - tail])
+    low, high = np.quantile(np.concatenate(drawn), [tail, 1 - tail])
     return float(low), float(high)
 
 
@@ -254,19 +232,19 @@ def _difference(
 ) -> Difference | None:
     """None where no scene has the metric in both."""
     column, value = first.columns[metric], f"model_{metric}"
-    both = [s for s in shared if value in first.scenes[s] and value in second.scenes[s]]
-    if not both:
+    scenes = [(first.scenes[name], second.scenes[name]) for name in shared]
+    values = np.array([[a[value], b[value]] for a, b in scenes if value in a and value in b])
+    if not len(values):
         return None
-    ours, theirs = (np.array([r.scenes[name][value] for name in both]) for r in (first, second))
-    apart = ours - theirs
+    apart = values[:, 0] - values[:, 1]
     better = apart if column.better == "higher" else -apart
     low, high = paired_interval(apart) or (None, None)
     return Difference(
         metric=metric,
         column=column,
-        scenes=len(both),
-        first=float(ours.mean()),
-        second=float(theirs.mean()),
+        scenes=len(values),
+        first=float(values[:, 0].mean()),
+        second=float(values[:, 1].mean()),
         difference=float(apart.mean()),
         low=low,
         high=high,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -16,7 +18,8 @@ from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
-from qgs.metrics import gaussians_used, mean_colour, nearest_input
+from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.dispersion import gaussians_used
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
@@ -36,11 +39,9 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
-    A scene that fails is named in the result with the reason, and the others go on. Samples are
-    decoded one at a time. Leaves the model in the mode it was in.
-
-    step: optimiser steps behind the weights. batch: scenes that pass through the model together;
-    with tuned tokens each passes alone. observe: see `Observer`.
+    A scene that fails is named in the result with the reason, and the others go on. Leaves the
+    model in the mode it was in. step: optimiser steps behind the weights. batch: scenes that pass
+    through the model together; with tuned tokens each passes alone.
     Raises what opening the data source or the index raises, and ValueError when no scene at all
     could be judged, `batch` is less than 1, or two values of metrics have one name.
     """
@@ -57,11 +58,8 @@ def evaluate(
         model.train(training)
     missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
     if not scores:
-        first = missing[0]
-        raise ValueError(
-            f"none of {len(missing)} scenes could be judged; the first, {first.scene}: "
-            f"{first.reason}"
-        )
+        first = f"{missing[0].scene}: {missing[0].reason}"
+        raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
     return Evaluation(
         protocol=protocol_of(recipe, index, plan.wanted),
         columns=judge.columns,
@@ -92,9 +90,9 @@ class _Judge:
         self._needed = {need for metric in self._metrics.values() for need in metric.needs}
         self._owners: dict[str, Metric] = {}
         self.columns: dict[str, Column] = {}
-        for metric_name, metric in self._metrics.items():
+        for label, metric in self._metrics.items():
             for key, column in metric.columns().items():
-                name = _name(metric_name, key)
+                name = _name(label, key)
                 if name in self.columns:
                     raise ValueError(f"two values of the metrics are called {name}; rename one")
                 self.columns[name], self._owners[name] = column, metric
@@ -105,9 +103,7 @@ class _Judge:
         for name, metric in self._owners.items():
             if metric.unavailable:
                 found[name] = metric.unavailable
-                continue
-            lacking = sum(f"model_{name}" not in score.values for score in scores)
-            if lacking:
+            elif lacking := sum(f"model_{name}" not in score.values for score in scores):
                 needs = " and ".join(metric.needs).replace("_", " ")
                 found[name] = f"it needs {needs}, not known for {lacking} of {len(scores)} scenes"
         return found
@@ -121,9 +117,8 @@ class _Judge:
             if isinstance(sample, SceneFailure):
                 yield sample
                 continue
-            shape = sample.inputs.images.shape
-            alike = not waiting or waiting[0].inputs.images.shape == shape
-            if len(waiting) == batch or not alike:
+            shapes = {s.inputs.images.shape for s in (*waiting, sample)}
+            if len(waiting) == batch or len(shapes) > 1:
                 yield from self._together(waiting)
                 waiting = []
             waiting.append(sample)
@@ -132,24 +127,26 @@ class _Judge:
     @torch.no_grad()
     def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
         if len(samples) > 1 and not self._tune:
-            try:
+            with suppress(Exception):  # otherwise each runs by itself, to see which one fails
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
                 gaussians = self._model(inputs).gaussians
-            except Exception:  # run each by itself, to see which one fails
-                pass
-            else:
                 return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
         return [self._score(sample) for sample in samples]
 
     def _score(
         self, sample: Sample, gaussians: Gaussians | None = None
     ) -> SceneScore | SceneFailure:
-        """The score of `sample`. gaussians: (1, G), None to predict them here."""
+        """The score of `sample`. gaussians: (1, G), None to predict or tune them here."""
         values: dict[str, float] = {}
         try:
-            if gaussians is None:
-                gaussians, values = self._predicted(sample.inputs.to(self._device))
-            values = {**self._values(sample, gaussians), **values}
+            inputs = sample.inputs.to(self._device)
+            if gaussians is None and self._tune:
+                tuning = self._tune(inputs)
+                gaussians = tuning.prediction.gaussians
+                values = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
+            elif gaussians is None:
+                gaussians = self._model(inputs).gaussians
+            values = {**self._values(sample, inputs, gaussians), **values}
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         broken = [name for name, value in values.items() if not math.isfinite(value)]
@@ -157,17 +154,9 @@ class _Judge:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
         return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
 
-    def _predicted(self, inputs: Views) -> tuple[Gaussians, dict[str, float]]:
-        """Gaussians (1, G), and TUNING where tokens are tuned before."""
-        if self._tune is None:
-            return self._model(inputs).gaussians, {}
-        tuning = self._tune(inputs)
-        ends = tuning.losses[0], tuning.losses[-1]
-        return tuning.prediction.gaussians, dict(zip(TUNING, ends, strict=True))
-
-    def _values(self, sample: Sample, gaussians: Gaussians) -> dict[str, float]:
+    def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
         """Everything measured on the Gaussians (1, G) of `sample`."""
-        inputs, targets = sample.inputs.to(self._device), sample.targets.to(self._device)
+        targets = sample.targets.to(self._device)
         rendering = self._model.render(gaussians, targets.cameras)
         depth = true_depth(self._source, sample) if "true_depth" in self._needed else None
         if depth is not None:
@@ -180,21 +169,15 @@ class _Judge:
             "nearest_input": MetricInput(nearest_input(inputs, targets.cameras), targets),
             "mean_colour": MetricInput(mean_colour(inputs, targets.cameras), targets),
         }
-        values = {
-            f"{method}_{name}": value
-            for method, shown in given.items()
-            for name, value in self._measured(shown)
-        }
-        return {**values, "gaussians_used": float(gaussians_used(gaussians.opacities))}
-
-    def _measured(self, given: MetricInput) -> Iterator[tuple[str, float]]:
-        for name, metric in self._metrics.items():
-            if metric.unavailable or any(getattr(given, need) is None for need in metric.needs):
+        values: dict[str, float] = {}
+        for (method, shown), (label, metric) in product(given.items(), self._metrics.items()):
+            if metric.unavailable or any(getattr(shown, need) is None for need in metric.needs):
                 continue
-            found = metric(given)
+            found = metric(shown)
             found = found if isinstance(found, Mapping) else {"": found}
             for key in metric.columns():
-                yield _name(name, key), float(found[key].double().mean())
+                values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
+        return {**values, "gaussians_used": float(gaussians_used(gaussians.opacities))}
 
 
 def _name(metric: str, key: str) -> str:
@@ -216,19 +199,14 @@ def _by_scene(
             samples.setdefault(result.scene, []).append(result)
         if observe:
             observe(len(samples.keys() | failures.keys()), len(wanted))
-    scores = [_merged(samples[name]) for name in wanted if name in samples and name not in failures]
+    scores = []
+    for name in (name for name in wanted if name in samples and name not in failures):
+        found = [sample.values for sample in samples[name]]
+        common = [key for key in found[0] if all(key in values for values in found)]
+        means = {key: sum(values[key] for values in found) / len(found) for key in common}
+        views = [frames for sample in samples[name] for frames in sample.views]
+        scores.append(SceneScore(name, views, means))
     return scores, [failures[name] for name in wanted if name in failures]
-
-
-def _merged(samples: Sequence[SceneScore]) -> SceneScore:
-    """One scene's samples as one: means of the values that all of them have."""
-    values = {
-        name: sum(sample.values[name] for sample in samples) / len(samples)
-        for name in samples[0].values
-        if all(name in sample.values for sample in samples)
-    }
-    views = [frames for sample in samples for frames in sample.views]
-    return SceneScore(samples[0].scene, views, values)
 
 
 def _held_out(source: SceneSource, scores: Sequence[SceneScore]) -> tuple[int, int] | None:

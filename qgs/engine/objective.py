@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from qgs.contracts import Loss
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import (
     Cameras,

@@ -13,17 +13,13 @@ from qgs.contracts import Metric, SceneSourceConfig
 from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.engine.tuning import tuning_loss
 
-_CROP = "centre crop to the aspect ratio of image_size, then Lanczos resize"
-
 
 @dataclass(frozen=True)
 class Protocol:
     """Settings of an evaluation under a name; results with one hash are comparable.
 
-    content: everything that decides a score of given Gaussians, and nothing else: no path, no name
-    of a file. That is the data's images and cameras, which views are judged, their poses, the
-    metrics, tuning, and the settings that every renderer obeys; not the renderer's type, as all of
-    them render alike, on whichever device.
+    content: everything that decides a score of given Gaussians, and nothing else: no path, and not
+    the renderer's type or device, as all render alike.
     """
 
     name: str
@@ -32,7 +28,7 @@ class Protocol:
     @property
     def canonical(self) -> str:
         """What is hashed: `content` as JSON with sorted keys and no spaces."""
-        return canonical_json(self.content)
+        return _canonical(self.content)
 
     @property
     def sha256(self) -> str:
@@ -44,13 +40,10 @@ class Protocol:
 
     def settings(self) -> dict[str, Any]:
         """`content` with size and hash in place of the index, which may be long."""
-        index = self.content["views"].get("index")
-        if index is None:
-            return dict(self.content)
-        return {
-            **self.content,
-            "views": {"index": {"scenes": len(index), "sha256": _sha256(index)}},
-        }
+        views = self.content["views"]
+        if index := views.get("index"):
+            views = {"index": {"scenes": len(index), "sha256": _sha256(index)}}
+        return {**self.content, "views": views}
 
 
 def index_of(recipe: Recipe) -> EvaluationIndex | None:
@@ -69,52 +62,46 @@ def protocol_of(
     evaluation, config = recipe.evaluation, recipe.parts["data",].config
     assert isinstance(config, SceneSourceConfig)
     left_out = {"image_size", *config.unhashed_options}
-    data: dict[str, Any] = {}
     if index is None:
-        data["type"] = recipe.tree["data"]["type"]
+        data = {"type": recipe.tree["data"]["type"]}
+        data |= config.model_dump(mode="json", exclude=left_out)
         views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
         rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
         judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
     else:
         left_out |= config.split_options
+        data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
         judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
-    data |= config.model_dump(mode="json", exclude=left_out, exclude_defaults=index is not None)
-    tuning = None
+    tuning, metrics = None, {}
     if evaluation.tuning_steps:
         loss = tuning_loss(recipe).config.model_dump(mode="json")
         budget = {"steps": evaluation.tuning_steps, "rate": evaluation.tuning_rate}
         tuning = {**budget, "optimizer": "Adam", "loss": loss}
+    for path, chosen in recipe.parts.items():
+        metric = chosen.component
+        if issubclass(metric, Metric):
+            options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
+            metrics[path[-1]] = {"type": chosen.type, "definition": metric.definition, **options}
     content = {
         "format": 2,
         "image_size": list(config.image_size),
-        "crop": _CROP,
+        "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
         "data": data,
         "poses": recipe.views.model_dump(include={"frame", "scale", "scale_factor"}),
         "views": judged,
         "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
-        "metrics": _metrics(recipe),
+        "metrics": metrics,
         "tuning": tuning,
     }
     file = (evaluation.index or "drawn").replace("\\", "/").rsplit("/", 1)[-1]
     return Protocol(evaluation.protocol or file.removesuffix(".json"), content)
 
 
-def canonical_json(value: Any) -> str:
-    """JSON with sorted keys and no spaces."""
+def _canonical(value: Any) -> str:
     return json.dumps(
         value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )
 
 
 def _sha256(value: Any) -> str:
-    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
-
-
-def _metrics(recipe: Recipe) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for path, chosen in recipe.parts.items():
-        metric = chosen.component
-        if path[0] == "metrics" and issubclass(metric, Metric):
-            options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
-            found[path[1]] = {"type": chosen.type, "definition": metric.definition, **options}
-    return found
+    return hashlib.sha256(_canonical(value).encode()).hexdigest()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -19,20 +19,21 @@ from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
 from qgs.data.sampling import Frames
 from qgs.engine.protocol import Protocol
+from qgs.io.differences import listed
 from qgs.io.files import write_text
-from qgs.metrics import OPACITY_USED
+from qgs.metrics.dispersion import OPACITY_USED
 
 METHODS = ("model", "nearest_input", "mean_colour")
 TUNING = ("tuning_loss_before", "tuning_loss_after")
 _FRAMES = ("scene", "input_frames", "target_frames")
 """Columns of scenes.csv before the values; `problem` stands behind them."""
-_NAMED = 10
+_MOST_MISSING = 10
+"""How many missing scenes the notes give the reason of."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Mean, variance (over the population) and median of a value over scenes."""
-    x = torch.tensor(values, dtype=torch.float64)
-    found = {"mean": x.mean(), "variance": x.var(correction=0), "median": x.quantile(0.5)}
+    found = {"mean": np.mean(values), "variance": np.var(values), "median": np.median(values)}
     return {name: float(value) for name, value in found.items()}
 
 
@@ -59,12 +60,11 @@ class SceneScore:
 class Evaluation:
     """All scenes and what they amount to; the same weights and recipe give the same numbers.
 
-    columns: name of each value of the metrics to how it is shown. scores: of the scenes that were
-    judged. wanted: names of all that the protocol names. missing: those without a score. null:
-    scenes that the index lists without frames. unlisted: scenes of the data that the index lacks.
-    gaussians: how many a scene has. incomplete: values that scenes of the model lack, and why.
-    held_out: how many held-out frames were judged, and how many there are; None where the test
-    scenes hold none out. step: optimiser steps behind the weights.
+    columns: by name of the value. scores: of the judged scenes. wanted: names of all scenes of the
+    protocol. missing: those without a score. null: scenes that the index lists without frames.
+    unlisted: scenes of the data that the index lacks. gaussians: of a scene. incomplete: values
+    that scenes lack, and why. held_out: how many held-out frames were judged, and how many there
+    are; None where the test scenes hold none out. step: optimiser steps behind the weights.
     """
 
     protocol: Protocol
@@ -80,10 +80,7 @@ class Evaluation:
     step: int | None = None
 
     def mean(self, metric: str, method: str = "model") -> float | None:
-        """Mean over the judged scenes of one of `columns`; None if no scene has this value.
-
-        Scenes weigh alike, however many samples and views they have.
-        """
+        """Mean over scenes of one of `columns`, each scene once; None if none has this value."""
         values = self._values(f"{method}_{metric}")
         return sum(values) / len(values) if values else None
 
@@ -92,19 +89,14 @@ class Evaluation:
         return {name: self.mean(name, method) for name in self.columns}
 
     @property
-    def is_complete(self) -> bool:
-        """Whether every scene that the protocol names has a score."""
-        return not self.missing
-
-    @property
     def statement(self) -> str:
         """The model's first value, usually PSNR, and over how many scenes, in one line."""
         line = f"over {self._of_wanted(len(self.scores))} scene{'s' * (len(self.wanted) != 1)}"
         if known := [name for name, value in self.means().items() if value is not None]:
             column = self.columns[known[0]]
             line = f"{column.heading} {column.shown(self.mean(known[0]))} {line}"
-        missing = [failure.scene for failure in self.missing]
-        return f"{line}; missing: {listed(missing)}" if missing else line
+        missing = listed([failure.scene for failure in self.missing])
+        return f"{line}; missing: {missing}" if missing else line
 
     def summary(self) -> dict[str, Any]:
         """Everything but the scores of single scenes, as plain values for JSON.
@@ -112,12 +104,9 @@ class Evaluation:
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
         values = {name: self._values(f"model_{name}") for name in self.columns}
+        p = self.protocol
         return {
-            "protocol": {
-                "name": self.protocol.name,
-                "sha256": self.protocol.sha256,
-                "settings": self.protocol.settings(),
-            },
+            "protocol": {"name": p.name, "sha256": p.sha256, "settings": p.settings()},
             "step": self.step,
             "statement": self.statement,
             "scenes": len(self.scores),
@@ -132,10 +121,7 @@ class Evaluation:
             "incomplete": dict(self.incomplete),
             "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
             "gaussians": self.gaussians,
-            "gaussians_used": {
-                "opacity_above": OPACITY_USED,
-                **spread(self._values("gaussians_used")),
-            },
+            "gaussians_used": {"opacity_above": OPACITY_USED, **self._used()},
             "tuning": self._tuning(),
             "held_out_frames": self.held_out,
         }
@@ -164,6 +150,9 @@ class Evaluation:
         wanted = len(self.wanted)
         return str(count) if count == wanted else f"{count} of {wanted}"
 
+    def _used(self) -> dict[str, float]:
+        return spread(self._values("gaussians_used"))
+
     def _tuning(self) -> dict[str, Any] | None:
         settings = self.protocol.content["tuning"]
         if settings is None:
@@ -190,9 +179,8 @@ class Evaluation:
         return rows
 
     def _markdown(self) -> str:
-        notes = "\n".join(f"- {line}" for line in self._notes())
         tables = [markdown_table(rows) for rows in (self._rows(), self._rows_over_scenes())]
-        return "\n\n".join([*tables, notes]) + "\n"
+        return "\n\n".join([*tables, bullets(self._notes())]) + "\n"
 
     def _csv(self) -> str:
         """A line per scene that the protocol names, in its order; those without a score say why."""
@@ -204,10 +192,10 @@ class Evaluation:
         writer.writeheader()
         for name in self.wanted:
             row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
-            if name in judged:
-                sides = zip(*judged[name].views, strict=True)
-                shown = ["; ".join(" ".join(map(str, frames)) for frames in side) for side in sides]
-                row |= {**dict(zip(_FRAMES[1:], shown, strict=True)), **judged[name].values}
+            if score := judged.get(name):
+                for key, side in zip(_FRAMES[1:], zip(*score.views, strict=True), strict=True):
+                    row[key] = "; ".join(" ".join(map(str, frames)) for frames in side)
+                row |= score.values
             writer.writerow(row)
         return text.getvalue()
 
@@ -222,15 +210,13 @@ class Evaluation:
             f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
             f"{poses['scale']} {poses['scale_factor']}"
         )
-        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_NAMED])
-        if len(self.missing) > _NAMED:
-            yield f"{len(self.missing) - _NAMED} more missing scenes are in scenes.csv"
-        for names, what in (
-            (self.null, "null entries of the index"),
-            (self.unlisted, "scenes of the data that the index lacks"),
-        ):
-            if names:
-                yield f"{what}, not judged ({len(names)}): {listed(names)}"
+        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_MOST_MISSING])
+        if len(self.missing) > _MOST_MISSING:
+            yield f"{len(self.missing) - _MOST_MISSING} more missing scenes are in scenes.csv"
+        if null := self.null:
+            yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
+        if names := self.unlisted:
+            yield f"scenes that the index lacks, not judged ({len(names)}): {listed(names)}"
         if given := [score for score in self.scores if score.given]:
             named = [f"{score.scene} ({' '.join(map(str, score.given))})" for score in given]
             yield (
@@ -243,7 +229,7 @@ class Evaluation:
             yield f"{self.columns[name].heading} is {over}: {why}"
         if self.held_out:
             yield "judged on {} of {} held-out frames".format(*self.held_out)
-        used = spread(self._values("gaussians_used"))
+        used = self._used()
         yield (
             f"{self.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "
             f"above {OPACITY_USED:.4f}; mean over scenes, median {used['median']:,.0f})"
@@ -256,12 +242,6 @@ class Evaluation:
             )
 
 
-def listed(names: Sequence[str], most: int = _NAMED) -> str:
-    """Names with commas between, at most so many."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
-
-
 def as_json(value: Mapping[str, Any]) -> str:
     """A file's text; raises ValueError for NaN and infinities."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -270,13 +250,18 @@ def as_json(value: Mapping[str, Any]) -> str:
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
     """Rows of equal length, headers first, as a Markdown table; numbers to the right."""
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    rule = "|:" + "-" * (widths[0] + 1) + "".join(f"|{'-' * (width + 1)}:" for width in widths[1:])
+    first, *rest = (max(map(len, column)) for column in zip(*cells, strict=True))
+    rule = "|".join(["", ":" + "-" * (first + 1), *("-" * (width + 1) + ":" for width in rest), ""])
     lines = []
-    for first, *rest in cells:
-        right = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
-        lines.append("| " + " | ".join([first.ljust(widths[0]), *right]) + " |")
-    return "\n".join([lines[0], rule + "|", *lines[1:]])
+    for name, *values in cells:
+        right = [value.rjust(width) for value, width in zip(values, rest, strict=True)]
+        lines.append(f"| {' | '.join([name.ljust(first), *right])} |")
+    return "\n".join([lines[0], rule, *lines[1:]])
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Lines as a Markdown list."""
+    return "\n".join(f"- {line}" for line in lines)
 
 
 def print_table(
@@ -285,13 +270,13 @@ def print_table(
     """Print rows, headers first; numbers to the right. options: of rich's Table."""
     table = Table(title=escape(title) or None, title_justify="left", **options)
     for place, header in enumerate(rows[0]):
-        table.add_column(header, justify="right" if place else "left")
+        table.add_column(header, justify="right" if place else "left", overflow="fold")
     for row in rows[1:]:
         table.add_row(*row)
     console.print(table)
 
 
-def print_lines(console: Console, lines: Iterator[str] | Sequence[str]) -> None:
+def print_lines(console: Console, lines: Iterable[str]) -> None:
     """Print lines of plain text."""
     for line in lines:
         console.print(escape(line), highlight=False, soft_wrap=True)
@@ -301,10 +286,9 @@ def print_lines(console: Console, lines: Iterator[str] | Sequence[str]) -> None:
 class StoredResults:
     """Results of one evaluation. name: the folder, as it was given. protocol: its content.
 
-    columns, scenes: as `Evaluation.columns` and `SceneScore.values`, of the scenes that were
-    judged. frames: their input and target frames, as scenes.csv writes them. wanted: how many
-    scenes the protocol names. missing: those without a score. null: scenes that the index lists
-    without frames.
+    scenes: `SceneScore.values` of the judged scenes. frames: their input and target frames, as
+    scenes.csv writes them. wanted: how many scenes the protocol names. columns, missing and null
+    as in `Evaluation`.
     """
 
     name: str
@@ -324,39 +308,34 @@ def read_results(path: str | Path) -> StoredResults:
 
     Raises FileNotFoundError when there are none, ValueError when they cannot be read.
     """
-    folder = Path(path)
-    if not (folder / "summary.json").is_file():
-        folder = folder / "evaluation"
-    if not (folder / "summary.json").is_file():
+    folders = (Path(path), Path(path) / "evaluation")
+    folder = next((folder for folder in folders if (folder / "summary.json").is_file()), None)
+    if folder is None:
         raise FileNotFoundError(
             f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder with an "
             "evaluation/ in it"
         )
     try:
-        return _read(folder, str(path))
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
+            judged = {row["scene"]: row for row in csv.DictReader(file) if not row["problem"]}
+        return StoredResults(
+            name=str(path),
+            protocol_name=summary["protocol"]["name"],
+            sha256=summary["protocol"]["sha256"],
+            protocol=json.loads((folder / "protocol.json").read_text(encoding="utf-8")),
+            columns={name: Column(**column) for name, column in summary["columns"].items()},
+            scenes={
+                scene: {k: float(v) for k, v in row.items() if k not in _FRAMES and v}
+                for scene, row in judged.items()
+            },
+            frames={s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()},
+            wanted=summary["scenes_in_protocol"],
+            missing=list(summary["missing"]),
+            null=summary["null_entries"],
+        )
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise ValueError(
             f"the results in {folder} cannot be read ({type(error).__name__}: {error}): they were "
             "changed, or written by an earlier version; evaluate again with `qgs eval`"
         ) from error
-
-
-def _read(folder: Path, name: str) -> StoredResults:
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
-        judged = {row["scene"]: row for row in csv.DictReader(file) if not row["problem"]}
-    return StoredResults(
-        name=name,
-        protocol_name=summary["protocol"]["name"],
-        sha256=summary["protocol"]["sha256"],
-        protocol=json.loads((folder / "protocol.json").read_text(encoding="utf-8")),
-        columns={name: Column(**column) for name, column in summary["columns"].items()},
-        scenes={
-            scene: {k: float(v) for k, v in row.items() if k not in _FRAMES and v}
-            for scene, row in judged.items()
-        },
-        frames={s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()},
-        wanted=summary["scenes_in_protocol"],
-        missing=list(summary["missing"]),
-        null=summary["null_entries"],
-    )

@@ -35,9 +35,8 @@ def tune(
 ) -> Tuning:
     """Fit the initial queries of `views` (B, V) to these views with Adam; weights stay as they are.
 
-    Whatever floats in the initial state is fitted, its features and every field, so LocusGS's
-    anchors too. The photos are encoded once; the last layer is rendered at the input cameras and
-    compared with the photos themselves. TokenGS takes 50 steps at a rate of 1e-4.
+    All features and floating fields of the state are fitted, so LocusGS's anchors too. `loss`
+    compares the last layer with the photos. TokenGS takes 50 steps at a rate of 1e-4.
     Raises ValueError for less than one step.
     """
     if steps < 1:

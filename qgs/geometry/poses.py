@@ -1,7 +1,5 @@
 """Poses in the frame and scale that the model expects (TokenGS release)."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

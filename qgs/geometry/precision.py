@@ -1,7 +1,5 @@
 """Float32 or better for geometry, also inside autocast."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps
@@ -34,7 +32,9 @@ def full_precision(function: F) -> F:
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         given = sorted((*args, *kwargs.values()), key=lambda value: not isinstance(value, Tensor))
         first = next(named_tensors(given), None)
-        device = first[1].device.type if first else _device_without_tensors()
+        device = first[1].device.type if first else None
+        if device is None:
+            device = "cuda" if torch.is_autocast_enabled("cuda") else "cpu"
         # Leaving the outermost autocast of a thread empties a cache that all threads share, so
         # a thread that loads data must not enter one while another trains.
         inside = device != "meta" and torch.is_autocast_enabled(device)
@@ -44,7 +44,3 @@ def full_precision(function: F) -> F:
             )
 
     return cast(F, wrapper)
-
-
-def _device_without_tensors() -> str:
-    return "cuda" if torch.is_autocast_enabled("cuda") else "cpu"

@@ -1,7 +1,5 @@
 """Pixel rays and Plücker coordinates."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Points into cameras and pixels, quaternions to rotation matrices."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A model as one safetensors file that carries its recipe; no pickle is ever read."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

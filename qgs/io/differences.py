@@ -1,7 +1,5 @@
 """In what two state dicts, or two recipes, differ: the lines that messages list."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -50,18 +48,14 @@ def differing_options(
 
     None stands for an option that a recipe does not have.
     """
-    of_a, of_b = flat(a), flat(b)
-    different = (
-        path
-        for path in dict.fromkeys([*of_a, *of_b])
-        if path not in of_a or path not in of_b or of_a[path] != of_b[path]
-    )
+    of_a, of_b, absent = flat(a), flat(b), object()
     return {
         path: (
             inline(of_a[path]) if path in of_a else None,
             inline(of_b[path]) if path in of_b else None,
         )
-        for path in different
+        for path in of_a | of_b
+        if of_a.get(path, absent) != of_b.get(path, absent)
     }
 
 

@@ -1,7 +1,5 @@
 """Files and folders that appear whole or not at all; files of JSON records."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -121,11 +119,9 @@ def read_records(path: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
-            sound = isinstance(record["step"], int)
-        except (ValueError, TypeError, KeyError):
-            sound = False
-        if sound:
+            if not isinstance(record["step"], int):
+                raise TypeError
             records.append(record)
-        else:
+        except (ValueError, TypeError, KeyError):
             _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
     return records

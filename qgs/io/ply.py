@@ -1,7 +1,5 @@
 """Gaussians as PLY files that splat viewers open (property names and order: 3DGS release)."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Published state dicts and ours: which parameter is which, and which recipe fits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -85,16 +83,13 @@ def exact_names_of(recipe: Recipe) -> Names:
     Raises PublishedError that lists what the codebase lacks, and what it has besides.
     """
     names = names_of(recipe)
-    layout = names.layout
-    extra, theirs = list(names.unnamed), names.shapes
-    problems = []
+    layout, extra, theirs, problems = names.layout, names.unnamed, names.shapes, []
     if not extra:
         try:
             theirs = _names_in(resolve(layout.read(names.published_shapes())), layout).shapes
-        except (LayoutError, ValueError) as error:
+        except ValueError as error:  # a LayoutError or RecipeError
             problems.append(str(error))
-        else:
-            extra = [name for name in names.shapes if name not in theirs]
+        extra = [name for name in names.shapes if name not in theirs]
     problems += [f"{name}: {layout.name} has no such parameter" for name in extra]
     problems += [
         f"{name}: {layout.name} has it with the shape {shape}, this model has "
@@ -147,7 +142,7 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
 def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
     """The layout, of any installed plugin, that a state dict is of; and all that there are."""
     layouts = _layouts(load_sound_plugins()[0].plugins.values())
-    return next((layout for layout in layouts if layout.marks_all_in(shapes)), None), layouts
+    return next((layout for layout in layouts if set(layout.marks) <= set(shapes)), None), layouts
 
 
 def without_prefix(file: WeightFile) -> WeightFile:

@@ -1,7 +1,5 @@
 """Published weights in and out of checkpoints, every tensor accounted for."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Files of published weights: safetensors, or torch's own, whose code is never run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,10 +40,11 @@ def read_weight_file(path: str | Path) -> WeightFile:
     if not path.stat().st_size:
         raise CheckpointError(f"{path} is empty; copy it again")
     suffix = path.suffix.lower()
+    notes: list[str] = []
     if suffix in SAFETENSORS:
-        tensors, notes = _read_safetensors(path), []
+        tensors = _read_safetensors(path)
     elif suffix in TORCH:
-        tensors, notes = _read_torch(path)
+        tensors = _read_torch(path, notes)
     else:
         known = ", ".join((*SAFETENSORS, *TORCH))
         raise CheckpointError(
@@ -76,7 +75,7 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def _read_torch(path: Path) -> tuple[dict[str, Tensor], list[str]]:
+def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
     kind = pickle_kind(path)
     with path.open("rb") as file:
         if file.read(9)[8:] == b"{":
@@ -91,8 +90,7 @@ def _read_torch(path: Path) -> tuple[dict[str, Tensor], list[str]]:
             f"{path} is not a whole torch file of plain tensors ({reason}); copy it again, or save "
             "`model.state_dict()` alone"
         ) from error
-    notes: list[str] = []
-    return _state_dict(content, path, notes), notes
+    return _state_dict(content, path, notes)
 
 
 def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]:

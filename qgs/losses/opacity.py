@@ -1,14 +1,12 @@
 """`qgs/opacity`, `qgs/mask`: Gaussians become opaque, alpha becomes the mask (TokenGS release)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss
-from qgs.geometry.precision import full_precision
+from qgs.geometry.precision import at_least_float32
 from qgs.losses.photometric import mean_squared_error
 from qgs.types import LayerPrediction, Rendering, Views
 
@@ -30,14 +28,8 @@ class Opacity(Loss):
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
-        """One term, `opacity`."""
-        mean = _negative_log_mean(prediction.gaussians.opacities, self.config.eps)
-        return {"opacity": self.config.weight * mean}
-
-
-@full_precision
-def _negative_log_mean(opacities: Tensor, eps: float) -> Tensor:
-    return -(opacities + eps).log().mean()
+        opacities = at_least_float32(prediction.gaussians.opacities)
+        return {"opacity": self.config.weight * -(opacities + self.config.eps).log().mean()}
 
 
 class Mask(Loss):

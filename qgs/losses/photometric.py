@@ -1,7 +1,5 @@
 """`qgs/photometric`: MSE and SSIM of rendered against true images (TokenGS, LocusGS)."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 import torch

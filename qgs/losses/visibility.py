@@ -1,7 +1,5 @@
 """`qgs/visibility`: moves points that no target view sees towards the nearest one (TokenGS)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import ClassVar, Literal
 
@@ -12,8 +10,6 @@ from torch import Tensor
 from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
-
-BehindCamera = Literal["published", "invisible"]
 
 _TINY_Z = 1e-8
 """Below this |z| counts as 0, so that gradients of x / z stay finite."""
@@ -35,7 +31,7 @@ class VisibilityOptions(ComponentConfig):
     """Upper bound per point, in halves of an image side (release: 1); null for no bound."""
     near: float = Field(default=0.025, gt=0)
     """Camera-frame z at or below which a point is behind the camera, world units."""
-    behind_camera: BehindCamera = "published"
+    behind_camera: Literal["published", "invisible"] = "published"
     """A point behind the camera is seen mirrored, so it may count as visible ("published", as in
     both releases), or it costs the full `clamp` in that view ("invisible")."""
 
@@ -71,7 +67,6 @@ class Visibility(Loss):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options that contradict each other or have no effect."""
         yield from config.conflicts()
         if config.clamp is not None:
             yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
@@ -79,7 +74,6 @@ class Visibility(Loss):
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
-        """One term, `visibility`."""
         per_point = view_visibility(
             prediction.gaussians.means,
             target.cameras,

@@ -13,8 +13,7 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
     """For every target camera (B, T) the image of the nearest input view -> (B, T, 3, H, W).
 
     Nearest by the distance of camera centres over the spread of the input cameras plus the angle
-    between viewing directions, in radians, so that of two cameras in one place the one that looks
-    the same way wins.
+    between viewing directions, in radians.
     """
     index = _distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
     scene = torch.arange(index.shape[0], device=index.device)[:, None]

@@ -16,10 +16,8 @@ SsimCovariance: TypeAlias = Literal["population", "sample"]
 
 _WINDOW = 11
 _SIGMA = 1.5
-_STABILISERS = (0.01**2, 0.03**2)
-"""C1 and C2 of Wang et al. 2004 for a data range of 1."""
-_MSE_FLOOR = 1e-10
-"""Identical images get 100 dB."""
+_STABILISERS = (0.01**2, 0.03**2)  # C1 and C2 of Wang et al. 2004 for a data range of 1
+_MSE_FLOOR = 1e-10  # identical images get 100 dB
 
 
 class Psnr(Metric):
@@ -49,18 +47,17 @@ class Ssim(Metric):
         """population: as in Wang et al. 2004; sample: scikit-image's default, by which pixelSplat's
         evaluation and those derived from it score."""
 
-    def __init__(self, config: Config) -> None:
-        super().__init__(config)
-        self.covariance: SsimCovariance = config.covariance
+    config: Config
 
     def columns(self) -> Mapping[str, Column]:
         """Names the covariance where it is not the default."""
-        form = "" if self.covariance == "population" else f" ({self.covariance} covariance)"
+        covariance = self.config.covariance
+        form = "" if covariance == "population" else f" ({covariance} covariance)"
         return {"": Column(f"SSIM{form}", "higher")}
 
     def forward(self, given: MetricInput) -> Tensor:
         """(1, T). Raises ValueError for images smaller than the window."""
-        return ssim(given.images, given.targets.images, self.covariance)
+        return ssim(given.images, given.targets.images, self.config.covariance)
 
 
 @full_precision
@@ -75,10 +72,9 @@ def ssim(images: Tensor, truth: Tensor, covariance: SsimCovariance = "population
     """Structural similarity of images (..., 3, H, W), clipped to [0, 1] -> (...).
 
     Wang et al. 2004, eq. 13. Equals scikit-image's `structural_similarity` with gaussian_weights,
-    sigma 1.5 and data_range 1, which leaves out the 5 pixels at the border; with
-    use_sample_covariance=False for the covariance "population", True, its default, for "sample",
-    where the N = 11 * 11 pixels of a window give variances times N / (N - 1). Computed in float64:
-    the variances of flat images are small differences of squares.
+    sigma 1.5 and data_range 1, which leaves out the 5 pixels at the border; covariance "sample" is
+    its use_sample_covariance, by which the N = 11 * 11 pixels of a window give variances times
+    N / (N - 1). In float64: the variances of flat images are small differences of squares.
     Raises ValueError when a side is shorter than the window of 11 pixels.
     """
     if min(images.shape[-2:]) < _WINDOW:

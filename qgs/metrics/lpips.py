@@ -7,6 +7,7 @@ takes VGG-16 from torchvision, whose wheels work with CUDA builds of torch only.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar
@@ -19,12 +20,9 @@ from torch import Tensor, nn
 from qgs.contracts import Column, ComponentConfig, Metric, MetricInput
 from qgs.geometry.precision import full_precision
 
-VGG_FILE = "vgg16-397923af.pth"
-"""Name of torchvision's VGG-16 in torch's cache."""
-
+_VGG_FILE = "vgg16-397923af.pth"  # torchvision's VGG-16 in torch's cache
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Convolutions of VGG-16 by torchvision's numbers; a 2x2 max pooling stands between blocks."""
-
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPS = 1e-10
@@ -82,8 +80,7 @@ class Lpips(Metric):
         for index, (block, weight) in enumerate(zip(self.blocks, self.linear, strict=True)):
             x = block(F.max_pool2d(x, 2) if index else x)
             unit = x / (x.norm(dim=1, keepdim=True) + _EPS)
-            apart = (unit[:1] - unit[1:]).square()
-            total = total + F.conv2d(apart, weight).mean()
+            total = total + F.conv2d((unit[:1] - unit[1:]).square(), weight).mean()
         return total
 
     def _load(self, weights: str | None) -> str:
@@ -95,15 +92,16 @@ class Lpips(Metric):
                 'pip install "query-gaussians[lpips]"'
             )
         linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
-        vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE
+        vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / _VGG_FILE
         if not vgg.is_file():
             place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
             return (
-                f"there are no VGG-16 weights {place}: download torchvision's {VGG_FILE} and name "
+                f"there are no VGG-16 weights {place}: download torchvision's {_VGG_FILE} and name "
                 "it in the option `weights` of qgs/lpips"
             )
         try:
-            tensors, factors = _read(vgg), _read(linear)
+            read = load_file if vgg.suffix == ".safetensors" else _load_pickled
+            tensors, factors = read(vgg), _load_pickled(linear)
             self.blocks = nn.ModuleList(
                 nn.Sequential(*(layer for number in block for layer in _layers(tensors, number)))
                 for block in _BLOCKS
@@ -125,7 +123,4 @@ def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]
     return convolution, nn.ReLU(inplace=True)
 
 
-def _read(path: Path) -> Mapping[str, Tensor]:
-    if path.suffix == ".safetensors":
-        return load_file(path)
-    return torch.load(path, map_location="cpu", weights_only=True)
+_load_pickled = partial(torch.load, map_location="cpu", weights_only=True)

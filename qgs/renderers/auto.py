@@ -1,7 +1,5 @@
 """`qgs/auto`: gsplat for tensors on CUDA, `qgs/cpu` otherwise."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from functools import cached_property
 

@@ -1,13 +1,12 @@
 """`qgs/cpu`: projection and blending by tiles of 16 x 16 pixels, in numba."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -133,15 +132,11 @@ class _Splat(torch.autograd.Function):
             )  # fmt: skip
 
         _in_threads((blend, stripes), (project, units))
-        cameras = _camera_gradients(of_cameras.sum(1)) if wants_cameras else (None, None)
-        return *of_inputs, *cameras, None, None
-
-
-def _camera_gradients(found: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of c2w (B, V, 4, 4) and intrinsics (B, V, 4) from the kernels' (B, V, 16)."""
-    rotation, position, lens = found.float().split([9, 3, 4], -1)
-    pose = torch.cat([rotation.unflatten(-1, (3, 3)), position[..., None]], -1)
-    return torch.nn.functional.pad(pose, (0, 0, 0, 1)), lens
+        if not wants_cameras:
+            return *of_inputs, None, None, None, None
+        rotation, position, lens = of_cameras.sum(1).float().split([9, 3, 4], -1)
+        pose = torch.cat([rotation.unflatten(-1, (3, 3)), position[..., None]], -1)
+        return *of_inputs, torch.nn.functional.pad(pose, (0, 0, 0, 1)), lens, None, None
 
 
 def _limits(config: RendererConfig) -> tuple[Any, Any]:
@@ -152,8 +147,6 @@ def _limits(config: RendererConfig) -> tuple[Any, Any]:
 
 
 def _float32(options: tuple[float, ...]) -> tuple[Any, ...]:
-    import numpy as np
-
     return tuple(np.float32(value) for value in options)
 
 

@@ -1,7 +1,5 @@
 """`qgs/gsplat`: the CUDA kernels of gsplat 1.5.3."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from importlib import import_module
 from importlib.util import find_spec
@@ -13,8 +11,6 @@ from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, Ren
 from qgs.contracts.component import MissingExtraError
 from qgs.renderers.inputs import background_of, check_inputs
 from qgs.types import Cameras, Gaussians, Rendering
-
-_FIXED = ("alpha_min", "alpha_cap", "transmittance_min")
 
 
 class GsplatRenderer(Renderer):
@@ -54,6 +50,9 @@ class GsplatRenderer(Renderer):
             gaussians, cameras = gaussians.to(torch.float32), cameras.to(torch.float32)
             backdrop = background_of(background, config.background, gaussians.means)
             height, width = cameras.size
+            fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
+            o, one = torch.zeros_like(fx), torch.ones_like(fx)
+            calibration = torch.stack([fx, o, cx, o, fy, cy, o, o, one], -1)
             # The packed path asserts with backgrounds and can mix gradients between scenes.
             rgbd, alpha, _ = rasterization(
                 means=gaussians.means,
@@ -62,7 +61,7 @@ class GsplatRenderer(Renderer):
                 opacities=gaussians.opacities,
                 colors=gaussians.colors,
                 viewmats=cameras.w2c,
-                Ks=_calibration(cameras.intrinsics),
+                Ks=calibration.unflatten(-1, (3, 3)),
                 width=width,
                 height=height,
                 near_plane=config.near,
@@ -85,7 +84,7 @@ def _unsupported(config: ComponentConfig) -> list[Problem]:
             f"got {getattr(config, option):g}",
             "remove the option, or choose qgs/torch or qgs/cpu as renderer",
         )
-        for option in _FIXED
+        for option in ("alpha_min", "alpha_cap", "transmittance_min")
         if getattr(config, option) != getattr(defaults, option)
     ]
 
@@ -111,10 +110,3 @@ def _check_supported(gaussians: Gaussians, cameras: Cameras) -> None:
             "the renderer qgs/gsplat needs gsplat, which is not installed: run "
             '`pip install "query-gaussians[gsplat]"`, or choose `renderer: {type: qgs/torch}`'
         )
-
-
-def _calibration(intrinsics: Tensor) -> Tensor:
-    """Matrices (..., 3, 3) of intrinsics (..., 4)."""
-    fx, fy, cx, cy = intrinsics.unbind(-1)
-    o, one = torch.zeros_like(fx), torch.ones_like(fx)
-    return torch.stack([fx, o, cx, o, fy, cy, o, o, one], -1).unflatten(-1, (3, 3))

@@ -1,7 +1,5 @@
 """What renderers share: checks of their inputs, one precision, the background."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@
 EWA projection after Zwicker et al. 2001 and gsplat 1.5.3.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -118,11 +116,7 @@ def resolve(sums: Tensor, background: Tensor) -> Rendering:
     """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
     hit = torch.where(alpha > 0, alpha, 1.0)
-    return Rendering(
-        rgb=rgb + (1 - alpha) * background[:, None, None],
-        alpha=alpha,
-        depth=depth / hit,
-    )
+    return Rendering(rgb + (1 - alpha) * background[:, None, None], alpha, depth / hit)
 
 
 def _composite(

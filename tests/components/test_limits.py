@@ -1,7 +1,5 @@
 """Every limit and epsilon of the releases is an option: published by default, and it matters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -185,8 +183,6 @@ def test_no_limit_was_forgotten() -> None:
 @pytest.mark.parametrize(
     ("overrides", "option"),
     [
-        ([f"{CROSS}.bandwidth=fixed", f"{CROSS}.sigma_sq_min=0.5"], "sigma_sq_min"),
-        ([f"{REFINE}.center_step=linear", f"{REFINE}.input_limit=1.0"], "input_limit"),
         ([f"{REFINE}.center=false", f"{REFINE}.output_limit=1.0"], "output_limit"),
         (["model.centers.offset=linear", "model.centers.output_limit=1.0"], "output_limit"),
         (["model.head.norm_eps=0.1"], "norm_eps"),

@@ -27,7 +27,7 @@ from qgs.contracts import (
     Scene,
     SceneSource,
 )
-from qgs.metrics import Psnr
+from qgs.metrics.images import Psnr
 from qgs.types import Cameras, ImageMemory, LayerPrediction, Rendering, Views
 
 

@@ -9,7 +9,7 @@ import torch
 
 from qgs.composer import resolve
 from qgs.engine.bench.memory import peak_memory, resident_bytes
-from qgs.engine.bench.run import Spread, in_turn
+from qgs.engine.bench.run import in_turn, quartiles
 from qgs.engine.bench.work import Workload, make_task, posed_photos, workload_of
 from qgs.geometry.transforms import to_camera, to_pixels
 
@@ -18,20 +18,18 @@ SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 MODEST = Workload(views=2, targets=2, size=(16, 24))
 
 
-def test_quartiles_and_paired_ratios() -> None:
-    ours, base = Spread((2.0, 8.0, 6.0, 4.0, 10.0)), Spread((1.0, 4.0, 2.0, 2.0, 5.0))
-    assert ours.quartiles == (4.0, 6.0, 8.0)
-    assert ours.over(base).samples == (2.0, 2.0, 3.0, 2.0, 2.0)
-    assert base.over(base).quartiles == (1.0, 1.0, 1.0)
+def test_quartiles() -> None:
+    expected = {"lower_quartile": 4.0, "median": 6.0, "upper_quartile": 8.0}
+    assert quartiles((2.0, 8.0, 6.0, 4.0, 10.0)) == expected
 
 
 def test_tasks_take_turns() -> None:
     calls: list[str] = []
     heard: list[str] = []
     tasks = [lambda name=name: calls.append(name) for name in "abc"]
-    spreads = in_turn(tasks, rounds=3, warmup=1, say=heard.append)
+    columns = in_turn(tasks, rounds=3, warmup=1, say=heard.append)
     assert calls == ["a", "b", "c"] * 4
-    assert [len(spread.samples) for spread in spreads] == [3, 3, 3]
+    assert [len(column) for column in columns] == [3, 3, 3]
     assert heard == ["warm-up 1 of 1", *(f"round {n} of 3" for n in (1, 2, 3))]
 
 

@@ -24,7 +24,10 @@ from qgs.data.evaluation import evaluation_samples
 from qgs.engine import evaluate
 from qgs.engine.comparison import compare
 from qgs.engine.results import METHODS, Evaluation, read_results
-from qgs.metrics import Lpips, Psnr, mean_colour, nearest_input, psnr, ssim, token_dispersion
+from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.dispersion import token_dispersion
+from qgs.metrics.images import Psnr, psnr, ssim
+from qgs.metrics.lpips import Lpips
 
 FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
 

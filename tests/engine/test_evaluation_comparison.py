@@ -86,7 +86,7 @@ def test_what_cannot_be_compared_is_refused() -> None:
     with pytest.raises(ValueError, match=r"x was judged by rooms .*y by halls .*differ in views:"):
         compare([rooms, halls])
     (pair,) = compare([rooms, halls], across_protocols=True).pairs
-    assert not pair.same_protocol
+    assert not pair.record()["same_protocol"]
     assert pair.differences[0].low is None
 
 

@@ -10,7 +10,7 @@ from qgs.composer import Recipe
 from qgs.data.sampling import Batch
 from qgs.data.stream import training_batches
 from qgs.engine.objective import Objective
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 
 
 def first_batch(recipe: Recipe) -> Batch:

@@ -20,7 +20,7 @@ from qgs.contracts import ComponentConfig, Loss
 from qgs.data.stream import training_batches
 from qgs.engine.objective import Objective, Outcome, measure
 from qgs.losses import Mask, Opacity
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 from qgs.types import LayerPrediction, Rendering, Views
 
 TOOL = Path(__file__).parents[2] / "tools" / "measure_render_memory.py"

@@ -1,7 +1,5 @@
 """What `full_precision` raises, and when it leaves autocast."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The models here are so small that a second thread only waits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

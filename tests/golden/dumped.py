@@ -1,7 +1,5 @@
 """Files like the golden ones, of other sizes and options, computed by our models in float64."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

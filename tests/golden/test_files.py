@@ -1,7 +1,5 @@
 """Every golden file passes the comparison with the published code, tensor by tensor."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import parity

@@ -1,7 +1,5 @@
 """The comparison on files of other sizes and options, and on files with something wrong."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from typing import Any
@@ -105,11 +103,9 @@ def test_infinities_and_nan_must_be_where_they_were(tmp_path: Path) -> None:
     ],
 )
 def test_a_tensor_without_counterpart_fails_by_name(tmp_path: Path, source: str, name: str) -> None:
-    def add(tensors: dict[str, Tensor], config: dict[str, Any]) -> None:
-        tensors[name] = torch.zeros(2)
-
-    found = problems(changed(tmp_path / "file", add, source))
-    assert found == {name: "not compared: nothing here has this name"}
+    added = {name: torch.zeros(2)}
+    path = changed(tmp_path / "file", lambda tensors, _: tensors.update(added), source)
+    assert problems(path) == {name: "not compared: nothing here has this name"}
 
 
 def test_a_tensor_that_the_metadata_promises_and_the_file_lacks(tmp_path: Path) -> None:
@@ -147,37 +143,32 @@ def test_an_option_that_is_not_understood_is_named(tmp_path: Path, option: str, 
         parity.rows_of(path)
 
 
+WRONG = [
+    {"gaussian_scale_cap": 0.08}, {"enc_depth": 2}, {"patch_size": 4}, {"enc_num_heads": 2},
+    {"num_gs_tokens": 6}, {"mlp_ratio": 2}, {"img_size": [24, 16]},
+]  # fmt: skip
+WRONG_FOR_LOCUSGS = [
+    {"anchor_radius_min": 0.5}, {"anchor_radius_affects_bias": False},
+    {"anchor_radius_refinement": False}, {"gaussian_center_variant": "anchor_offset"},
+    {"self_attn_variant": "content_only"}, {"num_gaussians_per_token": 2},
+    {"gaussian_center_variant": "free_center"}, {"cross_attn_variant": "content_only"},
+]  # fmt: skip
+WRONG_FOR_TOKENGS = [
+    {"gaussian_z_offset": 1.5}, {"opacity_bias": 1.0}, {"dec_patch_size": 1}, {"dec_depth": 1},
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "options",
+    ("source", "options"),
     [
-        {"gaussian_scale_cap": 0.08}, {"anchor_radius_min": 0.5}, {"enc_depth": 2},
-        {"patch_size": 4}, {"enc_num_heads": 2}, {"anchor_radius_affects_bias": False},
-        {"anchor_radius_refinement": False}, {"gaussian_center_variant": "anchor_offset"},
-        {"self_attn_variant": "content_only"}, {"num_gaussians_per_token": 2},
-        {"num_gs_tokens": 6}, {"mlp_ratio": 2}, {"img_size": [24, 16]},
-        {"gaussian_center_variant": "free_center"}, {"cross_attn_variant": "content_only"},
+        *(("locus_full_a", options) for options in WRONG + WRONG_FOR_LOCUSGS),
+        *(("tokengs_a", options) for options in WRONG + WRONG_FOR_TOKENGS),
     ],
-    ids=lambda options: next(iter(options)),
-)  # fmt: skip
-def test_a_wrong_option_does_not_pass(tmp_path: Path, options: dict[str, Any]) -> None:
-    path = changed(tmp_path / "file", lambda _, config: config["options"].update(options))
+    ids=str,
+)
+def test_a_wrong_option_does_not_pass(tmp_path: Path, source: str, options: dict[str, Any]) -> None:
+    path = changed(tmp_path / "file", lambda _, config: config["options"].update(options), source)
     assert parity.report(path) is False
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"gaussian_scale_cap": 0.08}, {"gaussian_z_offset": 1.5}, {"opacity_bias": 1.0},
-        {"dec_patch_size": 1}, {"enc_depth": 2}, {"dec_depth": 1}, {"patch_size": 4},
-        {"enc_num_heads": 2}, {"num_gs_tokens": 6}, {"mlp_ratio": 2}, {"img_size": [24, 16]},
-    ],
-    ids=lambda options: next(iter(options)),
-)  # fmt: skip
-def test_a_wrong_option_of_tokengs_does_not_pass(tmp_path: Path, options: dict[str, Any]) -> None:
-    def change(_: dict[str, Tensor], config: dict[str, Any]) -> None:
-        config["options"].update(options)
-
-    assert parity.report(changed(tmp_path / "file", change, "tokengs_a")) is False
 
 
 def test_another_constant_bandwidth_does_not_pass(tmp_path: Path) -> None:
@@ -278,10 +269,8 @@ def test_unknown_options_are_listed(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_nan_counts_as_an_infinite_error(tmp_path: Path) -> None:
-    def spoil(tensors: dict[str, Tensor], config: dict[str, Any]) -> None:
-        tensors["keys"].fill_(torch.nan)
-
-    rows = {row.name: row for row in parity.rows_of(changed(tmp_path / "file", spoil))}
+    path = changed(tmp_path / "file", lambda tensors, _: tensors["keys"].fill_(torch.nan))
+    rows = {row.name: row for row in parity.rows_of(path)}
     assert rows["keys"].absolute == rows["keys"].relative == torch.inf
     assert rows["values"].absolute is not None
     assert rows["values"].absolute < 1e-4

@@ -1,7 +1,5 @@
 """What each option of a release says in a recipe, at values that are no defaults."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """The memory that importing a file of a gigabyte takes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Published state dicts under our names and back; what no layout can hold is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +10,7 @@ from golden_weights import published
 from qgs.components import TOKENGS
 from qgs.composer import Recipe, resolve
 from qgs.io.differences import shapes_of
-from qgs.io.published import (
-    PublishedError,
-    exact_names_of,
-    names_of,
-)
+from qgs.io.published import PublishedError, exact_names_of, names_of
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "model.decoder.depth=2")

@@ -1,7 +1,5 @@
 """Files of weights: what is read, and one clear reason for what is not."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path

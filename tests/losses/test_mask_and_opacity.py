@@ -1,26 +1,16 @@
 """The mask and opacity losses against the released code."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from qgs.contracts import Loss
 from qgs.losses import Mask, Opacity
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "loss_a.safetensors"
 TOLERANCE = {"rtol": 1e-4, "atol": 5e-5}
-
-
-@pytest.fixture(scope="module")
-def golden() -> dict[str, Tensor]:
-    return load_file(GOLDEN)
 
 
 def views_of(golden: dict[str, Tensor]) -> Views:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from qgs.metrics import mean_colour, nearest_input
+from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.types import Cameras, Views
 
 

@@ -8,7 +8,7 @@ import torch
 
 from qgs.contracts import MetricInput
 from qgs.engine.results import spread
-from qgs.metrics import OPACITY_USED, Dispersion, gaussians_used, token_dispersion
+from qgs.metrics.dispersion import OPACITY_USED, Dispersion, gaussians_used, token_dispersion
 from qgs.types import Cameras, Gaussians, Views
 
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "colors": (3,)}

@@ -6,8 +6,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from qgs.metrics import psnr, ssim
-from qgs.metrics.images import SsimCovariance
+from qgs.metrics.images import SsimCovariance, psnr, ssim
 
 
 def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, torch.Tensor]:

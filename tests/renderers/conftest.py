@@ -1,7 +1,5 @@
 """Scenes with well separated depths, and gradients of everything a renderer differentiates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 from importlib.util import find_spec

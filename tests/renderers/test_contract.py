@@ -1,8 +1,7 @@
 """What every renderer owes, checked against float64 autograd of the dense oracle."""
 
-from __future__ import annotations
-
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -96,85 +95,57 @@ def test_zero_gaussians_show_the_background(build, make_scene, differentiate):
     assert_finite(rendering, gradients)
 
 
-def behind(g: Gaussians) -> Gaussians:
-    return replace(g, means=g.means * torch.tensor([1.0, 1.0, -1.0]))
+FACTORS: dict[str, dict[str, tuple[float, ...]]] = {
+    "behind": {"means": (1.0, 1.0, -1.0)},
+    "at_the_eye": {"means": (0.0,)},
+    "huge": {"scales": (1e4,)},
+    "overflowing": {"scales": (1e12,)},
+    "tiny": {"scales": (1e-12,)},
+    "needles": {"scales": (10.0, 1e-6, 1e-6)},
+    "discs": {"scales": (10.0, 10.0, 1e-8)},
+    "transparent": {"opacities": (1e-9,)},
+    "invisible": {"opacities": (0.0,)},
+}
+OTHERS: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "on_the_near_plane": lambda g: replace(
+        g, means=g.means * torch.tensor([0.01, 0.01, 0.0]) + torch.tensor([0, 0, 0.025])
+    ),
+    "off_screen": lambda g: replace(g, means=g.means + torch.tensor([500.0, 0.0, 0.0])),
+    "opaque": lambda g: replace(g, opacities=torch.ones_like(g.opacities)),
+    "coincident": lambda g: replace(g, means=g.means[:, :1].expand_as(g.means).clone()),
+}
 
 
-def at_the_eye(g: Gaussians) -> Gaussians:
-    return replace(g, means=g.means * 0)
+def extreme(gaussians: Gaussians, change: str) -> Gaussians:
+    if change in OTHERS:
+        return OTHERS[change](gaussians)
+    ((name, factor),) = FACTORS[change].items()
+    return replace(gaussians, **{name: getattr(gaussians, name) * torch.tensor(factor)})
 
 
-def on_the_near_plane(g: Gaussians) -> Gaussians:
-    return replace(g, means=g.means * torch.tensor([0.01, 0.01, 0.0]) + torch.tensor([0, 0, 0.025]))
-
-
-def off_screen(g: Gaussians) -> Gaussians:
-    return replace(g, means=g.means + torch.tensor([500.0, 0.0, 0.0]))
-
-
-def huge(g: Gaussians) -> Gaussians:
-    return replace(g, scales=g.scales * 1e4)
-
-
-def overflowing(g: Gaussians) -> Gaussians:
-    return replace(g, scales=g.scales * 1e12)
-
-
-def tiny(g: Gaussians) -> Gaussians:
-    return replace(g, scales=g.scales * 1e-12)
-
-
-def needles(g: Gaussians) -> Gaussians:
-    return replace(g, scales=g.scales * torch.tensor([10.0, 1e-6, 1e-6]))
-
-
-def discs(g: Gaussians) -> Gaussians:
-    return replace(g, scales=g.scales * torch.tensor([10.0, 10.0, 1e-8]))
-
-
-def transparent(g: Gaussians) -> Gaussians:
-    return replace(g, opacities=g.opacities * 1e-9)
-
-
-def invisible(g: Gaussians) -> Gaussians:
-    return replace(g, opacities=g.opacities * 0)
-
-
-def opaque(g: Gaussians) -> Gaussians:
-    return replace(g, opacities=torch.ones_like(g.opacities))
-
-
-def coincident(g: Gaussians) -> Gaussians:
-    return replace(g, means=g.means[:, :1].expand_as(g.means).clone())
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        behind, at_the_eye, on_the_near_plane, off_screen, huge, overflowing, tiny, needles, discs,
-        transparent, invisible, opaque, coincident,
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("change", [*FACTORS, *OTHERS])
 def test_extreme_gaussians_stay_finite(build, make_scene, differentiate, change):
     gaussians, _ = make_scene(batch=2)
     camera = identity_camera()
     cameras = Cameras(camera.c2w.repeat(2, 1, 1, 1), camera.intrinsics.repeat(2, 1, 1), camera.size)
-    rendering, gradients = differentiate(build(), change(gaussians), cameras)
+    rendering, gradients = differentiate(build(), extreme(gaussians, change), cameras)
     assert_finite(rendering, gradients)
 
 
-@pytest.mark.parametrize("change", [behind, at_the_eye, off_screen, transparent, invisible])
+@pytest.mark.parametrize(
+    "change", ["behind", "at_the_eye", "off_screen", "transparent", "invisible"]
+)
 def test_what_cannot_be_seen_leaves_the_background(build, make_scene, differentiate, change):
     gaussians, _ = make_scene()
-    rendering, gradients = differentiate(build(), change(gaussians), identity_camera())
+    rendering, gradients = differentiate(build(), extreme(gaussians, change), identity_camera())
     assert rendering.alpha.eq(0).all()
     assert all(grad.eq(0).all() for grad in gradients.values())
 
 
-@pytest.mark.parametrize("change", [tiny, discs, opaque, coincident, huge])
+@pytest.mark.parametrize("change", ["tiny", "discs", "opaque", "coincident", "huge"])
 def test_extreme_gaussians_match_the_oracle(build, make_scene, differentiate, change):
     gaussians, _ = make_scene(count=12)
-    gaussians = change(gaussians)
+    gaussians = extreme(gaussians, change)
     cameras = identity_camera()
     found = differentiate(build(), gaussians, cameras)
     expected = differentiate(oracle(), gaussians.to(torch.float64), cameras.to(torch.float64))
@@ -320,10 +291,3 @@ def test_devices_must_agree(make_scene):
     gaussians, cameras = make_scene()
     with pytest.raises(ValueError, match="Gaussians are on meta, cameras on cpu"):
         oracle()(gaussians.to("meta"), cameras)
-
-
-def test_inputs_are_left_alone(build, make_scene):
-    gaussians, cameras = make_scene()
-    copies = {f.name: getattr(gaussians, f.name).clone() for f in fields(gaussians)}
-    build()(gaussians, cameras)
-    assert all(torch.equal(getattr(gaussians, name), copy) for name, copy in copies.items())

@@ -1,7 +1,5 @@
 """What is particular to `qgs/cpu`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

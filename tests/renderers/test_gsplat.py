@@ -1,7 +1,5 @@
 """`qgs/gsplat` and `qgs/auto` as far as a machine without a GPU can tell."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """The oracle itself, against formulas written out independently."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

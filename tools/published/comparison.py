@@ -1,7 +1,5 @@
 """How far two tensors are apart, and whether that is small enough."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -44,27 +42,15 @@ def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
     if found.shape != expected.shape:
         return Row(name, shape, problem=f"shape {tuple(found.shape)} here")
     ours, theirs = found.detach().double(), expected.double()
-    error = _error(ours, theirs)
-    nonzero = theirs != 0
-    relative = (error / theirs.abs()).nan_to_num(torch.inf)[nonzero & (error > 0)]
-    return Row(name, shape, _largest(error), _largest(relative), _verdict(ours, theirs))
-
-
-def _error(ours: Tensor, theirs: Tensor) -> Tensor:
-    """Absolute errors: 0 where both are the same infinity or NaN, infinite where one alone is."""
+    # 0 where both are the same infinity or NaN, infinite where one alone is.
     same = (ours == theirs) | (ours.isnan() & theirs.isnan())
-    return (ours - theirs).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0)
-
-
-def _largest(errors: Tensor) -> float:
-    return float(errors.max()) if errors.numel() else 0.0
-
-
-def _verdict(ours: Tensor, theirs: Tensor) -> str:
-    """Empty when every element is within rtol and atol; infinities and NaN must be the same."""
+    error = (ours - theirs).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0)
+    relative = (error / theirs.abs()).nan_to_num(torch.inf)[(theirs != 0) & (error > 0)]
+    absolute, relative = (float(x.max()) if x.numel() else 0.0 for x in (error, relative))
     close = torch.isclose(ours, theirs, rtol=RTOL, atol=ATOL, equal_nan=True)
     beyond = int((~close).sum())
-    return f"{beyond} of {close.numel()} beyond tolerance" if beyond else ""
+    problem = f"{beyond} of {close.numel()} beyond tolerance" if beyond else ""
+    return Row(name, shape, absolute, relative, problem)
 
 
 def table(rows: list[Row]) -> Iterator[str]:

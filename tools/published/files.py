@@ -1,7 +1,5 @@
 """A file of golden numbers: tensors, and in its metadata what they were computed with."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +10,6 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from published.idle_options import IDLE_OPTIONS
-from published.options import ReleasedOptions
 
 WEIGHTS = "weights."
 EXPECTED = "expected."
@@ -55,10 +52,6 @@ class GoldenFile:
             raise GoldenFileError(f"`{group}` must be a mapping of options, got {options!r}")
         return _Noting({**options, **(beside or {})}, self.known)
 
-    def released(self, group: str) -> ReleasedOptions:
-        """The published options in the metadata under `group`; raises as `options` does."""
-        return ReleasedOptions(self.options(group))
-
     def unknown_options(self) -> list[str]:
         """Options that nothing has read and that are not in IDLE_OPTIONS."""
         groups = (value for name, value in self.config.items() if name.endswith("options"))
@@ -77,10 +70,6 @@ class GoldenFile:
         self.read.add(name)
         tensor = self.tensors[name]
         return tensor.float() if tensor.is_floating_point() else tensor
-
-    def input_or(self, name: str, otherwise: Tensor) -> Tensor:
-        """The tensor to compute from, or `otherwise` where the file has none."""
-        return self.input(name) if name in self.tensors else otherwise
 
     def weights(self) -> dict[str, Tensor]:
         """The published state dict."""

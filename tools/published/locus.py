@@ -1,7 +1,5 @@
 """The recipe for the options of a LocusGS run (LocusGS release)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -3,11 +3,10 @@
 `refssim` means SSIM with zero padding ("same"), as in training here.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from qgs_locus.fields import CENTER
@@ -19,7 +18,7 @@ from published.options import ReleasedOptions
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
-from qgs.metrics import psnr
+from qgs.metrics.images import psnr
 from qgs.types import (
     Cameras,
     Gaussians,
@@ -43,7 +42,7 @@ class LossInputs(TensorContainer):
     target: Views
     has_mask: Tensor
 
-    def scenes(self) -> Iterator[LossInputs]:
+    def scenes(self) -> Iterator[Self]:
         """Each scene as a batch of one."""
         for index in range(len(self.has_mask)):
             yield map_tensors(lambda x, one=slice(index, index + 1): x[one], self)
@@ -63,7 +62,7 @@ def read_inputs(golden: GoldenFile, images: bool) -> LossInputs:
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
 
     def read(name: str, *shape: int) -> Tensor:
-        return golden.input(name) if images else golden.input_or(name, torch.ones(shape))
+        return golden.input(name) if images or name in golden.tensors else torch.ones(shape)
 
     views = cameras.c2w.shape[:2]
     colours, pixels = (*views, 3, *golden.size), (*views, 1, *golden.size)
@@ -98,7 +97,8 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     for threshold in _thresholds(golden):
         found |= _visibility(inputs, threshold)
     for release, ssim in wholes:
-        terms = _whole_loss(inputs, release, golden.released(f"{release}_options"), ssim)
+        options = ReleasedOptions(golden.options(f"{release}_options"))
+        terms = _whole_loss(inputs, release, options, ssim)
         found |= {f"{EXPECTED}{release}.{ssim}.{name}": term for name, term in terms.items()}
     return found
 

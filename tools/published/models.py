@@ -1,7 +1,5 @@
 """The model of a golden file: composed from the published options, filled with its weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

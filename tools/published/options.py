@@ -1,7 +1,5 @@
 """The options of a published training run; one that is missing or unknown is an error."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import isfinite
 from typing import Any, TypeVar

@@ -3,10 +3,9 @@
 tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import torch
@@ -20,14 +19,22 @@ from qgs.components import MultiViewViT
 from qgs.components.encoder import imagenet_normalised
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import DecoderLayer, QueryGaussianModel
-from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
+from qgs.types import Gaussians, ImageMemory, QueryState, Views
 
 
 @torch.no_grad()
 def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
     """Run `model` and return every tensor that a file can hold."""
-    found = ray_tensors(views.cameras) | {"images": imagenet_normalised(views.images)}
-    with _recording(model, found):
+    origins, directions = camera_rays(views.cameras)
+    found = {
+        "images": imagenet_normalised(views.images),
+        "rays_o": origins.movedim(-1, -3),  # channels before pixels
+        "rays_d": directions.movedim(-1, -3),
+        "plucker": plucker_rays(views.cameras),
+    }
+    with ExitStack() as stack:
+        for handle in _Recorder(model, found).handles():
+            stack.callback(handle.remove)
         prediction = model(views, layers=range(1, model.depth + 1))
     found["gaussians"] = _packed(prediction.gaussians)
     for number, layer in prediction.layers.items():
@@ -35,26 +42,8 @@ def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
     return found
 
 
-def ray_tensors(cameras: Cameras) -> dict[str, Tensor]:
-    """Rays of the input cameras, channels before pixels."""
-    origins, directions = camera_rays(cameras)
-    return {
-        "rays_o": origins.movedim(-1, -3),
-        "rays_d": directions.movedim(-1, -3),
-        "plucker": plucker_rays(cameras),
-    }
-
-
 def _packed(g: Gaussians) -> Tensor:
     return torch.cat([g.means, g.opacities[..., None], g.scales, g.quats, g.colors], -1)
-
-
-@contextmanager
-def _recording(model: QueryGaussianModel, found: dict[str, Tensor]) -> Iterator[None]:
-    with ExitStack() as stack:
-        for handle in _Recorder(model, found).handles():
-            stack.callback(handle.remove)
-        yield
 
 
 class _Recorder:
@@ -73,7 +62,7 @@ class _Recorder:
         yield encoder.register_forward_hook(self._memory)
         for index, layer in enumerate(self.model.decoder):
             assert isinstance(layer, DecoderLayer)
-            yield layer.register_forward_pre_hook(self._entering(index))
+            yield layer.register_forward_pre_hook(partial(self._entering, index))
             yield layer.cross_attention.register_forward_hook(self._cross_attention)
             yield layer.self_attention.register_forward_hook(self._self_attention)
             if isinstance(layer.self_attention, AnchorAwareSelfAttention):
@@ -90,13 +79,12 @@ class _Recorder:
         self.found["keys"], self.found["values"] = memory.keys, memory.values
         self.found["plucker_patch"] = memory.patch_rays
 
-    def _entering(self, index: int) -> Any:
-        def enter(module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-            self.layer = index
-            if index == 0:
-                self._state(args[0], 0)
-
-        return enter
+    def _entering(
+        self, index: int, module: nn.Module, args: tuple[QueryState, ImageMemory]
+    ) -> None:
+        self.layer = index
+        if index == 0:
+            self._state(args[0], 0)
 
     def _refined(self, module: nn.Module, args: Any, state: QueryState) -> None:
         self._state(state, self.layer + 1)

@@ -1,7 +1,5 @@
 """The recipe for the options of a TokenGS run (TokenGS release)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Anchors, refinement, decoding and head, each on its own."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -23,11 +21,6 @@ from qgs.geometry.transforms import quat_to_matrix
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
 HALF = math.sqrt(0.5)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def _state(batch: int = 2, count: int = 5) -> QueryState:

@@ -1,7 +1,5 @@
 """Every component keeps its contract, as `qgs check-plugin ellipsoid` says too."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

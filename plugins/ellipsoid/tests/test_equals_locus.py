@@ -1,7 +1,5 @@
 """With three equal radii and a shape that does not turn it is LocusGS, in every tensor."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -15,59 +13,34 @@ from qgs import Cameras, QueryGaussianModel, Views, compose
 from qgs.contracts import ModelDims
 from qgs.types import LayerPrediction
 
-LOCUS: dict[str, Any] = {
-    "recipe": 1,
-    "plugins": ["locus"],
-    "model": {
+
+def _recipe(
+    plugin: str, radius_refined: bool = True, bound: str = "floor", **refinement: Any
+) -> dict[str, Any]:
+    """A model of LocusGS or of ellipsoids. refinement: other options of it."""
+    radius = {"radius_bound": bound}
+    if not refinement:
+        refinement = {"radius": radius_refined, **(radius if radius_refined else {})}
+        refinement |= {"rotation": False} if plugin == "ellipsoid" else {}
+    centers = {"locus": "locus/radius_scaled", "ellipsoid": "ellipsoid/axis_scaled"}[plugin]
+    model = {
         "width": 48,
         "heads": 3,
         "encoder": {"depth": 1},
-        "queries": {"type": "locus/anchored", "count": 40, "std": 0.5, "init_radius": 0.4},
+        "queries": {"type": f"{plugin}/anchored", "count": 40, "std": 0.5, **radius},
         "decoder": {
             "depth": 3,
             "layer_scale": 0.5,
-            "cross_attention": {"type": "locus/ray_biased", "gamma_init": 0.5},
+            "cross_attention": {"type": f"{plugin}/ray_biased", "gamma_init": 0.5, **radius},
             "self_attention": {"type": "locus/anchor_aware"},
-            "refinement": {"type": "locus/refine"},
+            "refinement": {"type": f"{plugin}/refine", **refinement},
         },
         "head": {"gaussians_per_query": 4, "init_std": 0.1},
-        "centers": {"type": "locus/radius_scaled"},
+        "centers": {"type": centers, **radius},
         "supervision": {"layers": [1, 2, 3]},
         "renderer": {"type": "qgs/torch"},
-    },
-}
-
-
-def _ellipsoid(radius_refined: bool, bound: str) -> dict[str, Any]:
-    radius = {"radius_bound": bound}
-    model, decoder = LOCUS["model"], LOCUS["model"]["decoder"]
-    refined = {"rotation": False, "radius": radius_refined, **(radius if radius_refined else {})}
-    decoder = decoder | {
-        "cross_attention": {"type": "ellipsoid/ray_biased", "gamma_init": 0.5, **radius},
-        "refinement": {"type": "ellipsoid/refine", **refined},
     }
-    changed = {
-        "queries": {"type": "ellipsoid/anchored", "count": 40, "std": 0.5, **radius},
-        "decoder": decoder,
-        "centers": {"type": "ellipsoid/axis_scaled", **radius},
-    }
-    return {**LOCUS, "plugins": ["locus", "ellipsoid"], "model": model | changed}
-
-
-def _locus(radius_refined: bool, bound: str) -> dict[str, Any]:
-    radius = {"radius_bound": bound}
-    model, decoder = LOCUS["model"], LOCUS["model"]["decoder"]
-    refined = {"radius": radius_refined, **(radius if radius_refined else {})}
-    changed = {
-        "queries": model["queries"] | radius,
-        "decoder": decoder
-        | {
-            "cross_attention": decoder["cross_attention"] | radius,
-            "refinement": decoder["refinement"] | refined,
-        },
-        "centers": model["centers"] | radius,
-    }
-    return {**LOCUS, "model": model | changed}
+    return {"recipe": 1, "plugins": ["locus", "ellipsoid"], "model": model}
 
 
 def _photos() -> Views:
@@ -77,22 +50,23 @@ def _photos() -> Views:
     return Views(torch.rand(2, 2, 3, 32, 40), Cameras(c2w, lens.clone(), (32, 40)))
 
 
-def _pair(radius_refined: bool, bound: str) -> tuple[QueryGaussianModel, QueryGaussianModel]:
+def _pair(
+    radius_refined: bool = True, bound: str = "floor"
+) -> tuple[QueryGaussianModel, QueryGaussianModel]:
     """LocusGS whose radii differ from anchor to anchor, and its ellipsoidal equal."""
     torch.manual_seed(0)
-    locus = compose(_locus(radius_refined, bound))
+    locus = compose(_recipe("locus", radius_refined, bound))
     with torch.no_grad():
         locus.queries.raw_radius.normal_(-1.0, 1.0)
-    ellipsoid = compose(_ellipsoid(radius_refined, bound))
+    ellipsoid = compose(_recipe("ellipsoid", radius_refined, bound))
     ellipsoid.load_state_dict(from_locus(locus.state_dict()))
     return locus.eval(), ellipsoid.eval()
 
 
 def _tensors(layer: LayerPrediction) -> dict[str, Tensor]:
     """Everything that both models have."""
-    gaussians = vars(layer.gaussians)
-    state = {name: layer.state[name] for name in ("anchor.center",)}
-    return {**gaussians, **state, "features": layer.state.features}
+    state = {"anchor.center": layer.state["anchor.center"], "features": layer.state.features}
+    return {**vars(layer.gaussians), **state}
 
 
 @pytest.mark.parametrize("bound", ["floor", "offset"])
@@ -114,7 +88,7 @@ def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined: bool, bo
 
 
 def test_the_bias_of_every_layer_is_that_of_locusgs() -> None:
-    locus, ellipsoid = _pair(radius_refined=True, bound="floor")
+    locus, ellipsoid = _pair()
     memory = locus.encoder(_photos())
     ours, theirs = ellipsoid.queries(2), locus.queries(2)
     for mine, other in zip(ellipsoid.decoder, locus.decoder, strict=True):
@@ -140,7 +114,7 @@ def _like_locus(gradients: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def test_every_gradient_is_that_of_locusgs() -> None:
     seen = []
-    for model in (model.double() for model in _pair(radius_refined=True, bound="floor")):
+    for model in (model.double() for model in _pair()):
         torch.manual_seed(1)
         gaussians = model(_photos().to(torch.float64)).gaussians
         loss = sum((x * torch.randn_like(x)).sum() for x in vars(gaussians).values())
@@ -154,7 +128,7 @@ def test_every_gradient_is_that_of_locusgs() -> None:
 
 
 def test_it_is_locusgs_in_half_precision_too() -> None:
-    locus, ellipsoid = _pair(radius_refined=True, bound="floor")
+    locus, ellipsoid = _pair()
     photos = _photos()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         theirs, ours = (model(photos).gaussians for model in (locus, ellipsoid))
@@ -163,11 +137,8 @@ def test_it_is_locusgs_in_half_precision_too() -> None:
 
 
 def test_a_trained_locusgs_is_where_a_model_that_turns_can_start() -> None:
-    locus, _ = _pair(radius_refined=True, bound="floor")
-    recipe = _ellipsoid(radius_refined=True, bound="floor")
-    refinement = {"type": "ellipsoid/refine", "zero_init": True}
-    recipe["model"]["decoder"] = {**recipe["model"]["decoder"], "refinement": refinement}
-    turning = compose(recipe)
+    locus, _ = _pair()
+    turning = compose(_recipe("ellipsoid", zero_init=True))
     absent = turning.load_state_dict(from_locus(locus.state_dict()), strict=False)
     assert {name.rpartition(".fc")[0] for name in absent.missing_keys} == {
         "refinements.0.rotation_mlp"

@@ -1,7 +1,5 @@
 """Every option does what it says: each component, with options off their defaults, by formula."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -24,11 +22,6 @@ from qgs.types import Cameras, ImageMemory, QueryState
 DIMS = ModelDims(width=16, heads=2, depth=2)
 CHOSEN = {"sigma0": 0.3, "sigma_sq_min": 1e-5, "bias_min": -7.0, "gamma_init": 0.4}
 OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def _radii(raw: Tensor) -> Tensor:

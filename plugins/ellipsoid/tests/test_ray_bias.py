@@ -1,7 +1,5 @@
 """The factored bias against its definition, and the definition against a search along the ray."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest
@@ -21,11 +19,6 @@ from qgs_locus.ray_bias import ray_features as isotropic_features
 from torch import Tensor
 
 ONE = torch.ones((), dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 def _lines(count: int) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,5 @@
 """The factored bias against the formula of the paper, and its invariances."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from qgs_locus.ray_bias import BLOCK, ray_bias, ray_bias_direct, ray_features
@@ -15,11 +13,6 @@ def _rays(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
     directions = torch.nn.functional.normalize(torch.randn(2, count, 3, dtype=dtype), dim=-1)
     # Patch means are shorter than unit vectors.
     return torch.cat([torch.linalg.cross(origins, directions), directions], -1) * 0.97
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
 
 
 @pytest.mark.parametrize("bandwidth", ["radius", "fixed"])

@@ -30,10 +30,9 @@ def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, thread
 
     Raises ChildProcessError, with what the process said last, when it failed or was killed.
     """
-    order = {"tree": dict(recipe.tree), "operation": operation, "threads": threads}
-    order["workload"] = asdict(workload)
+    order = json.dumps([dict(recipe.tree), operation, asdict(workload), threads])
     command = [sys.executable, "-m", "qgs.engine.bench.memory"]
-    done = subprocess.run(command, input=json.dumps(order), capture_output=True, text=True)
+    done = subprocess.run(command, input=order, capture_output=True, text=True)
     if not done.returncode:
         return Peak(**json.loads(done.stdout))
     what = f"the process that measured the memory of the {operation}"
@@ -52,49 +51,36 @@ def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, thread
 def measure(
     tree: dict[str, Any], operation: Operation, workload: dict[str, Any], threads: int
 ) -> Peak:
-    """The peak of this process; see `peak_memory`.
-
-    Of training it is the second step's: the first one makes the optimiser's moments, and compiles
-    kernels, which takes memory that no later step needs.
-    """
+    """The peak of this process; see `peak_memory`."""
     torch.set_num_threads(threads)
     work = Workload(**{**workload, "size": tuple(workload["size"])})
     recipe = resolve(tree)
     on_gpu = work.device == "cuda"
     idle = 0 if on_gpu else resident_bytes("VmRSS")
     task = make_task(operation, recipe, recipe.build_model(work.device), work)
-    if operation == "step":
+    if operation == "step":  # the first one makes the optimiser's moments and compiles kernels
         task()
-        _forget_peak(on_gpu)
+        restart = Path("/proc/self/clear_refs")
+        if on_gpu:
+            torch.cuda.reset_peak_memory_stats()
+        elif restart.exists():  # on Linux
+            restart.write_text("5")
     task()
     return Peak(torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM"), idle)
 
 
 def resident_bytes(field: str) -> int:
-    """Bytes resident now (VmRSS) or at most so far (VmHWM) of this process.
-
-    Linux has both in /proc. Elsewhere ru_maxrss stands for both; on Linux it would count the parent
-    of a spawned process.
-    """
+    """Bytes resident now (VmRSS) or at most so far (VmHWM); the latter for both outside Linux."""
     status = Path("/proc/self/status")
     if status.exists():
         lines = status.read_text().splitlines()
         (kibibytes,) = (line.split()[1] for line in lines if line.startswith(f"{field}:"))
         return int(kibibytes) * 1024
-    import resource  # Windows has none
+    import resource  # Windows has none; on Linux it would count the parent of a spawned process
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def _forget_peak(on_gpu: bool) -> None:
-    """Start a new peak; on systems without Linux's /proc the old one stays."""
-    switch = Path("/proc/self/clear_refs")
-    if on_gpu:
-        torch.cuda.reset_peak_memory_stats()
-    elif switch.exists():
-        switch.write_text("5")
-
-
 if __name__ == "__main__":
-    json.dump(asdict(measure(**json.load(sys.stdin))), sys.stdout)
+    json.dump(asdict(measure(*json.load(sys.stdin))), sys.stdout)

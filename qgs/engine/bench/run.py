@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from operator import truediv
 from pathlib import Path
 from typing import Any
 
@@ -18,104 +19,25 @@ import qgs
 from qgs.composer import Recipe
 from qgs.engine.bench.memory import Peak, peak_memory
 from qgs.engine.bench.work import Operation, Task, Workload, make_task
-from qgs.io.files import write_text
 
 KIND = "qgs bench"
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Samples, their median and their lower and upper quartile (linear interpolation)."""
-
-    samples: tuple[float, ...]
-
-    @property
-    def quartiles(self) -> tuple[float, float, float]:
-        """Lower quartile, median, upper quartile."""
-        return tuple(np.quantile(self.samples, (0.25, 0.5, 0.75)).tolist())
-
-    def over(self, base: Spread) -> Spread:
-        """Ratios to the samples that `base` has of the same rounds."""
-        pairs = zip(self.samples, base.samples, strict=True)
-        return Spread(tuple(ours / theirs for ours, theirs in pairs))
-
-    def as_json(self) -> dict[str, float]:
-        """The quartiles by name."""
-        lower, median, upper = self.quartiles
-        return {"lower_quartile": lower, "median": median, "upper_quartile": upper}
-
-
-@dataclass(frozen=True)
 class Subject:
-    """What is measured: a recipe, by the name that the report gives it, with its workload."""
+    """A recipe to measure. name: in the report."""
 
     name: str
     recipe: Recipe
     workload: Workload
 
 
-@dataclass(frozen=True)
-class Result:
-    """One recipe. weight_bytes: of all parameters and saved buffers. times: seconds per call."""
-
-    recipe: str
-    workload: Workload
-    queries: int
-    gaussians: int
-    parameters: int
-    weight_bytes: int
-    times: Mapping[Operation, Spread]
-    peaks: Mapping[Operation, Peak]
-
-    def as_json(self, base: Result) -> dict[str, Any]:
-        """Everything, each sample included; seconds, bytes, and ratios to `base`."""
-        ratio = self.parameters / base.parameters
-        sizes = {"count": self.parameters, "weight_bytes": self.weight_bytes, "ratio": ratio}
-        return {
-            "recipe": self.recipe,
-            **asdict(self.workload),
-            "queries": self.queries,
-            "gaussians": self.gaussians,
-            "parameters": sizes,
-            "seconds": {
-                operation: {
-                    **spread.as_json(),
-                    "samples": [*spread.samples],
-                    "ratio": spread.over(base.times[operation]).as_json(),
-                }
-                for operation, spread in self.times.items()
-            },
-            "memory": {
-                o: {**asdict(peak), "ratio": peak.peak_bytes / base.peaks[o].peak_bytes}
-                for o, peak in self.peaks.items()
-            },
-        }
-
-
-@dataclass(frozen=True)
-class Report:
-    """All results, the first of which the others are compared with. machine: see `describe`."""
-
-    results: Sequence[Result]
-    machine: Mapping[str, str | int]
-    overrides: Sequence[str]
-    rounds: int
-    warmup: int
-
-    def write(self, path: str | Path) -> None:
-        """Write the report as JSON, whole or not at all."""
-        settings = {"overrides": [*self.overrides], "rounds": self.rounds, "warmup": self.warmup}
-        recipes = [result.as_json(self.results[0]) for result in self.results]
-        report = {"report": KIND, "machine": dict(self.machine), **settings, "recipes": recipes}
-        write_text(path, json.dumps(report, indent=2) + "\n")
-
-
 def refuse_other_file(path: Path) -> None:
     """Raise FileExistsError when `path` holds anything but an earlier report."""
-    if not path.exists():
-        return
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return
     except (OSError, ValueError):
         found = None
     if not isinstance(found, dict) or found.get("report") != KIND:
@@ -134,49 +56,78 @@ def bench(
     warmup: int = 2,
     overrides: Sequence[str] = (),
     say: Callable[[str], None] = lambda _: None,
-) -> Report:
+) -> dict[str, Any]:
     """Measure size and forward latency of all `subjects`, which share device and precision.
 
-    All models are in memory while latencies are measured, so that each round has all of them. They
-    have their initial weights. step, memory, renderer: what is measured besides. rounds: samples of
-    each latency. warmup: calls before the first sample. overrides: what the report says of them.
-    `say` hears what is under way. Raises ValueError as the models, losses and renderers do,
-    ChildProcessError as `peak_memory`.
+    All models, with initial weights, are in memory while latencies are measured, so that each round
+    has all of them. step, memory, renderer: what is measured besides. rounds: samples of each
+    latency. warmup: calls before the first sample. overrides: what the report says of them. `say`
+    hears what is under way. Returns the report, plain values for JSON: seconds with every sample,
+    bytes, and ratios to the first subject, those of latencies round by round.
+    Raises ValueError as the models, losses and renderers do, ChildProcessError as `peak_memory`.
     """
     threads = torch.get_num_threads()
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
     peaks: list[dict[Operation, Peak]] = [{} for _ in subjects]
-    for subject, found in zip(subjects, peaks, strict=True):
+    for s, found in zip(subjects, peaks, strict=True):
         for operation in operations if memory else ():
-            say(f"{subject.name}: memory of the {operation}")
-            found[operation] = peak_memory(subject.recipe, operation, subject.workload, threads)
+            say(f"{s.name}: memory of the {operation}")
+            found[operation] = peak_memory(s.recipe, operation, s.workload, threads)
     if renderer:
         operations.insert(1, "render")  # the step is last, because it changes weights
     models = [subject.recipe.build_model(subject.workload.device) for subject in subjects]
-    times: list[dict[Operation, Spread]] = [{} for _ in subjects]
+    times: list[dict[Operation, list[float]]] = [{} for _ in subjects]
     for operation in operations:
-        tasks = [
-            make_task(operation, subject.recipe, model, subject.workload)
-            for subject, model in zip(subjects, models, strict=True)
-        ]
-        spreads = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
-        for column, spread in zip(times, spreads, strict=True):
-            column[operation] = spread
-    results = [
-        Result(
-            recipe=subject.name,
-            workload=subject.workload,
-            queries=model.queries.count,
-            gaussians=model.queries.count * model.head.gaussians_per_query,
-            parameters=sum(p.numel() for p in model.parameters()),
-            weight_bytes=sum(t.numel() * t.element_size() for t in model.state_dict().values()),
-            times=seconds,
-            peaks=peak,
+        pairs = zip(subjects, models, strict=True)
+        tasks = [make_task(operation, s.recipe, model, s.workload) for s, model in pairs]
+        columns = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
+        for found, column in zip(times, columns, strict=True):
+            found[operation] = column
+    counts = [sum(p.numel() for p in model.parameters()) for model in models]
+    weights = [sum(t.nbytes for t in model.state_dict().values()) for model in models]
+    recipes = [
+        {
+            "recipe": subject.name,
+            **asdict(subject.workload),
+            "queries": model.queries.count,
+            "gaussians": model.queries.count * model.head.gaussians_per_query,
+            "parameters": {"count": count, "weight_bytes": size, "ratio": count / counts[0]},
+            "seconds": {
+                operation: {
+                    **quartiles(samples),
+                    "samples": samples,
+                    "ratio": quartiles(list(map(truediv, samples, times[0][operation]))),
+                }
+                for operation, samples in seconds.items()
+            },
+            "memory": {
+                o: {**asdict(peak), "ratio": peak.peak_bytes / peaks[0][o].peak_bytes}
+                for o, peak in found.items()
+            },
+        }
+        for subject, model, count, size, seconds, found in zip(
+            subjects, models, counts, weights, times, peaks, strict=True
         )
-        for subject, model, seconds, peak in zip(subjects, models, times, peaks, strict=True)
     ]
-    machine = describe(subjects[0].workload.device, threads)
-    return Report(results, machine, overrides, rounds, warmup)
+    device = subjects[0].workload.device
+    machine = {
+        "device": device,
+        "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
+        "cores": os.cpu_count() or 0,
+        "threads": threads,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "qgs": qgs.__version__,
+    }
+    settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
+    return {"report": KIND, "machine": machine, **settings, "recipes": recipes}
+
+
+def quartiles(samples: Sequence[float]) -> dict[str, float]:
+    """Quartiles by name (linear interpolation)."""
+    names = ("lower_quartile", "median", "upper_quartile")
+    return dict(zip(names, np.quantile(samples, (0.25, 0.5, 0.75)).tolist(), strict=True))
 
 
 def in_turn(
@@ -185,11 +136,10 @@ def in_turn(
     warmup: int,
     say: Callable[[str], None] = lambda _: None,
     label: str = "",
-) -> list[Spread]:
+) -> list[list[float]]:
     """Seconds of each task: `warmup` calls of each unmeasured, then all of them in every round.
 
-    The clock is that of torch.utils.benchmark, which waits for a GPU. `say` hears of each round,
-    with `label` before.
+    torch.utils.benchmark's clock waits for a GPU. `say` hears of each round, after `label`.
     """
     for number in range(warmup):
         say(f"{label}warm-up {number + 1} of {warmup}")
@@ -202,25 +152,10 @@ def in_turn(
             start = timer()
             task()
             column.append(timer() - start)
-    return [Spread(tuple(column)) for column in columns]
-
-
-def describe(device: str, threads: int) -> dict[str, str | int]:
-    """Names and versions without which a number says nothing."""
-    return {
-        "device": device,
-        "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
-        "cores": os.cpu_count() or 0,
-        "threads": threads,
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "qgs": qgs.__version__,
-    }
+    return columns
 
 
 def _processor() -> str:
-    """The CPU's name, where the system gives it."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

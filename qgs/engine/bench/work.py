@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import nn
@@ -16,8 +16,6 @@ from qgs.engine.objective import Objective
 from qgs.engine.optimizer import make_optimizer
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
-
-Precision: TypeAlias = Literal["float32", "bf16"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Workload:
     size: tuple[int, int]
     batch: int = 1
     device: str = "cpu"
-    precision: Precision = "float32"
+    precision: Literal["float32", "bf16"] = "float32"
 
     def autocast(self) -> torch.autocast:
         """The context in which the model runs."""
@@ -48,17 +46,11 @@ class Workload:
 
 
 def workload_of(
-    recipe: Recipe,
-    *,
-    views: int | None = None,
-    size: tuple[int, int] | None = None,
-    batch: int = 1,
-    device: str = "cpu",
-    precision: Precision = "float32",
+    recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
 ) -> Workload:
     """The workload of `recipe`: its `views` and `data.image_size`, unless given here.
 
-    Raises ValueError when nothing says how large the images are.
+    more: further fields. Raises ValueError when nothing says how large the images are.
     """
     data = recipe.parts.get(("data",))
     if size is None and data is not None and isinstance(data.config, SceneSourceConfig):
@@ -68,9 +60,7 @@ def workload_of(
             "the recipe has no data.image_size, so the size of the photos is not known; "
             "give one with --size HxW, such as --size 256x256"
         )
-    return Workload(
-        views or recipe.views.inputs, recipe.views.targets, size, batch, device, precision
-    )
+    return Workload(views or recipe.views.inputs, recipe.views.targets, size, **more)
 
 
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
@@ -106,7 +96,19 @@ def make_task(
     """
     inputs, targets = workload.inputs(), workload.supervision()
     if operation == "step":
-        return _step(recipe, model.train(), inputs, targets, workload)
+        losses, render_views = recipe.build_losses(), recipe.training.render_views
+        objective = Objective(model.train(), losses, render_views).to(workload.device)
+        optimizer = make_optimizer(objective, recipe.build_optimizer())
+
+        def step() -> None:
+            optimizer.zero_grad(set_to_none=True)
+            with workload.autocast():
+                outcome = objective(inputs, targets)
+            outcome.total.backward()
+            nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
+            optimizer.step()
+
+        return step
     model.eval()
 
     @torch.inference_mode()
@@ -118,21 +120,3 @@ def make_task(
         return forward
     gaussians = forward()
     return torch.inference_mode()(lambda: model.render(gaussians, targets.cameras))
-
-
-def _step(
-    recipe: Recipe, model: QueryGaussianModel, inputs: Views, targets: Views, workload: Workload
-) -> Task:
-    losses, render_views = recipe.build_losses(), recipe.training.render_views
-    objective = Objective(model, losses, render_views).to(workload.device)
-    optimizer = make_optimizer(objective, recipe.build_optimizer())
-
-    def step() -> None:
-        optimizer.zero_grad(set_to_none=True)
-        with workload.autocast():
-            outcome = objective(inputs, targets)
-        outcome.total.backward()
-        nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
-        optimizer.step()
-
-    return step

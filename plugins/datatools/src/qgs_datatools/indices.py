@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from upath import UPath
 
-from qgs.data.evaluation import GIVEN, IndexEntry, read_index
+from qgs.data.evaluation import GIVEN, IndexEntry, given_targets, read_index
 from qgs_datatools.findings import Finding, spans
 
 
@@ -79,6 +79,6 @@ def _entry_findings(
                 "correct the index, or add the missing frames to the scene",
                 outside,
             )
-    if entry.both:
+    if given := given_targets(entry.context, entry.target):
         fix = "judge models on frames that they are not given"
-        yield Finding(name, f"the index {file} has {GIVEN}", fix, entry.both, severity="warning")
+        yield Finding(name, f"the index {file} has {GIVEN}", fix, given, severity="warning")
