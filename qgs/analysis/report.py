@@ -109,10 +109,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A heading, a paragraph, and figures below the name of their model.
-
-    width: least width of a figure on the page, CSS pixels.
-    """
+    """A heading, a text, and figures by model, at least `width` CSS pixels wide."""
 
     title: str
     text: str
@@ -151,10 +148,7 @@ def _uri(image: Picture | list[Picture]) -> str:
 def scene_columns(
     contenders: Sequence[Contender], sample: Sample, depth: Tensor | None
 ) -> dict[str, Any]:
-    """Of one unseen scene the name, the input photos, and by heading: truth, renders, depths.
-
-    depth: the true one (T, 1, H, W), where it is known.
-    """
+    """Name, inputs and columns of pictures of a scene. depth: the true one (T, 1, H, W)."""
     shown = sample.targets.select(slice(TARGETS))
     frames = [f"frame {frame}" for frame in (*sample.input_frames, *sample.target_frames)]
     inputs = len(sample.input_frames)
@@ -214,10 +208,7 @@ def tokens(shown: Shown, sample: Sample) -> ReportSection:
 
 
 def anchors(shown: Shown, sample: Sample) -> ReportSection:
-    """Supports on the first input view, before the decoder and after each layer.
-
-    Queries without a place in space have none.
-    """
+    """Supports on the first input view, before the decoder and after each layer."""
     figures: dict[str, list[Tile]] = {}
     camera = sample.inputs.cameras[:, :1]
     photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE)

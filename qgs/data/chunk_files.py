@@ -98,10 +98,7 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """The scene that `data`, an entry of the chunk `file`, describes; numbers are not judged.
-
-    Raises ValueError, naming key and entry, where its structure is not that of the format.
-    """
+    """The scene in an entry of the chunk `file`. Raises ValueError for another structure."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {_described(data)}, expected a mapping with 'key', 'cameras' and "

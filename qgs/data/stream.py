@@ -105,10 +105,7 @@ class SceneOrder:
 
 
 class SampleStream:
-    """Training samples of `source` by number; sample k depends on (seed, k) alone.
-
-    Raises ValueError when the source has no training scenes.
-    """
+    """Samples by number, each of (seed, number) alone. Raises ValueError without scenes."""
 
     def __init__(self, source: SceneSource, views: ViewsConfig, seed: int) -> None:
         self._views, self._seed = views, seed
@@ -118,10 +115,7 @@ class SampleStream:
         self.order = SceneOrder(source.groups("train"), len(self._scenes), seed)
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """The samples of these numbers, counted from 0 over all epochs.
-
-        Raises ValueError for a scene with too few frames, else SampleError.
-        """
+        """Samples by number. Raises ValueError for too few frames in a scene, else SampleError."""
         return collate([self._sample(number) for number in numbers])
 
     def _sample(self, number: int) -> Sample:
@@ -198,10 +192,7 @@ def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
 
 
 def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batch, None, None]:
-    """Batches start, start + 1, ..., made by `workers` processes; closing ends them.
-
-    They are spawned: threads of numba and torch do not survive a fork.
-    """
+    """Batches from `start` on by spawned processes: numba and torch do not survive a fork."""
     loader = DataLoader(
         batches,
         batch_size=None,

@@ -142,10 +142,7 @@ class Token:
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Blending weight of each Gaussian, summed over all pixels of all cameras: (B, G), in pixels.
-
-    A render is linear in the colours, so this is the gradient of its sum, for any renderer.
-    """
+    """Blending weight (B, G) over all pixels: the gradient of a render's sum by the colours."""
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
         rgb = model.render(replace(gaussians, colors=colors), cameras).rgb
@@ -183,10 +180,7 @@ def notable_tokens(
 def token_picture(
     model: QueryGaussianModel, gaussians: Gaussians, tokens: Sequence[Token], cameras: Cameras
 ) -> Picture:
-    """The scene in pale grey, the Gaussians of `tokens` in their colours, on top of everything.
-
-    cameras (1, 1). Lines join each Gaussian in front of the camera to its token's centroid.
-    """
+    """The Gaussians of `tokens` in colour with lines to centroids, over a grey scene; (1, 1)."""
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = gaussians.count // model.queries.count
     members = [range(t.query * per_query, (t.query + 1) * per_query) for t in tokens]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from training_runs import Tiny
+from training_runs import Tiny, tensorboard_events
 
 from qgs.contracts.component import MissingExtraError
 from qgs.engine import tracking as trackers
@@ -30,15 +30,13 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
 def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     tracking = Trackers(("tensorboard",))
     tracking.open(tmp_path, tiny("locus"))
     for step in (1, 2):
         tracking.log({"loss": 1 / step, "psnr": 20.0 + step}, step)
     tracking.picture("evaluation", picture(), 2)
     tracking.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    events = tensorboard_events(tmp_path)
     found = [(event.step, event.value) for event in events.Scalars("loss")]
     assert found == [(1, 1.0), (2, 0.5)]
     (image,) = events.Images("evaluation")
@@ -49,15 +47,13 @@ def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Pat
 
 def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     for first, value in ((1, 1.0), (3, 2.0)):
         tracking = Trackers(("tensorboard",))
         tracking.open(tmp_path, tiny("locus"), step=first - 1)
         for step in range(first, 5):
             tracking.log({"loss": value}, step)
         tracking.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("loss")
+    events = tensorboard_events(tmp_path).Scalars("loss")
     assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
 
 

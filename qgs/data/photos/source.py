@@ -71,10 +71,7 @@ def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
 
 
 class PhotoScene(EncodedScene):
-    """The photos of one listing, in its order. World: that of the listing's poses.
-
-    cache: an `image_cache` shared by scenes of different names. Raises as `present_frames`.
-    """
+    """A listing's photos, in its world and order. cache: shared. Raises as `present_frames`."""
 
     def __init__(
         self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
@@ -300,10 +297,7 @@ def read_photos(
     frames: Sequence[int] | None = None,
     format: Format = "auto",
 ) -> Views:
-    """Views (1, V) of a photo folder, in the world of its poses; all frames unless some are named.
-
-    Raises FileNotFoundError and ValueError as `PhotosSource`, IndexError for frames out of range.
-    """
+    """Views (1, V) of a folder, in its poses' world. Raises as `PhotosSource`, and IndexError."""
     folder = opened_path(path)
     config = PhotosConfig(path=str(path), image_size=image_size, format=format)
     scene = PhotoScene(folder_name(folder), folder, config, image_cache())

@@ -17,10 +17,7 @@ from qgs_datatools.conventions import Convention
 
 @dataclass(frozen=True)
 class Photo:
-    """listed: as the listing says, with the faults that parsing found. read: the file's bytes.
-
-    exists, mask_exists: whether the files that are listed are there.
-    """
+    """A listed photo, what reads its bytes, and whether it and its mask exist."""
 
     listed: PhotoFrame
     read: Callable[[], bytes]

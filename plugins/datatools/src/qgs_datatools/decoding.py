@@ -28,10 +28,7 @@ _COPY = re.compile(r"images_\d+")
 
 @dataclass(frozen=True)
 class Decoded:
-    """size: (H, W); None for a photo that is missing or cannot be decoded. digest: of its bytes.
-
-    error, mask_error: why the photo and its mask cannot be; None where they can or do not exist.
-    """
+    """size: (H, W), None where it cannot be decoded. digest: of the bytes. Errors in words."""
 
     size: Size | None = None
     digest: bytes = b""

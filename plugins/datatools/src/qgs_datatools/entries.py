@@ -47,10 +47,7 @@ def _file(pixels: np.ndarray, **options: Any) -> bytes:
 
 
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
-    """The frames of a scene in order, and whether each keeps its original bytes.
-
-    Every image is decoded, so that none is packed that cannot be read. Raises as the scene does.
-    """
+    """The decodable frames in order, and whether each keeps its bytes. Raises as the scene."""
     for index in range(len(scene)):
         if isinstance(scene, EncodedScene) and not encoding.resized:
             yield _stored(scene, index, encoding)

@@ -102,10 +102,7 @@ class Pair:
         return np.stack([b @ fundamental, a @ fundamental.T])
 
     def distance(self, reading: Reading = np.asarray) -> float:
-        """Median distance of matches to their lines, both photos' mean, if poses are meant so.
-
-        A fraction of the diagonal. Two cameras on one point have no epipolar lines: 0.
-        """
+        """Median distance of matches to their lines, of the diagonal; 0 without a baseline."""
         lines = self.lines(reading)
         length = np.linalg.norm(lines[..., :2], axis=-1)
         off = np.abs((_homogeneous(self.matches) * lines).sum(-1))

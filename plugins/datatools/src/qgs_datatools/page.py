@@ -79,10 +79,7 @@ def _pictured(scene: SceneReport) -> _Pictured:
 
 
 def frusta_figure(scene: SceneReport) -> Figure | None:
-    """The cameras that have sound poses, at most 120 of them; None where there is none.
-
-    The figure's vertical axis is the mean of the cameras' up axes.
-    """
+    """At most 120 cameras with sound poses, their mean up axis upwards; None without any."""
     if not len(scene.c2w):
         return None
     kept = np.unique(np.linspace(0, len(scene.c2w) - 1, _CAMERAS).round().astype(int))
@@ -156,10 +153,7 @@ def _frame(axes: Any, points: np.ndarray) -> None:
 
 
 def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
-    """Both photos, in each the matches as dots and the line on which the poses want them.
-
-    A dot off its line of the same colour is what a wrong pose looks like.
-    """
+    """Both photos with matches as dots, and the lines on which the poses want them."""
     chosen = _spread(pair.matches[0], _MATCHES)
     points, lines = pair.matches[:, chosen], pair.lines()[:, chosen]
     height, width = pair.size
