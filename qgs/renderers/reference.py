@@ -102,7 +102,7 @@ class TorchRenderer(Renderer):
             splats = project(gaussians, cameras, config.near, config.far, config.dilation)
             sums = [
                 _composite(splats, gaussians, image, cameras.size, config)
-                for image in product(*map(range, cameras.shape))
+                for image in product(range(cameras.shape[0]), range(cameras.shape[1]))
             ]
             sums = torch.stack(sums).reshape(*cameras.shape, 5, *cameras.size)
             return resolve(sums, backdrop)
