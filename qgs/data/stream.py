@@ -149,11 +149,7 @@ class _Failure:
 
 
 class _Batches(Dataset[Batch | _Failure]):
-    """The batches of one process by number.
-
-    A copy in a worker opens the data itself when it is first used: no scene travels, and what fails
-    then is told as any failure.
-    """
+    """The batches of one process; a copy in a worker opens the data itself when first used."""
 
     def __init__(
         self, source: SceneSource, views: ViewsConfig, seed: int, batch_size: int, share: Share
@@ -239,15 +235,13 @@ def _prepare_worker(number: int) -> None:
 class Feed:
     """The batches of the next optimiser step, or the error that fetching them raised.
 
-    They are fetched before the present step is over, so that processes can tell each other of a
-    failure where they exchange numbers anyway; one that ended alone would leave the others waiting.
+    Fetched within the present step, so that processes tell each other of failures at its end.
     """
 
     def __init__(self, stream: Iterator[Batch], count: int) -> None:
         self.batches: Sequence[Batch] = ()
         self.error: Exception | None = None
-        self._stream = stream
-        self._count = count
+        self._stream, self._count = stream, count
 
     def fetch(self) -> None:
         """Get the `count` batches of the next step; none, and `error`, when that fails."""

@@ -130,14 +130,12 @@ class PhotoScene(EncodedScene):
         """See `EncodedScene`."""
         listed = self._frames[frame]
         size = _checked(image_size(listed.path), listed, listed.path)
-        mask = None
+        buffer = io.BytesIO()
         if listed.mask is not None:
-            buffer = io.BytesIO()
             Image.fromarray(_whole_mask(listed)).save(buffer, "png")
-            mask = buffer.getvalue()
         return EncodedFrame(
             listed.name, listed.path.read_bytes(), listed.c2w, listed.at_size(size), size,
-            listed.lens, mask, self._config.background,
+            listed.lens, buffer.getvalue() or None, self._config.background,
         )  # fmt: skip
 
     def _stacked(

@@ -79,11 +79,7 @@ def sharing_findings(
 
 
 def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
-    """How far apart two cameras, and all cameras, may be on one point, in the world's units.
-
-    Coordinates are as precise as the format, or as the rotations beside them; far from the origin
-    such errors exceed the steps between cameras, so that the extent bounds what is one place.
-    """
+    """How far two cameras, and all, may be apart on one point, given their poses' precision."""
     rotations, centres = poses[:, :3, :3], poses[:, :3, 3]
     off_rigid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     distance, extent = np.abs(centres).max(), np.ptp(centres, axis=0).max()

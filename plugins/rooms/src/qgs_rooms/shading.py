@@ -201,11 +201,7 @@ def _light(lights, floor, size, code, x, y, z, normal):
 
 @njit(forceinline=True, **INNER)
 def _gather(t, code, i, j, own, samples, step, top, o, rays, points):
-    """Write where those rays of the pixel that begins at ray (i, j) hit that meet surface `own`.
-
-    Row 0 of `points` gets the mean, the next rows the points themselves, whose number is returned.
-    The rays are marked as taken.
-    """
+    """Write where rays of the pixel at (i, j) hit surface `own`, the mean in row 0; count them."""
     n = 0
     x = y = z = 0.0
     for a in range(samples):
