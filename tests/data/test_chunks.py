@@ -260,6 +260,15 @@ def test_an_index_does_not_lead_outside(tmp_path):
         opened(tmp_path)
 
 
+def test_folders_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        opened(tmp_path / "nothing")
+    with pytest.raises(FileNotFoundError, match=r"holds no chunks.*qgs data pack"):
+        opened(tmp_path)
+    with pytest.raises(ValueError, match="cannot be opened as a path or URL"):
+        opened("nosuch://bucket")
+
+
 def test_code_in_a_chunk_is_not_run(tmp_path):
     class Payload:
         def __reduce__(self):
@@ -269,15 +278,6 @@ def test_code_in_a_chunk_is_not_run(tmp_path):
     with pytest.raises(ValueError, match="cannot be read as a torch file"):
         load_chunk(UPath(tmp_path / "a.torch"))
     assert not (tmp_path / "made").exists()
-
-
-def test_folders_that_are_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        opened(tmp_path / "nothing")
-    with pytest.raises(FileNotFoundError, match=r"holds no chunks.*qgs data pack"):
-        opened(tmp_path)
-    with pytest.raises(ValueError, match="cannot be opened as a path or URL"):
-        opened("nosuch://bucket")
 
 
 def test_a_chunk_with_python_objects_is_told_without_torchs_advice(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def started(recipe: Recipe) -> tuple[QueryGaussianModel, list[str]]:
 
 
 @pytest.fixture
-def learned(tiny: Tiny, tmp_path: Path) -> Callable[..., Recipe]:
+def learned(tiny: Tiny, tmp_path: Path) -> Tiny:
     """`learned("locus", "a.b=c")`: that tiny model, from a checkpoint of another seed."""
 
     def make(name: str, *options: str, of: str = "") -> Recipe:
@@ -53,7 +52,7 @@ def old_weights(recipe: Recipe) -> dict[str, Tensor]:
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 @pytest.mark.parametrize("count", [25, 60, 96])
 def test_old_queries_stay_and_new_ones_are_noisy_copies(
-    learned: Callable[..., Recipe], name: str, count: int
+    learned: Tiny, name: str, count: int
 ) -> None:
     recipe = learned(name, f"model.queries.count={count}")
     model, told = started(recipe)
@@ -81,7 +80,7 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_shrinking_keeps_the_first(learned: Callable[..., Recipe], name: str) -> None:
+def test_shrinking_keeps_the_first(learned: Tiny, name: str) -> None:
     recipe = learned(name, "model.queries.count=10")
     model, told = started(recipe)
     for parameter in PER_QUERY[name]:
@@ -90,14 +89,14 @@ def test_shrinking_keeps_the_first(learned: Callable[..., Recipe], name: str) ->
     assert "queries.features: 24 -> 10, the first are kept" in told
 
 
-def test_the_same_size_is_taken_as_it_is(learned: Callable[..., Recipe]) -> None:
+def test_the_same_size_is_taken_as_it_is(learned: Tiny) -> None:
     recipe = learned("locus")
     model, told = started(recipe)
     assert same(model.state_dict(), old_weights(recipe))
     assert told == [f"weights start from {recipe.tree['init_from']}"]
 
 
-def test_the_recipes_seed_decides_the_noise(learned: Callable[..., Recipe]) -> None:
+def test_the_recipes_seed_decides_the_noise(learned: Tiny) -> None:
     def features(seed: int) -> torch.Tensor:
         torch.rand(seed)  # the global random state plays no part
         model, _ = started(learned("tokengs", "model.queries.count=30", f"seed={seed}"))
@@ -116,7 +115,7 @@ def test_a_recipe_without_it_starts_from_its_own_seed(tiny: Tiny) -> None:
 
 
 def test_queries_may_have_a_rule_of_their_own(
-    learned: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+    learned: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def doubled(queries: Queries, learned: dict[str, Tensor], _: Generator) -> dict[str, Tensor]:
         return {name: torch.cat([values, values]) for name, values in learned.items()}
@@ -127,9 +126,7 @@ def test_queries_may_have_a_rule_of_their_own(
     assert torch.equal(features, old_weights(recipe)["queries.features"].repeat(2, 1))
 
 
-def test_every_difference_is_told_with_the_options_that_fit(
-    learned: Callable[..., Recipe],
-) -> None:
+def test_every_difference_is_told_with_the_options_that_fit(learned: Tiny) -> None:
     options = (GAUSSIANS, "queries.count=48", "head.norm=false")
     recipe = learned("tokengs", *(f"model.{option}" for option in options))
     model = recipe.build_model()
@@ -149,7 +146,7 @@ def test_every_difference_is_told_with_the_options_that_fit(
     assert same(model.state_dict(), before)
 
 
-def test_a_refusal_lists_no_options_that_play_no_part(learned: Callable[..., Recipe]) -> None:
+def test_a_refusal_lists_no_options_that_play_no_part(learned: Tiny) -> None:
     idle = ("queries.std=0.3", "queries.init_radius=0.7", "encoder.layer_scale=0.3")
     recipe = learned("locus", *(f"model.{option}" for option in (GAUSSIANS, *idle)))
     with pytest.raises(CheckpointError) as caught:
@@ -158,7 +155,7 @@ def test_a_refusal_lists_no_options_that_play_no_part(learned: Callable[..., Rec
     assert options.split() == ["model.head.gaussians_per_query:", "4", "(here", "5)"]
 
 
-def test_options_that_no_weight_shows_are_told(tiny: Tiny, learned: Callable[..., Recipe]) -> None:
+def test_options_that_no_weight_shows_are_told(tiny: Tiny, learned: Tiny) -> None:
     options = ("model.head.scale_cap=0.3", "model.queries.init_radius=0.7")
     _, told = started(learned("locus", *options))
     cap = tiny("locus").tree["model"]["head"]["scale_cap"]
@@ -171,14 +168,14 @@ def test_published_weights_are_to_be_imported_first(tiny: Tiny, tmp_path: Path) 
         started(tiny("tokengs", f"init_from={tmp_path / 'w.safetensors'}"))
 
 
-def test_another_width_is_no_other_number_of_queries(learned: Callable[..., Recipe]) -> None:
+def test_another_width_is_no_other_number_of_queries(learned: Tiny) -> None:
     recipe = learned("tokengs", "model.width=64", "model.queries.count=48")
     message = r"queries\.features: \(24, 32\).*\(48, 64\) in the rec"
     with pytest.raises(CheckpointError, match=message):
         started(recipe)
 
 
-def test_anchors_are_not_taken_from_a_model_without(learned: Callable[..., Recipe]) -> None:
+def test_anchors_are_not_taken_from_a_model_without(learned: Tiny) -> None:
     with pytest.raises(CheckpointError, match=r"missing: queries\.center"):
         started(learned("locus", of="tokengs"))
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import pytest
 import torch
@@ -74,6 +74,7 @@ def test_no_loss_at_all_is_refused(tiny: Tiny) -> None:
 
 TOOL = Path(__file__).parents[2] / "tools" / "measure_render_memory.py"
 TARGETS = 5
+Setting: TypeAlias = Callable[..., tuple]
 RENDERERS = ("qgs/torch", "qgs/cpu")
 
 
@@ -123,7 +124,7 @@ def with_masks(views: Views) -> Views:
 
 
 @pytest.fixture(scope="module")
-def setting(tiny: Tiny) -> Callable[..., tuple]:
+def setting(tiny: Tiny) -> Setting:
     def make(renderer: str, *, dtype: torch.dtype = torch.float32) -> tuple:
         recipe = tiny("locus", f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
         torch.manual_seed(0)
@@ -175,7 +176,7 @@ def error(objective: Objective, *batch: Views) -> float:
 @pytest.mark.parametrize("render_views", [0, 1, 2, 9])
 @pytest.mark.parametrize("all_at_once", [False, True])
 def test_gradients_do_not_depend_on_it(
-    setting: Callable[..., tuple], renderer: str, render_views: int, all_at_once: bool
+    setting: Setting, renderer: str, render_views: int, all_at_once: bool
 ) -> None:
     model, losses, *batch = setting(renderer)
     if all_at_once:
@@ -188,9 +189,7 @@ def test_gradients_do_not_depend_on_it(
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
 @pytest.mark.parametrize("render_views", [1, 2])
-def test_gradients_through_gsplat_do_not_depend_on_it(
-    setting: Callable[..., tuple], render_views: int
-) -> None:
+def test_gradients_through_gsplat_do_not_depend_on_it(setting: Setting, render_views: int) -> None:
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     model, losses, *batch = setting("qgs/gsplat")
     objective = Objective(model, losses, render_views).cuda()
@@ -198,13 +197,13 @@ def test_gradients_through_gsplat_do_not_depend_on_it(
     assert found < 1e-5, "its kernels add in no fixed order"
 
 
-def test_in_float64_they_are_the_same_numbers(setting: Callable[..., tuple]) -> None:
+def test_in_float64_they_are_the_same_numbers(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/torch", dtype=torch.float64)
     assert error(Objective(model, losses, 2), *batch) < 1e-13
 
 
 def test_under_autocast_the_gaussians_get_the_same_gradients(
-    setting: Callable[..., tuple],
+    setting: Setting,
 ) -> None:
     model, losses, *batch = setting("qgs/cpu")
     found: dict[int, dict[str, Tensor]] = {}
@@ -224,7 +223,7 @@ def test_under_autocast_the_gaussians_get_the_same_gradients(
     assert furthest(found[2], found[0]) < 1e-6
 
 
-def test_a_scaled_total_scales_every_gradient(setting: Callable[..., tuple]) -> None:
+def test_a_scaled_total_scales_every_gradient(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/cpu")
     objective = Objective(model, losses, 2)
     whole = gradients(objective, objective(*batch).total)
@@ -234,7 +233,7 @@ def test_a_scaled_total_scales_every_gradient(setting: Callable[..., tuple]) -> 
 
 @pytest.mark.parametrize("render_views", [0, 2])
 def test_signs_are_those_of_all_views_of_the_last_layer(
-    setting: Callable[..., tuple], render_views: int
+    setting: Setting, render_views: int
 ) -> None:
     model, losses, inputs, targets = setting("qgs/cpu")
     outcome: Outcome = Objective(model, losses, render_views)(inputs, targets)
@@ -248,7 +247,7 @@ def test_signs_are_those_of_all_views_of_the_last_layer(
     torch.testing.assert_close(tuple(outcome.signs.values()), wanted)
 
 
-def test_without_gradients_it_only_measures(setting: Callable[..., tuple]) -> None:
+def test_without_gradients_it_only_measures(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/cpu")
     with torch.no_grad():
         outcome = Objective(model, losses, 2)(*batch)
