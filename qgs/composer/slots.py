@@ -63,15 +63,13 @@ class Section:
 
 
 DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
-DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
-
+_DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
 SECTIONS = {
     "losses": Section(named=True, defaults=DEFAULT_LOSSES),
     "data": Section(),
-    "metrics": Section(named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
+    "metrics": Section(named=True, defaults=_DEFAULT_METRICS, defaults_stay=True),
     "optimizer": Section(),
 }
-
 
 MOVED = {
     "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
