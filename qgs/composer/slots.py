@@ -55,37 +55,8 @@ SLOTS = {
 }
 MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
 LAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward", "refinement")
-<<<<<<< HEAD
 SECTIONS = {name: SLOTS[name] for name in ("losses", "data", "metrics", "optimizer")}
 """Slots that are top-level sections of a recipe."""
-=======
-
-
-@dataclass(frozen=True)
-class Section:
-    """A top-level section of components, called like its slot.
-
-    named: whether it maps names to components; else it is one component, and there is always one
-        if its slot has a default type.
-    defaults: name to type of the components of a recipe that has no such section.
-    defaults_stay: whether they also stand beside those that are written; `NAME: null` drops one.
-    """
-
-    named: bool = False
-    defaults: Mapping[str, str] = field(default_factory=dict)
-    defaults_stay: bool = False
-
-
-DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
-_DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
-SECTIONS = {
-    "losses": Section(named=True, defaults=DEFAULT_LOSSES),
-    "data": Section(),
-    "metrics": Section(named=True, defaults=_DEFAULT_METRICS, defaults_stay=True),
-    "optimizer": Section(),
-}
-
->>>>>>> r5
 MOVED = {
     "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
     "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",
