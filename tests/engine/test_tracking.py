@@ -5,9 +5,8 @@ from __future__ import annotations
 import io
 import re
 import sys
-import types
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -59,31 +58,13 @@ def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_pa
     assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
 
 
-class Wandb(types.ModuleType):
-    """Stands in for wandb, whose package is large: notes what it is told."""
-
-    def __init__(self) -> None:
-        super().__init__("wandb")
-        self.told: list[tuple[str, Any]] = []
-        self.config = types.SimpleNamespace(update=lambda values, **_: self.note("config", values))
-        self.Image = lambda image: image
-
-    def note(self, what: str, value: Any) -> None:
-        self.told.append((what, value))
-
-    def init(self, **options: Any) -> types.SimpleNamespace:
-        self.note("init", options)
-        return types.SimpleNamespace(
-            log=lambda values, step: self.note("log", (values, step)),
-            finish=lambda: self.note("finish", None),
-        )
-
-
 def test_wandb_continues_one_run(
     tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A mock stands in for wandb, whose package is large."""
     make_accelerator("cpu")
-    wandb = Wandb()
+    wandb = Mock()
+    wandb.Image = lambda image: image
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     monkeypatch.setattr("qgs.engine.tracking.find_spec", lambda name: object())
     for _ in range(2):
@@ -92,17 +73,16 @@ def test_wandb_continues_one_run(
         tracking.log({"loss": 0.5}, 3)
         tracking.picture("evaluation", picture(), 3)
         tracking.close()
-    kinds = [what for what, _ in wandb.told]
-    assert kinds == ["init", "config", "log", "log", "finish"] * 2
-    first, second = (value for what, value in wandb.told if what == "init")
+    calls = [name for name, *_ in wandb.mock_calls]
+    assert calls == ["init", "config.update", "init().log", "init().log", "init().finish"] * 2
+    first, second = (made.kwargs for made in wandb.init.call_args_list)
     assert first == second, "the same id"
-    assert first["project"] == "qgs"
-    assert first["name"] == "run"
+    assert (first["project"], first["name"]) == ("qgs", "run")
     assert Path(first["dir"]) == tmp_path / "run"
-    assert wandb.told[2][1] == ({"loss": 0.5}, 3)
-    ((images,), step) = wandb.told[3][1][0].values(), wandb.told[3][1][1]
-    assert np.array_equal(images[0], picture())
-    assert step == 3
+    numbers, images, *_ = wandb.init.return_value.log.call_args_list
+    assert numbers == call({"loss": 0.5}, step=3)
+    assert np.array_equal(images.args[0]["evaluation"][0], picture())
+    assert images.kwargs == {"step": 3}
 
 
 def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:
