@@ -30,8 +30,7 @@ def list_components(
 
 
 def compose(
-    recipe: Annotated[Path, typer.Argument(help="Recipe file.")],
-    overrides: Overrides = None,
+    recipe: Annotated[Path, typer.Argument(help="Recipe file.")], overrides: Overrides = None
 ) -> None:
     """The resolved recipe, where each value comes from, and parameters per component.
 

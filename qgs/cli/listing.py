@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich.console import Group
@@ -15,7 +15,7 @@ from qgs.composer.schema import recipe_schema
 from qgs.composer.sections import SETTINGS
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
 from qgs.composer.yaml_text import inline
-from qgs.contracts import Component, ComponentConfig, Fields
+from qgs.contracts import Component
 
 Schema = Mapping[str, Any]
 
@@ -39,8 +39,7 @@ def overview(registry: Registry) -> Iterator[Table]:
 def details(name: str, registry: Registry) -> Iterator[Group]:
     """The options of a component (`qgs/latent`), of all in a slot, or of a section of settings.
 
-    The name `recipe` stands for the settings at the top of a recipe. Raises ValueError for a name
-    that is none of these.
+    `recipe` stands for the settings at the top of a recipe. Raises ValueError for other names.
     """
     schema = recipe_schema(registry)
     settings = {".".join(path) or "recipe": path for path in SETTINGS}
@@ -72,7 +71,6 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
 
 
 def _by_type(definition: Schema) -> dict[str, Schema]:
-    """The components of a slot's JSON Schema by their `type`."""
     return {one["properties"]["type"]["const"]: one for one in definition["anyOf"]}
 
 
@@ -130,15 +128,11 @@ def _fields(component: type[Component]) -> Iterator[str]:
     config = default_config(component)
     declarations = {"requires": component.requires, "provides": component.provides}
     for word, declare in declarations.items():
-        if config is None:
-            yield f"  {word}: depends on options"
-        else:
-            told = _declared(declare, config)
-            yield from [escape(f"  {word}: {told}")] if told else []
-
-
-def _declared(declare: Callable[[ComponentConfig], Fields], config: ComponentConfig) -> str:
-    try:
-        return "; ".join(f"{name} ({spec})" for name, spec in declare(config).items())
-    except Exception as error:  # code of a plugin
-        return f"fails: {type(error).__name__}: {error}"
+        told = "depends on options"
+        if config is not None:
+            try:
+                told = "; ".join(f"{name} ({spec})" for name, spec in declare(config).items())
+            except Exception as error:  # code of a plugin
+                told = f"fails: {type(error).__name__}: {error}"
+        if told:
+            yield escape(f"  {word}: {told}")

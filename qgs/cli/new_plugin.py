@@ -13,7 +13,6 @@ from typing import Annotated
 
 import typer
 
-TEMPLATE_SUFFIX = ".jinja"
 NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 LONGEST_NAME = 40
 WINDOWS_DEVICES = {"con", "prn", "aux", "nul"} | {
@@ -31,11 +30,9 @@ def new_plugin(
     check_name(name)
     folder = (out or Path(distribution_of(name))).expanduser()
     write_plugin(name, folder)
-    typer.echo(f"wrote {folder}; next:")
-    typer.echo(f"  cd {shlex.quote(str(folder))}")
-    typer.echo("  pip install -e '.[test]'")
-    typer.echo("  python -m pytest")
-    typer.echo("  qgs compose recipe.yaml")
+    next_steps = "pip install -e '.[test]'", "python -m pytest", "qgs compose recipe.yaml"
+    lines = [f"wrote {folder}; next:", f"cd {shlex.quote(str(folder))}", *next_steps]
+    typer.echo("\n  ".join(lines))
 
 
 def distribution_of(name: str) -> str:
@@ -45,6 +42,9 @@ def distribution_of(name: str) -> str:
 
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
+    from qgs.composer.errors import Problems
+    from qgs.composer.yaml_text import load_mapping
+
     if not NAME.fullmatch(name):
         letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
         near = re.sub(r"[^a-z0-9]+", "-", letters.lower()).lstrip("-0123456789").rstrip("-")
@@ -62,14 +62,17 @@ def check_name(name: str) -> None:
             f"`{name}` begins like the framework's own name; the distribution is called "
             "qgs-NAME anyway, so leave `qgs` out"
         )
-    value = _read_as_yaml(name)
-    reason = ""
     if name in WINDOWS_DEVICES:
-        reason = "is the name of a device on Windows, where no file can have it"
-    elif value != name:
-        reason = f"in a recipe's `plugins: [{name}]` would be read as {value!r} and not as a name"
-    if reason:
-        raise ValueError(f"`{name}` {reason}; choose another, such as `{name}-things`")
+        raise ValueError(
+            f"`{name}` is the name of a device on Windows, where no file can have it; choose "
+            f"another, such as `{name}-things`"
+        )
+    (value,) = load_mapping(f"name: {name}", name, Problems()).values()
+    if value != name:
+        raise ValueError(
+            f"`{name}` in a recipe's `plugins: [{name}]` would be read as {value!r} and not as a "
+            f"name; choose another, such as `{name}-things`"
+        )
     for entry in entry_points(group="qgs.plugins", name=name):
         raise ValueError(
             f"the name `{name}` is taken by {entry.dist.name if entry.dist else 'a plugin'}, which "
@@ -84,21 +87,10 @@ def check_name(name: str) -> None:
         )
 
 
-def _read_as_yaml(name: str) -> object:
-    """What a YAML 1.2 reader takes `name` for when it stands without quotes."""
-    import yaml
-
-    from qgs.composer.yaml_text import Yaml12Loader, scalar_value
-
-    node = yaml.compose(name, Loader=Yaml12Loader)
-    return scalar_value(node.tag, node.value)
-
-
 def write_plugin(name: str, folder: Path) -> None:
     """Write the distribution of the plugin `name` into the new `folder`, whole or not at all.
 
-    Raises FileExistsError if there is something at `folder`, whatever it is, and OSError if no
-    folder can be made there.
+    Raises FileExistsError if there is anything at `folder`, OSError if none can be made there.
     """
     from qgs.io.files import new_folder, write_text
 
@@ -135,7 +127,7 @@ def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
         "next_qgs": f"{major}.{int(minor) + 1}",
     }
     folder = Path(__file__).with_name("plugin_template")
-    for file in sorted(folder.rglob(f"*{TEMPLATE_SUFFIX}")):
+    for file in sorted(folder.rglob("*.jinja")):
         path = file.relative_to(folder).with_suffix("")
         parts = [values["package"] if part == "package" else part for part in path.parts]
         text = environment.from_string(file.read_text(encoding="utf-8")).render(values)

@@ -44,18 +44,14 @@ class OfferedCommand(TyperCommand):
 
     def __init__(self, name: str, offers: list[EntryPoint]) -> None:
         self.offers = offers
-        self.releases = ", ".join(
-            sorted(f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist)
-        )
+        releases = (f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist)
+        self.releases = ", ".join(sorted(releases))
         super().__init__(name, help=f"Commands of {self.releases}.")
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
         """The context of the real command. Raises ValueError where there is none."""
-        return self._imported().make_context(info_name, args, parent, **extra)
-
-    def _imported(self) -> Any:
         entry, command = self.offers[0], f"the command `qgs {self.name}`"
         if len(self.offers) > 1:
             raise ValueError(
@@ -73,4 +69,4 @@ class OfferedCommand(TyperCommand):
                 f"{command} of {self.releases} is no command: `{entry.value}` is "
                 f"{type(app).__name__}, not a typer.Typer; update {self.releases}"
             )
-        return typer.main.get_command(app)
+        return typer.main.get_command(app).make_context(info_name, args, parent, **extra)

@@ -59,14 +59,10 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
 
 
 class _LargeWeightsUnwritten(TorchFunctionMode):
-    """Leaves large weights as they are allocated: to count them takes no time and no memory.
-
-    On the meta device torch would import its compiler first, which takes three seconds.
-    """
+    """Leaves large weights unwritten; on the meta device torch would import its compiler first."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        draws = (Tensor.uniform_, Tensor.normal_)
-        if func in draws and args[0].numel() > 2**14:
+        if func in (Tensor.uniform_, Tensor.normal_) and args[0].numel() > 2**14:
             return args[0]
         return func(*args, **(kwargs or {}))
 
@@ -75,16 +71,20 @@ def parameter_counts(recipe: Recipe) -> dict[str, int]:
     """Component to its number of parameters, decoder layers summed by slot."""
     with _LargeWeightsUnwritten():
         model = recipe.build_model()
-    counts = {name: _count(getattr(model, name)) for name in ("encoder", "queries")}
-    in_layers = {
+    sublayers = {
         f"decoder.{slot}": sum(_count(getattr(layer, slot)) for layer in model.decoder)
         for slot in LAYER_SLOTS
         if slot != "refinement"
     }
-    scales = _count(model.decoder) - sum(in_layers.values())
-    counts |= in_layers | {"decoder.refinement": _count(model.refinements)}
-    counts["decoder.layer_scale"] = scales
-    return counts | {name: _count(getattr(model, name)) for name in ("head", "centers")}
+    return {
+        "encoder": _count(model.encoder),
+        "queries": _count(model.queries),
+        **sublayers,
+        "decoder.refinement": _count(model.refinements),
+        "decoder.layer_scale": _count(model.decoder) - sum(sublayers.values()),
+        "head": _count(model.head),
+        "centers": _count(model.centers),
+    }
 
 
 def _count(module: nn.Module) -> int:

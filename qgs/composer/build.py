@@ -30,10 +30,9 @@ def build_model(
     tree: Mapping[str, Any],
     device: torch.device | str | None,
 ) -> QueryGaussianModel:
-    """The model of a checked recipe.
+    """The model of a checked recipe; on "meta" nothing is allocated.
 
-    Parameters depend on the recipe alone: they are drawn on the CPU from `seed`, whatever the
-    device, and the global random state stays as it was. On "meta" nothing is allocated.
+    Parameters are drawn on the CPU from `seed`, whatever the device; the global random state stays.
     """
     on_meta = device is not None and torch.device(device).type == "meta"
     shared: list[tuple[Chosen, nn.Module]] = []
@@ -61,14 +60,13 @@ def build_model(
             sublayers = {slot: at("decoder", "layers", index, slot) for slot in slots}
             decoder.append(DecoderLayer(**sublayers, layer_scale=layer_scale))
             refinements.append(at("decoder", "layers", index, "refinement"))
-        others = {slot: at(slot) for slot in ("head", "centers", "supervision", "renderer")}
         model = QueryGaussianModel(
             encoder=encoder,
             queries=queries,
             decoder=decoder,
             refinements=refinements,
             recipe=tree,
-            **others,
+            **{slot: at(slot) for slot in ("head", "centers", "supervision", "renderer")},
         )
     return model if on_meta or device is None else model.to(device)
 
@@ -103,9 +101,8 @@ class _ShapesAlone(TorchFunctionMode):
 def build(chosen: Chosen, *arguments: Any) -> Any:
     """The component itself. arguments: what its constructor takes besides its Config.
 
-    What a plugin's constructor raises is reported with its distribution. Missing packages,
-    data that cannot be opened and training too short for its optimiser are for the user to put
-    right, and raised as they are.
+    What a plugin's constructor raises is reported with its distribution, except what is for the
+    user to put right: missing packages, data, training too short for its optimiser.
     """
     component: Any = chosen.component
     try:
@@ -113,9 +110,10 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
     except MissingExtraError:
         raise
     except Exception as error:
-        ours = chosen.installed.plugin.name == BUILTIN.name
         for_users = issubclass(component, SceneSource | Optimizer)
-        if ours or (for_users and isinstance(error, ValueError | OSError)):
+        if chosen.installed.plugin is BUILTIN or (
+            for_users and isinstance(error, ValueError | OSError)
+        ):
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         where = chosen.place.origin.file, chosen.place.origin.line
@@ -127,10 +125,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
 
 def _check_first_state(module: nn.Module, chosen: Chosen) -> None:
-    """Make `module` raise PluginError until it has once returned the state that it must.
-
-    That has the fields that the component provides, and those of the state that it was given.
-    """
+    """Make `module` raise PluginError until it has once returned the state that it must."""
 
     def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
         fault = _state_fault(chosen, arguments, state)

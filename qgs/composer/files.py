@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -86,8 +86,16 @@ def _with_bases(
     node: MapNode, folder: Path, chain: tuple[Path, ...], problems: Problems
 ) -> MapNode:
     """`node` laid over the files that it extends, the later ones over the earlier ones."""
+    written, at = node.get("extends"), node.origins.get("extends", node.origin)
+    if not isinstance(written, ListNode):
+        written = ListNode(at, [] if written is None else [(written, at)])
     layers: list[MapNode] = []
-    for name, origin in _extended(node, problems):
+    for name, origin in zip(written, written.origins, strict=True):
+        if not isinstance(name, str):
+            reason = "`extends` names one recipe file or a list of them"
+            fix = "write `extends: base.yaml`, relative to this file"
+            problems.stop(at, "extends", reason, fix)
+            continue
         file = Path(os.path.normpath(folder / name))
         visited = [path.resolve() for path in chain]
         if file.resolve() not in visited:
@@ -97,22 +105,6 @@ def _with_bases(
         reason = f"recipes extend each other in a circle: {' -> '.join(map(str, circle))}"
         problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
     return reduce(merge, [*layers, node.without("extends")])
-
-
-def _extended(node: MapNode, problems: Problems) -> Iterator[tuple[str, Origin]]:
-    written = node.get("extends")
-    if written is None:
-        return
-    at = node.origins["extends"]
-    is_list = isinstance(written, ListNode)
-    for name, origin in zip(written, written.origins, strict=True) if is_list else [(written, at)]:
-        if isinstance(name, str):
-            yield name, origin
-        else:
-            reason = "`extends` names one recipe file or a list of them"
-            problems.stop(
-                at, "extends", reason, "write `extends: base.yaml`, relative to this file"
-            )
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:

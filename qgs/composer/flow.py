@@ -9,12 +9,7 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import KeyPath, MapNode, find
-from qgs.composer.registry import (
-    Registry,
-    component_error,
-    component_failure,
-    default_config,
-)
+from qgs.composer.registry import Registry, component_error, component_failure, default_config
 from qgs.composer.slots import LAYER_SLOTS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import MEMORY_FIELDS, Encoder, Queries, Refinement, Renderer, Supervision
@@ -29,7 +24,6 @@ from qgs.contracts.component import (
 
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
 """What stands at each place; None for a component that could not be decoded."""
-
 
 _FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses")
 """Slots that read or write fields, in the order in which a layer's prediction is made."""
@@ -53,9 +47,11 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
         if odd:
             raise TypeError(f"it gives {odd[0]}, not qgs.contracts.Problem")
         if beyond:
-            fault = f"says that it provides {', '.join(beyond)}, which a component of the slot"
-            told = f"`{chosen.type}` {fault} `{component.slot}` has no way to write"
-            failure = component_error(chosen.installed, told)
+            fault = (
+                f"`{chosen.type}` says that it provides {', '.join(beyond)}, which a component of "
+                f"the slot `{component.slot}` has no way to write"
+            )
+            failure = component_error(chosen.installed, fault)
     except Exception as error:
         failure, cause = component_failure(chosen.type, asked, error, chosen.installed), error
     if failure:
@@ -81,8 +77,7 @@ def _writable(component: type[Component], provided: Fields) -> Collection[str]:
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
     """Report fields that are read before they are written, or not as they are written.
 
-    After a component that could not be decoded nothing is reported as missing: it might have
-    provided it.
+    After a component that could not be decoded, which might have provided it, nothing is missing.
     """
     steps = list(_execution_order(parts, depth))
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
@@ -165,7 +160,11 @@ def _fixes(
         standing = {chosen.place.slot.name: chosen for chosen in before}
         for slot in _FLOW[: _FLOW.index(reader.place.slot.name)]:
             for kind, component in registry.components(slot).items():
-                for words, config in _default_and_variants(component):
+                default = default_config(component)
+                if default is None:
+                    continue
+                others = ((f" with `{o}: {v}`", config) for o, v, config in variants(default))
+                for words, config in (("", default), *others):
                     if missing.keys() <= _offers(component, config).keys():
                         fixes[f"use `{kind}`{words} in the slot `{slot}`"] = standing.get(slot)
                         break
@@ -177,19 +176,8 @@ def _fixes(
     return fixes
 
 
-def _default_and_variants(component: type[Component]) -> Iterator[tuple[str, ComponentConfig]]:
-    default = default_config(component)
-    if default is not None:
-        yield "", default
-        for option, value, config in variants(default):
-            yield f" with `{option}: {value}`", config
-
-
 def _offers(component: type[Component], config: ComponentConfig) -> Fields:
-    """What `component` provides with `config` without needing it itself.
-
-    Nothing for options with which its code fails: nothing is suggested that may not work.
-    """
+    """What `component` provides with `config` without needing it; nothing where its code fails."""
     with suppress(Exception):
         given = component.requires(config)
         return {n: spec for n, spec in component.provides(config).items() if n not in given}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 KeyPath: TypeAlias = tuple[str, ...]
 
@@ -62,10 +62,7 @@ Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
 def from_plain(value: Any, origin: Origin) -> Node:
-    """A tree of a plain Python value, all of one origin.
-
-    Raises ValueError for a value that YAML could not hold.
-    """
+    """A tree of a plain Python value; raises ValueError for one that YAML could not hold."""
     if isinstance(value, Mapping):
         entries = ((str(key), from_plain(item, origin), origin) for key, item in value.items())
         return MapNode(origin, entries)
@@ -97,9 +94,7 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
 
     Returns the steps taken, where the last one was written, and the value found.
     """
-    taken: list[str | int] = []
-    origin: Origin = tree.origin
-    node: Any = tree
+    taken, origin, node = list[str | int](), tree.origin, cast("Any", tree)
     for step in path:
         if isinstance(node, MapNode) and str(step) in node:
             origin, node = node.origins[str(step)], node[str(step)]

@@ -52,15 +52,12 @@ class Recipe:
         return build_model(self.parts, self.dims, self.layer_scale, self.seed, self.tree, device)
 
     def build_losses(self) -> dict[str, contracts.Loss]:
-        """Losses by the names that the recipe gives them.
-
-        `losses: {}` gives none: fine for everything but training, which refuses it.
-        """
-        return self._build_named("losses")
+        """Losses by the names that the recipe gives; without any, training refuses to start."""
+        return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
 
     def build_metrics(self) -> dict[str, contracts.Metric]:
         """What evaluations measure, by the names that the recipe gives."""
-        return self._build_named("metrics")
+        return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "metrics"}
 
     def build_optimizer(self) -> contracts.Optimizer:
         """The optimiser; raises ValueError where `training` is too short for it."""
@@ -72,10 +69,6 @@ class Recipe:
             raise ValueError("this recipe has no data; add `data: {type: PLUGIN/NAME}`")
         return build(self.parts["data",])
 
-    def _build_named(self, section: str) -> dict[str, Any]:
-        """The components of a section such as `losses`, by name."""
-        return {path[1]: build(part) for path, part in self.parts.items() if path[0] == section}
-
 
 def resolve(
     recipe: str | Path | Mapping[str, Any],
@@ -86,8 +79,7 @@ def resolve(
 
     recipe: path of a YAML file, or a mapping of the same form, whose `extends` is relative to the
         working directory. overrides: `a.b=value`, laid over it in order.
-    plugins: what the recipe may name besides the plugins that are installed, such as one under
-        test.
+    plugins: what it may name besides the installed plugins, such as one under test.
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
@@ -150,8 +142,8 @@ def _spell_out(
     tree: dict[str, Any] = {}
     provenance: dict[str, str] = {}
 
+    # written: what the recipe has at `path`; the rest is set by `default`.
     def put(path: KeyPath, values: Mapping[str, Any], written: Any, default: str) -> None:
-        """Put `values` at `path`. written: what the recipe has there, the rest is by `default`."""
         origins = written.origins if isinstance(written, MapNode) else {}
         below = tree
         for key in path:
@@ -225,19 +217,16 @@ def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:
 
 def annotated(recipe: Recipe) -> str:
     """The resolved recipe in YAML; comments, aligned at the right, say what set each value."""
-    lines = list(_lines(recipe.tree, (), recipe.provenance))
+
+    def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
+        for key, value in tree.items():
+            below, name = (*path, key), "  " * len(path) + inline(key)
+            if isinstance(value, Mapping) and value:
+                yield f"{name}:", ""
+                yield from lines_of(value, below)
+            else:
+                yield f"{name}: {inline(value)}", recipe.provenance[".".join(below)]
+
+    lines = list(lines_of(recipe.tree, ()))
     width = max(len(text) for text, _ in lines)
     return "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)
-
-
-def _lines(
-    tree: Mapping[str, Any], path: KeyPath, provenance: Mapping[str, str]
-) -> Iterator[tuple[str, str]]:
-    """Lines of YAML, and what set the value of each."""
-    for key, value in tree.items():
-        below, name = (*path, key), "  " * len(path) + inline(key)
-        if isinstance(value, Mapping) and value:
-            yield f"{name}:", ""
-            yield from _lines(value, below, provenance)
-        else:
-            yield f"{name}: {inline(value)}", provenance[".".join(below)]

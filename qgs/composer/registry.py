@@ -58,11 +58,14 @@ class PluginError(ValueError):
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A sound plugin and its distribution. editable: installed by its author, with `pip -e`."""
+    """A sound plugin and its distribution, "" for none.
+
+    editable: installed by its author, with `pip -e`.
+    """
 
     plugin: Plugin
-    distribution: str
-    version: str
+    distribution: str = ""
+    version: str = "0"
     editable: bool = False
 
     @property
@@ -98,11 +101,6 @@ def builtin() -> InstalledPlugin:
     return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
 
 
-def not_installed(plugin: Plugin) -> InstalledPlugin:
-    """A plugin that came with no distribution."""
-    return InstalledPlugin(plugin, "", "0")
-
-
 def available_plugins() -> dict[str, list[EntryPoint]]:
     """Name to entry points of every installed plugin, by metadata alone."""
     found: dict[str, list[EntryPoint]] = {}
@@ -120,7 +118,7 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
     plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()
-    for release in map(_release, available.pop(BUILTIN.name, [])):
+    for release in map(_release, available.pop("qgs", [])):
         reason = f"{release} offers a plugin `qgs`, the framework's own name"
         broken.append(f"{reason}; uninstall {release}")
     for name in sorted(available):
@@ -133,18 +131,18 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
 
 def load_plugin(name: str) -> InstalledPlugin:
     """Import and check the plugin `name`; raises PluginError."""
-    if name == BUILTIN.name:
+    if name == "qgs":
         return builtin()
     available = available_plugins()
-    entries = available.get(name, [])
+    entries = available.get(name)
     if not entries:
         installed = ", ".join(sorted(available)) or "none"
         fix = f"install the one that does; installed plugins: {installed}"
         raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
-        reason = f"several distributions offer a plugin `{name}`: "
         releases = ", ".join(sorted(map(_release, entries)))
-        raise PluginError(reason + releases, "uninstall all of them but one")
+        reason = f"several distributions offer a plugin `{name}`: {releases}"
+        raise PluginError(reason, "uninstall all of them but one")
     entry = entries[0]
     assert entry.dist is not None
     # The record of where a distribution came from (PEP 610): whether by `pip install -e`.
@@ -191,8 +189,7 @@ def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
     if type(version) is not int:
         yield f"must give `contract_version` as a whole number, not {version!r}"
     elif version != CONTRACT_VERSION:
-        known = f"this qgs has version {CONTRACT_VERSION}"
-        yield f"was written for contract version {version}; {known}"
+        yield f"was written for contract version {version}; this qgs has version {CONTRACT_VERSION}"
     if plugin.name != name:
         yield f"calls itself `{plugin.name}`; the two names must be one"
     for attribute in ("components", "layouts", "examples"):
@@ -292,11 +289,6 @@ def package_of(file: str) -> Path:
     return path
 
 
-def lies_in(file: str, root: Path) -> bool:
-    """Whether `file` is `root` or below it."""
-    return Path(file).resolve().is_relative_to(root)
-
-
 def place_of(function: Callable[..., Any]) -> str:
     """FILE:LINE where a function starts; "" for one that is not written in Python."""
     code = getattr(inspect.unwrap(function), "__code__", None)
@@ -309,6 +301,8 @@ def place_in(error: BaseException, roots: Iterable[Path]) -> str:
     passed = [(frame.filename, frame.lineno) for frame in frames]
     if isinstance(error, SyntaxError) and error.filename:
         passed.append((error.filename, error.lineno))
-    roots = list(roots)
-    own = [place for place in passed if any(lies_in(place[0], root) for root in roots)]
-    return "{}:{}".format(*own[-1]) if own else ""
+    inside = tuple(roots)
+    for file, line in reversed(passed):
+        if any(Path(file).resolve().is_relative_to(root) for root in inside):
+            return f"{file}:{line}"
+    return ""

@@ -64,8 +64,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
     """The options of `component`, and the `type` that chooses it."""
     description, schema = _summary(component), _settings(component.Config)
-    kind = {"const": name, "description": description}
-    properties = {"type": kind, **schema["properties"]}
+    properties = {"type": {"const": name, "description": description}, **schema["properties"]}
     return schema | {"description": description, "properties": properties}
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from qgs.composer.decode import decode_config
 from qgs.composer.errors import Problems, did_you_mean
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, kind_of
-from qgs.composer.registry import PluginError, Registry, builtin, load_plugin, not_installed
+from qgs.composer.registry import InstalledPlugin, PluginError, Registry, builtin, load_plugin
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.contracts import ComponentConfig, EvaluationConfig, Plugin, TrainingConfig, ViewsConfig
 
@@ -89,17 +89,14 @@ def check_tree(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, Any], bool]:
-    """Settings by section, and whether the model's sizes are what the recipe says.
-
-    Defaults stand in for a section that has problems.
-    """
+    """Settings by section, defaults for one with problems; whether the model's sizes are sound."""
     settings: dict[KeyPath, Any] = {}
+    sizes_known = True
     for path, config in SETTINGS.items():
         node = tree.child(*path).without(*_BESIDE.get(path, ()))
-        settings[path] = decode_config(config, node, path, problems)
-    sizes_known = all(settings[path] for path in (("model",), ("model", "decoder")))
-    defaults = {path: config.model_construct() for path, config in SETTINGS.items()}
-    settings = {path: found or defaults[path] for path, found in settings.items()}
+        found = decode_config(config, node, path, problems)
+        settings[path] = found or config.model_construct()
+        sizes_known &= bool(found) or path[:1] != ("model",)
     model, node = settings["model",], tree.child("model")
     if model.width % model.heads:
         fitting = [n for n in range(1, model.width + 1) if model.width % n == 0]
@@ -114,11 +111,8 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, An
 
 
 def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
-    """The components of the recipe's `plugins`; a problem for each that cannot be used.
-
-    given: plugins that need not be installed.
-    """
-    at_hand = {plugin.name: not_installed(plugin) for plugin in given}
+    """The components of the recipe's `plugins`; a problem for each that cannot be used."""
+    at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins, seen = {"qgs": builtin()}, dict[str, Origin]()
     written = tree.get("plugins")
     if written is not None and not isinstance(written, ListNode):

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import torch
 
 from qgs.composer.errors import did_you_mean
-from qgs.composer.registry import file_of, lies_in, package_of, place_in
+from qgs.composer.registry import file_of, package_of, place_in
 from qgs.contracts import CONTRACT_VERSION, ComponentConfig, Expected, ExpectedError
 from qgs.contracts.component import MissingExtraError
 from qgs.testing.case import CannotCheck, Case, ContractError
@@ -168,7 +168,8 @@ def with_place(error: BaseException, file: str | None) -> str:
     place = place_in(error, [package_of(file)]) if file else ""
     if not place:
         frames = traceback.extract_tb(error.__traceback__)
-        others = [f for f in frames if not any(lies_in(f.filename, x) for x in NOT_THE_AUTHORS)]
+        files = [(frame, Path(frame.filename).resolve()) for frame in frames]
+        others = [f for f, file in files if not any(map(file.is_relative_to, NOT_THE_AUTHORS))]
         frame = (others or frames[-1:])[0]
         place = f"{frame.filename}:{frame.lineno}"
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

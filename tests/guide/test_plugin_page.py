@@ -19,7 +19,7 @@ from guide_pages import blocks
 from qgs.cli.new_plugin import rendered
 from qgs.composer import RecipeError
 from qgs.composer.recipe import resolve
-from qgs.composer.registry import not_installed
+from qgs.composer.registry import InstalledPlugin
 from qgs.contracts import ModelDims
 from qgs.testing import cases_of, checks_for, run_check
 from qgs.types import QueryState
@@ -74,7 +74,7 @@ def test_the_pages_test_makes_the_checks_of_the_command(folder: Path, package: M
     checked = {(bound.check.name, bound.run.case.config) for (bound,) in _arguments(mark)}
     expected = {
         (check.name, case.config)
-        for case in cases_of(not_installed(package.plugin))
+        for case in cases_of(InstalledPlugin(package.plugin))
         for check in checks_for(case)
     }
     assert checked == expected
@@ -86,7 +86,7 @@ def _arguments(mark: pytest.Mark) -> list[tuple]:
 
 @pytest.mark.parametrize("number", range(6))
 def test_components_keep_their_contracts(package: ModuleType, number: int) -> None:
-    cases = cases_of(not_installed(package.plugin))
+    cases = cases_of(InstalledPlugin(package.plugin))
     assert len(cases) == 6, "one of each component, and one more of its examples"
     case = cases[number]
     outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
