@@ -54,11 +54,9 @@ def choose_frames(
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Input frames and novel frames, from 0 to total - 1.
 
-    frames: the inputs; None spreads `inputs` of them over `span` frames in the middle of all, both
-    ends included, or over all when there are fewer. compare: the novel ones; None takes at most
-    `novel`, evenly spread over the frames between the inputs. held_out: frames that the model was
-    not trained on, of a folder that it was trained on; the inputs are then chosen from the others,
-    and compared are those between the inputs, where there are any.
+    frames: the inputs; None spreads `inputs` of them, ends included, over the middle `span` frames.
+    compare: the novel ones; None spreads at most `novel` between the inputs. held_out: frames that
+    training left out; inputs are then chosen from the others, and these are compared.
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
     usable = [frame for frame in range(total) if frame not in held_out]
@@ -139,10 +137,9 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Gaussians (1, G) of a sample, and what its input and target cameras see of them.
+    """Gaussians (1, G) of a sample, and what its cameras see of them.
 
-    world: reference pose (4, 4) and scale of the sample's world, as `own_world` gives them. tuning:
-    how the tokens were tuned on the inputs, as plain values; None where they were not.
+    world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, None without.
     """
 
     sample: Sample
@@ -193,9 +190,8 @@ def write_reconstruction(
 ) -> list[Path]:
     """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
 
-    views/ holds photo and render side by side. Everything is in the normalised world of the model,
-    in which cameras.json tells the cameras, and how that world lies in the photos'. Earlier files
-    and folders of these names are replaced, all at the end.
+    All is in the model's normalised world; cameras.json tells how it lies in that of the photos.
+    Earlier files and folders of these names are replaced, all at the end.
     """
     path = orbit_path(reconstruction.sample.inputs.cameras, reconstruction.rendering.depth)
     with torch.no_grad():

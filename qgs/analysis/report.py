@@ -63,12 +63,10 @@ class Baseline:
 
 @dataclass(frozen=True)
 class Report:
-    """A comparison.
+    """A comparison of `contenders`, in order, by `columns`: each score and how it is shown.
 
-    columns: name of each score to how it is shown. contenders: in the order in which they are
-    shown. samples: the unseen scenes to picture. depths: for each of them the true depth
-    (T, 1, H, W) of its targets in the model's units, where known. facts: name to value, what was
-    run where.
+    samples: the unseen scenes to picture. depths: for each the true depth (T, 1, H, W) of its
+    targets in the model's units, where known. facts: what was run where.
     """
 
     columns: Mapping[str, Column]
@@ -155,9 +153,7 @@ def scene_columns(
     for contender in contenders:
         gaussians = contender.model(sample.inputs).gaussians
         rendering = contender.model.render(gaussians, shown.cameras)
-        quality = [
-            f"{float(psnr(*pair)):.1f} dB" for pair in zip(rendering.rgb[0], truth, strict=True)
-        ]
+        quality = [f"{value:.1f} dB" for value in psnr(rendering.rgb[0], truth).tolist()]
         columns[contender.name] = _photos(rendering.rgb[0], quality)
         depths[f"{contender.name}, depth"] = rendering.depth[0]
     near, far = depth_range(torch.cat(list(depths.values())))

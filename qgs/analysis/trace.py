@@ -35,11 +35,7 @@ class LayerTrace:
 
 @dataclass
 class Trace:
-    """The last forward pass inside the `with` block.
-
-    queries: (Q,) their indices. grid: (V, H/P, W/P) of the image tokens, once a pass has run.
-    layers: layer number (1 is the first) to what it did.
-    """
+    """The last forward pass: indices (Q,), `layers` by number from 1, grid (V, H/P, W/P)."""
 
     queries: Tensor
     grid: tuple[int, int, int] | None = None

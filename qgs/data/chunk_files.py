@@ -43,11 +43,7 @@ _DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 1
 
 @dataclass(frozen=True)
 class Record:
-    """A scene as a chunk holds it (see the top of this file); nothing is decoded.
-
-    where: file and key, for messages. names: time stamps or numbers where the chunk has no names.
-    sizes, masks: None where the chunk has none.
-    """
+    """A scene as a chunk holds it (see the top of this file), undecoded; where: for messages."""
 
     where: str
     key: str
@@ -208,10 +204,9 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def load_chunk(path: UPath) -> list[Any]:
-    """The entries of a chunk, unpickled as tensors and plain containers only.
+    """The entries of a chunk, tensors and plain containers; a local zip file is memory-mapped.
 
-    A local file of torch's zip format is memory-mapped, so that images are read when they are used;
-    others are read whole. Raises FileNotFoundError, and ValueError for a file that is no list.
+    Raises FileNotFoundError, and ValueError for a file that is no list.
     """
     try:
         file = str(path) if is_local(path) else io.BytesIO(path.read_bytes())
@@ -306,11 +301,10 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
 
 
 def list_scenes(folder: UPath) -> dict[str, UPath]:
-    """The scenes of a folder by key, in the index's order, with their chunk files.
+    """The scenes of a folder by key, in the order of its index, or else of its chunks.
 
-    They are read from index.json alone where there is one; else chunks are opened.
-    Scenes whose chunk does not exist are left out and logged. Raises FileNotFoundError when no
-    scene is left, ValueError for an index or a chunk that cannot be read.
+    Scenes whose chunk is missing are left out and logged. Raises FileNotFoundError when none is
+    left, ValueError for an index or a chunk that cannot be read.
     """
     if not (folder / INDEX).is_file():
         return _scanned(folder)

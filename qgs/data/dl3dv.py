@@ -162,11 +162,7 @@ def scene_folder(place: Place) -> UPath:
 
 
 def read_scene_list(file: UPath) -> list[str]:
-    """Names of scenes in a file: the keys of a JSON mapping, such as an evaluation index, a JSON
-    list of names, or lines of text, where what follows # is a comment.
-
-    Raises FileNotFoundError, and ValueError for a file that names no scene.
-    """
+    """Scenes: keys of a JSON mapping, a list, or lines. Raises FileNotFoundError, ValueError."""
     if not file.is_file():
         raise FileNotFoundError(f"the list of scenes {file} does not exist")
     text = file.read_text(encoding="utf-8-sig")

@@ -88,11 +88,7 @@ def alpha_mask(path: UPath) -> np.ndarray:
 
 
 def open_depth(path: UPath, unit: float) -> np.ndarray:
-    """A depth map, an image of integers or a .npy file, as (H, W) float32 of world units.
-
-    unit: world units per number of the file. What is not finite becomes 0, for unknown.
-    Raises ValueError for another kind of file.
-    """
+    """A depth map as (H, W) float32; unit: world units per number; 0: unknown. ValueError."""
     with _readable(path, "a depth map"), path.open("rb") as file:
         if path.suffix.lower() == ".npy":
             depth = np.asarray(np.load(file, allow_pickle=False)).squeeze()

@@ -84,10 +84,7 @@ def _turn(*coefficients: float) -> float:
 
 
 def undistorted(
-    pixels: np.ndarray,
-    intrinsics: Intrinsics,
-    lens: Lens | None,
-    mode: Mode = "bilinear",
+    pixels: np.ndarray, intrinsics: Intrinsics, lens: Lens | None, mode: Mode = "bilinear"
 ) -> np.ndarray:
     """The photo as a pinhole camera with the same intrinsics would have taken it.
 

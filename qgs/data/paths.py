@@ -13,7 +13,7 @@ from typing import IO, Literal
 
 from upath import UPath
 
-_PROTOCOLS = {
+_PROTOCOLS = {  # the packages that file systems of fsspec need: the protocols that they serve
     "requests aiohttp": ("http", "https"),
     "s3fs": ("s3", "s3a"),
     "gcsfs": ("gs", "gcs"),
@@ -23,7 +23,6 @@ _PROTOCOLS = {
     "smbprotocol": ("smb",),
     "webdav4": ("webdav",),
 }
-"""The packages that file systems of fsspec need, with the protocols that they serve."""
 
 
 def opened_path(path: str | Path | UPath) -> UPath:
@@ -55,11 +54,7 @@ def stays_inside(name: str) -> bool:
 
 
 class Archive:
-    """An open zip file. Raises ValueError for a file that is none, or that leads outside itself.
-
-    files: path, with slashes and without `./`, to the name that the archive has for it.
-    folders: path to the names in it.
-    """
+    """An open zip file: `files` by path to its names, `folders` to names in them. ValueError."""
 
     def __init__(self, path: UPath) -> None:
         try:

@@ -11,11 +11,9 @@ from qgs.data.paths import opened_path
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
-    """The first of `sources` that recognises `path`, as PLUGIN/NAME.
+    """PLUGIN/NAME of the first of `sources` that recognises `path`, else qgs/photos.
 
-    sources: components of the slot data by PLUGIN/NAME, as `Registry.components` gives them: those
-    of qgs first. What none recognises is left to `qgs/photos`, whose error says what a folder of
-    photos needs. Raises FileNotFoundError when `path` does not exist.
+    Photos say best what a folder lacks. Raises FileNotFoundError when `path` does not exist.
     """
     if not path.exists():
         raise FileNotFoundError(
@@ -35,11 +33,10 @@ def open_for(
     trained: SceneSourceConfig | None,
     sources: Mapping[str, type[Component]],
 ) -> tuple[SceneSource, bool]:
-    """The data at `path`, and whether it is what a model with the data `trained` was trained on.
+    """The data at `path`, and whether a model with the data `trained` was trained on it.
 
-    If so it is opened with the same options, held-out frames included; else as `recognised`.
-    image_size: (H, W), by default that of `trained`. Raises as `recognised`, and as the source does
-    when it is opened.
+    Then it has the same options, held-out frames included; else it is opened as `recognised`.
+    image_size: (H, W), by default that of `trained`. Raises as `recognised` and the source do.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
     place = opened_path(path)

@@ -83,11 +83,9 @@ def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
 def draw_frames(
     scene: Scene, views: ViewsConfig, rng: np.random.Generator
 ) -> tuple[Frames, Frames]:
-    """Input frames, ascending, and target frames of a training sample.
+    """Input frames, ascending, and target frames of a training sample, of a span of usable ones.
 
-    The gap counts steps between frames that training may see. Targets are frames of the span that
-    are no inputs; where those are too few, input frames join them, and where even these are too
-    few, frames come again.
+    Targets are no inputs, where there are enough frames; then inputs join, then frames repeat.
     """
     usable = training_frames(scene)
     low, high = gap_range(len(usable), views, scene.name)
@@ -124,8 +122,8 @@ def make_sample(
         None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
     )
     both = mirrored_views(both) if mirror else both
-    inputs = both.select(slice(0, len(input_frames)))
-    targets = both.select(slice(len(input_frames), None))
+    count = len(input_frames)
+    inputs, targets = both.select(slice(0, count)), both.select(slice(count, None))
     return Sample(scene.name, inputs, targets, input_frames, target_frames)
 
 
@@ -172,11 +170,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 def stack_views(views: Sequence[Views]) -> Views:
     """Views (B, V) of several (b, V), on the CPU; masks of 1 where only others have some."""
-    cameras = Cameras(
-        torch.cat([v.cameras.c2w for v in views]),
-        torch.cat([v.cameras.intrinsics for v in views]),
-        views[0].cameras.size,
-    )
+    c2w = torch.cat([v.cameras.c2w for v in views])
+    intrinsics = torch.cat([v.cameras.intrinsics for v in views])
+    cameras = Cameras(c2w, intrinsics, views[0].cameras.size)
     images = np.concatenate([v.images.numpy() for v in views])
     masks = None
     if any(v.masks is not None for v in views):

@@ -52,15 +52,11 @@ def training_batches(
 ) -> Generator[Batch, None, None]:
     """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
-    Each epoch visits every training scene once (see `SceneOrder`). Sample k of the whole sequence
-    depends on (seed, k) alone. Global batch n is the samples from n * batch_size * processes on,
-    and every process gets its slice: so W processes see together what one with W times the batch
-    size sees, `start` resumes exactly, and the number of workers changes nothing.
-
-    workers: processes that decode; with 0 the next batch is made in a thread while the caller uses
-    this one. Closing the generator ends them.
-    Raises ValueError when the source has no training scenes or a scene has too few frames,
-    SampleError, which is one too, for a sample that cannot be made, and WorkerError.
+    Sample k depends on (seed, k) alone. Global batch n is the samples from n * batch_size *
+    processes on, of which every process gets its slice: `start` resumes exactly, and processes and
+    workers change nothing. workers: processes that decode; 0 decodes in a thread. Closing ends
+    them.
+    Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
     batches = _Batches(source, views, seed, batch_size, share)
     return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
@@ -77,9 +73,8 @@ def scenes_fingerprint(source: SceneSource) -> str:
 class SceneOrder:
     """The scenes of an endless sequence of samples: a function of (groups, seed) alone.
 
-    groups: scene indices by where they are stored, see `SceneSource.groups`. Each epoch visits
-    every scene once: the groups in a random order, the scenes of a group one after another in a
-    random order. Raises ValueError unless the groups hold each of `count` scenes once.
+    Each epoch visits the `groups` (see `SceneSource.groups`) in a random order, and the scenes of
+    each at random. Raises ValueError unless the groups hold each of `count` scenes once.
     """
 
     def __init__(self, groups: Sequence[Sequence[int]], count: int, seed: int) -> None:

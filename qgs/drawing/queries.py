@@ -26,11 +26,10 @@ OUTLINE_POINTS = 96
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Outlines in one image, pixels. whole: the ellipsoid is in front of the camera, all of it.
+    """Outlines in one image, pixels: centers (N, 2), semi-axes as columns of axes (N, 2, 2).
 
-    centers: (N, 2) of the outlines. axes: (N, 2, 2), semi-axes as columns. Only rows where `whole`
-    is true are ellipses. points: (N, 2) the ellipsoids' own centres in the image, at camera-frame
-    z `depths` (N,); only those of positive depth mean something.
+    Only rows where `whole` (all in front of the camera) are ellipses. points: (N, 2), the
+    ellipsoids' own centres at camera-frame z `depths` (N,); only positive depths mean something.
     """
 
     centers: Tensor

@@ -30,9 +30,8 @@ def formats_of(folder: UPath) -> list[str]:
 def read_listing(folder: UPath, format: Format = "auto", images: str | None = None) -> Listing:
     """The photos that `folder` lists in `format`, or in the first of `READERS` that it holds.
 
-    images: folder of photos to read instead of the one that the listing means, such as images_4.
-    Which of several formats is read is logged. Raises FileNotFoundError for a folder that does not
-    exist or lists no photos, ValueError for a listing that cannot be read.
+    images: another folder of photos, such as images_4. Raises FileNotFoundError for no folder or no
+    listing, ValueError for a listing that cannot be read.
     """
     if not folder.is_dir():
         raise FileNotFoundError(

@@ -54,12 +54,7 @@ class Nerfstudio(PhotoReader):
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
-    """The frames of a transforms file, in its order, with names relative to its folder.
-
-    A focal length given as an angle of view needs an image size: that of the first image, where the
-    file gives none. What is wrong with single frames is told in them. Raises ValueError for a file
-    that is no JSON or lists no frames, and for a split that names a file that no frame has.
-    """
+    """The frames of a transforms file in order, with their faults in them. Raises ValueError."""
     try:
         data = json.loads(file.read_bytes())  # with or without a byte order mark
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from qgs.data.photos import READERS, Format, read_listing
 from qgs_datatools.cameras import camera_findings, sharing_findings
 from qgs_datatools.candidates import Candidate
 from qgs_datatools.chunks import chunk_folders
-from qgs_datatools.decoding import DecodedScene, decode_scene, file_findings, size_findings
+from qgs_datatools.decoding import DecodedScene, decode, file_findings, size_findings
 from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
@@ -27,13 +29,7 @@ _LISTINGS = {**_PHOTO_FORMATS, "dl3dv": "transforms.json", "chunks": "the chunk"
 
 @dataclass(frozen=True)
 class Options:
-    """How thorough a check is.
-
-    geometry: poses are judged against photos in so many scenes, spread over the data set.
-    headers_only: no image is decoded, and none is matched. format: of photos, chunks, dl3dv or
-    PLUGIN/NAME of a plugin's source; auto tells it from what is there. images: folder of photos to
-    read instead of the listed one, such as images_4.
-    """
+    """How thorough a check is: the options of `qgs data check`; format may also be PLUGIN/NAME."""
 
     geometry: int = 20
     headers_only: bool = False
@@ -46,10 +42,9 @@ class Options:
 class SceneReport:
     """What was found in a scene.
 
-    split: train or test, empty where the format has none. listed, decodable, missing: numbers of
-    photos. pose_problems: of frames whose pose is wrong. c2w: (F, 3, 4) float32 OpenCV poses of
-    `frames`, those that can be drawn; fov: (F, 2) tangents of half the angles of view, x and y.
-    geometry: None where it was not asked for.
+    split: empty where the format has none. pose_problems: frames whose pose is wrong. c2w: (F, 3,
+    4) float32 OpenCV poses of `frames`, those that can be drawn; fov: (F, 2) tangents of half the
+    angles of view, x and y. geometry: None where it was not asked for.
     """
 
     name: str
@@ -112,9 +107,8 @@ def check(
 ) -> CheckReport:
     """Check the data set at `path`, and evaluation indices: those given and those beside it.
 
-    progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError when there
-    is no data set at `path`, or no file at one of `indices`, and MissingExtraError when a package
-    that the format needs is missing, ValueError for an unknown format.
+    progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError without a
+    data set or an index, MissingExtraError for the format, ValueError for an unknown one.
     """
     formats = ("auto", *_LISTINGS, *(kind for kind in sources() if not kind.startswith("qgs/")))
     if options.format not in formats:
@@ -195,7 +189,9 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     if not photos:
         nothing = Finding(name, "no photos are listed", "export the scene again")
         return replace(report, findings=[nothing])
-    scene = decode_scene(name, photos, options.threads, options.headers_only)
+    with ThreadPoolExecutor(options.threads) as pool:
+        decoded = pool.map(partial(decode, headers_only=options.headers_only), photos)
+    scene = DecodedScene(name, photos, list(decoded))
     files = list(file_findings(scene, _LISTINGS.get(candidate.kind, "the data set")))
     sizes = list(size_findings(scene))
     poses, others = camera_findings(scene, _frames(sizes))

@@ -197,9 +197,7 @@ def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None
         raise typer.BadParameter("give --test-scenes or --test-every, not both")
     if test_scenes is not None:
         return splits_by_list(source, read_scene_list(opened_path(test_scenes)))
-    if test_every is not None:
-        return splits_by_number(source, test_every)
-    return own_splits(source)
+    return own_splits(source) if test_every is None else splits_by_number(source, test_every)
 
 
 def _print_packed(console: Console, packed: Packed, out: str) -> None:

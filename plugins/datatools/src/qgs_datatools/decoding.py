@@ -6,7 +6,6 @@ import hashlib
 import io
 import re
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import median, median_low
 
@@ -52,16 +51,8 @@ class DecodedScene:
         return Finding(self.name, reason, fix, tuple(frames), names, severity)
 
 
-def decode_scene(
-    name: str, photos: Sequence[Photo], threads: int, headers_only: bool
-) -> DecodedScene:
-    """Try all photos, or their headers alone."""
-    with ThreadPoolExecutor(threads) as pool:
-        decoded = pool.map(lambda photo: _decode(photo, headers_only), photos)
-        return DecodedScene(name, photos, list(decoded))
-
-
-def _decode(photo: Photo, headers_only: bool) -> Decoded:
+def decode(photo: Photo, headers_only: bool) -> Decoded:
+    """Try a photo, or its header alone."""
     if not photo.exists or not photo.listed.name:
         return Decoded()
     try:
@@ -144,9 +135,8 @@ class _Sized:
 def size_findings(scene: DecodedScene) -> Iterator[Finding]:
     """Photos of another shape than listed, of another scale than the rest, or that shrank unasked.
 
-    A scaled copy of the whole scene is right, since intrinsics follow the size; it is told only
-    where the folder is not named as one (images_4), and is an error where intrinsics fit the files
-    and not the listed size.
+    Intrinsics follow a scaled copy of the whole scene: it is told only where its folder is not
+    named as one (images_4), and an error where they fit the files and not the listed size.
     """
     alike: list[_Sized] = []
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):

@@ -64,11 +64,9 @@ def match(first: Features, second: Features, seed: int = 0) -> np.ndarray | None
 
 @dataclass(frozen=True)
 class Pair:
-    """Two frames and what they share.
+    """Two frames and the P points they share; pixels (x, y), sizes (H, W).
 
-    matches: (2, P, 2) x, y in pixels of the same P scene points in each photo. poses: (2, 4, 4)
-    camera-to-world, OpenCV axes as read. intrinsics: (2, 4) fx, fy, cx, cy. size: (H, W) of both
-    photos, pixels.
+    matches: (2, P, 2). poses: (2, 4, 4) camera-to-world, OpenCV. intrinsics: (2, 4) fx, fy, cx, cy.
     """
 
     frames: tuple[int, int]
@@ -78,11 +76,7 @@ class Pair:
     size: tuple[int, int]
 
     def lines(self, reading: Reading = np.asarray) -> np.ndarray:
-        """The lines (2, P, 3) on which the matches in each photo must lie, if poses are meant so.
-
-        A line is a, b, c of a x + b y + c = 0, in pixels; each is that of the point in the other
-        photo. The fundamental matrix is that of Hartley and Zisserman (2004), section 9.2.
-        """
+        """Epipolar lines (2, P, 3), a x + b y + c = 0 (Hartley and Zisserman, section 9.2)."""
         first, second = (reading(pose) for pose in self.poses)
         relative = np.linalg.inv(second) @ first
         x, y, z = relative[:3, 3]

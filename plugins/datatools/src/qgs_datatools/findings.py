@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from operator import attrgetter
 from typing import Any, Literal, TypeAlias
 
@@ -15,11 +16,7 @@ _FEW = 3
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault and its remedy.
-
-    scene: its name; the file where no scene can be told. frames: their numbers in the listing, from
-    0; names: the same frames' names. severity: an error makes results wrong or ends a run.
-    """
+    """A fault and its remedy. frames, names: as listed. An error makes results wrong."""
 
     scene: str
     reason: str
@@ -49,12 +46,9 @@ def errors_of(findings: Iterable[Finding]) -> list[Finding]:
 
 def spans(numbers: Iterable[int]) -> str:
     """Numbers in words, such as 0-3, 7; after eight runs the rest is counted."""
-    runs: list[list[int]] = []
-    for number in sorted(set(numbers)):
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
+    # numbers of one run are all equally far ahead of their places
+    alike = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
+    runs = [[number for _, number in run] for _, run in alike]
     shown = [f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:8]]
     more = sum(map(len, runs[8:]))
     return ", ".join(shown) + (f" and {more} more" if more else "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -29,10 +30,9 @@ _NONSENSE = 0.02  # of the diagonal: no lens or rounding explains more
 class Geometry:
     """How well the poses of a scene explain its photos.
 
-    distances: median over pairs of the distance of matches to their epipolar lines, for each
-    reading of the poses, fractions of the diagonal; empty where nothing could be judged, and
-    unjudged says why. pairs: the worst first, as read; photos: both of the worst one as it was
-    matched, (H, W, 3) uint8. diagonal: of the photos' files, in pixels.
+    distances: median over pairs of the distance of matches to epipolar lines by reading of the
+    poses, fractions of the diagonal; empty where `unjudged` says why. pairs: the worst first;
+    photos: both of the worst one, (H, W, 3) uint8. diagonal: of the files, in pixels.
     """
 
     distances: Mapping[str, float] = field(default_factory=dict)
@@ -72,7 +72,7 @@ def judge_scene(scene: DecodedScene, sound: Sequence[int], convention: Conventio
     if not np.ptp(matcher.centres, axis=0).any():
         return Geometry(unjudged="all cameras on one point")
     starts = np.linspace(0, len(sound) - 2, _STARTS).round().astype(int).tolist()
-    pairs = [pair for start in dict.fromkeys(starts) if (pair := matcher.first_pair(start))]
+    pairs = [pair for start in dict.fromkeys(starts) for pair in islice(matcher.pairs(start), 1)]
     if not pairs:
         return Geometry(unjudged=TOO_FEW)
     pairs.sort(key=lambda pair: -pair.distance())
@@ -100,10 +100,9 @@ class _Matcher:
         """The photo as it is matched, and its intrinsics; by its number in the scene."""
         return self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
 
-    def first_pair(self, start: int) -> Pair | None:
-        """The frame at `start` and the first of its partners that shares enough with it."""
-        pairs = (self.pair(start, place) for place in self.partners(start))
-        return next((pair for pair in pairs if pair is not None), None)
+    def pairs(self, start: int) -> Iterator[Pair]:
+        """The frame at `start` with each of its partners that shares enough with it."""
+        return filter(None, (self.pair(start, place) for place in self.partners(start)))
 
     def pair(self, first: int, second: int) -> Pair | None:
         """None where too little is shared."""

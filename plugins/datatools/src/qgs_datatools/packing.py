@@ -93,8 +93,7 @@ class Journal:
 def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
     """The journal in `folder`, a new one where nothing is there yet.
 
-    Raises FileExistsError for a folder that holds something else, and ValueError for one with an
-    unfinished packing of other settings, or with a journal that is none.
+    Raises FileExistsError for other content, ValueError for other settings or a strange journal.
     """
     settings = json.loads(json.dumps(settings))
     file = folder / JOURNAL
@@ -139,11 +138,10 @@ def _is_unfinished(path: UPath) -> bool:
 
 @dataclass
 class Packed:
-    """What a packing did.
+    """What a packing did: scenes by split, of which `resumed` were packed before.
 
-    scenes: packed, by split, those of interrupted packings included. resumed: those of them that
-    were packed before. frames, kept: images written now, and those of them whose bytes stayed as
-    they were. left_out: scenes that could not be read, with the reason.
+    frames, kept: images written now, and those whose bytes stayed. left_out: scenes that could not
+    be read, with the reason.
     """
 
     scenes: dict[Split, int] = field(default_factory=dict)
@@ -164,16 +162,11 @@ def pack(
     leave_out_broken: bool = False,
     progress: Callable[[str], None] = lambda scene: None,
 ) -> Packed:
-    """Write the scenes of `splits` as chunks to `folder`/train and `folder`/test.
+    """Write the scenes of `splits` to `folder`, as chunks of at most `chunk_bytes` or one scene.
 
-    A chunk is closed before it would pass `chunk_bytes`, unless it is one scene. An interrupted
-    packing goes on after its last complete chunk when it is called again; until all is complete
-    there is no index.json.
-
-    settings: everything that decides what the source holds, as JSON; a packing with others does not
-    go on. leave_out_broken: whether scenes that cannot be read are left out, counted and named in
-    the result; a packing that goes on tries them again. progress: told each scene that is dealt
-    with.
+    An interrupted packing goes on after its last complete chunk, if `settings`, which decide what
+    the source holds, are the same; index.json comes last. leave_out_broken: unreadable scenes are
+    left out, named in the result and tried again. progress: told each scene that is dealt with.
     Raises FileExistsError for a folder with other content, ValueError and OSError as the scenes do.
     """
     encoding = encoding or Encoding()
@@ -239,10 +232,9 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
 
 @contextmanager
 def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
-    """A file to write, which takes the place of `path` when the block ends well.
+    """A file that replaces `path` when the block ends well; missing parent folders are made.
 
-    Makes missing parent folders. Object stores show an object when it is complete, so moving it is
-    as atomic as their copying. When the block raises, `path` stays as it was.
+    Moving is as atomic as the file system's: object stores show an object when it is complete.
     """
     if is_local(path):
         with replacing(Path(str(path))) as temporary, temporary.open("wb") as file:

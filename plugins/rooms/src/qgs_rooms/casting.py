@@ -25,11 +25,7 @@ def cast_images(
     size: tuple[int, int],
     samples: int,
 ) -> np.ndarray:
-    """Images (F, H, W, 3) uint8; a pixel is the mean of samples x samples rays on a regular grid.
-
-    floor: see `shading.floor_shadows`. c2w: (F, 4, 4) OpenCV. intrinsics: fx, fy, cx, cy in pixels.
-    size: (H, W).
-    """
+    """Images (F, H, W, 3) uint8, means of samples^2 rays. c2w: OpenCV. intrinsics: in pixels."""
     images = np.empty((len(c2w), *size, 3), np.uint8)
     packed = (room.shapes, room.textures, room.size, room.lights)
 
