@@ -67,10 +67,7 @@ class SavedState:
 def write_state(
     path: str | os.PathLike[str], recipe: Mapping[str, Any], parts: Mapping[str, State]
 ) -> None:
-    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree.
-
-    Raises OSError when the disk is full.
-    """
+    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, dict[str, Any]] = {}
     for part, state in parts.items():
@@ -88,10 +85,7 @@ def write_state(
 
 
 def read_state(path: str | os.PathLike[str]) -> SavedState:
-    """What `write_state` wrote.
-
-    Raises FileNotFoundError, CheckpointError, and the composer's error when a plugin is missing.
-    """
+    """What `write_state` wrote; raises FileNotFoundError, CheckpointError, RecipeError."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no training state at {path}")
     with opened_tensors(path) as file:

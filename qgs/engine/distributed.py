@@ -42,8 +42,7 @@ def wants_shards(accelerator: Accelerator) -> bool:
 def shard(model: QueryGaussianModel) -> None:
     """Lay the parameters of `model` in shards over all processes (FSDP2), in place.
 
-    Each decoder layer gathers its weights when it runs; the rest is gathered for the whole pass.
-    Parameters without a dimension to cut stay whole on every process, see `average_gradients`.
+    Each decoder layer gathers its own when it runs. Scalars stay whole, see `average_gradients`.
     """
     scalars = {parameter for parameter in model.parameters() if parameter.ndim == 0}
     for layer in model.decoder:
@@ -149,9 +148,8 @@ class StopRequest:
 def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
     """Turn the first SIGINT or SIGTERM inside the block into a request, and say so unless `quiet`.
 
-    Launchers (torchrun, Slurm) send their signals more than once, so that later ones are ignored;
-    only a second SIGINT, PAUSE seconds or more after the first, raises KeyboardInterrupt.
-    Outside the main thread, where Python delivers no signals, requests never come.
+    Launchers repeat their signals, so later ones are ignored; only a second SIGINT, PAUSE seconds
+    or more after the first, raises KeyboardInterrupt. Outside the main thread none ever comes.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():

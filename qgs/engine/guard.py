@@ -116,8 +116,7 @@ class Guard:
     def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
         """Look into the step after `step`, which is not finite; return to go on without it.
 
-        Raises NonFiniteError, the run then being saved as it was before that step, and
-        CollapseError when the model is already lost.
+        Raises NonFiniteError, the run saved as before that step, or CollapseError.
         """
         found, in_data = self.look_into(step + 1, batches, symptom)
         if self._skips and self.skipped <= MAX_SKIPPED:
@@ -200,8 +199,7 @@ class Guard:
         self.save_to_go_on(step)
 
     def _refuse_broken_weights(self, step: int) -> None:
-        problem = broken_tensors(self._saver.model)
-        if problem:
+        if problem := broken_tensors(self._saver.model):
             self._collapse(step, problem, NONFINITE_CAUSES)
 
     def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:

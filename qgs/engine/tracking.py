@@ -110,8 +110,8 @@ class TrainingProgress:
     ) -> bool:
         """Show a step, unless the last one was shown a moment ago; returns whether it did.
 
-        images, seconds: of the whole run so far. used: fraction of the budget. Speed and time left
-        are those of this session, which began with the first step that this is told.
+        images, seconds: of the whole run so far; what is shown is of this session. used: fraction
+        of the budget.
         """
         if self._start is None:
             self._start = images, seconds, used
