@@ -24,11 +24,7 @@ class TensorContainer:
     """A frozen dataclass of tensors, containers and mappings of them."""
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """The container with every tensor moved as by `Tensor.to`.
-
-        A dtype converts every tensor, poses, rays and other geometry included, which then is no
-        longer the float32 that components count on.
-        """
+        """The container with every tensor moved as by `Tensor.to`; a dtype moves geometry too."""
         return map_tensors(lambda x: x.to(*args, **kwargs), self)
 
 

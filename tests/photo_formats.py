@@ -5,6 +5,7 @@ The writers share no code with the readers: they follow the descriptions of the 
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -65,14 +66,32 @@ def real_folder(name: str) -> Path:
     return PHOTOS / name
 
 
-def opened(path: Path | str, size=(30, 40), **options: Any) -> PhotosSource:
-    config = {"path": str(path), "image_size": size, **options}
-    return PhotosSource(PhotosSource.Config.model_validate(config))
+def opened(path: Any, size=(30, 40), source: Any = PhotosSource, **options: Any) -> Any:
+    """The data at `path`, opened by a class of sources."""
+    return source(source.Config(path=str(path), **{"image_size": size, **options}))
+
+
+def encoded(image: np.ndarray | Image.Image, kind: str = "PNG", **options: Any) -> bytes:
+    """The bytes of an image file. image: (H, W, 3 or 4) uint8."""
+    file = io.BytesIO()
+    image = image if isinstance(image, Image.Image) else Image.fromarray(image)
+    image.save(file, kind, **options)
+    return file.getvalue()
+
+
+def row_of_frames(count: int, **top: Any) -> dict[str, Any]:
+    """The content of transforms.json for `images/0.png`, ...: cameras a unit apart along x."""
+    frames = []
+    for i in range(count):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    return {**top, "frames": frames}
 
 
 def scene(path: Path | str, size=(30, 40), **options: Any) -> PhotoScene:
     """The first training scene of what is `opened`."""
-    return opened(path, size, **options).scenes("train")[0]  # pyright: ignore[reportReturnType]
+    return opened(path, size, **options).scenes("train")[0]
 
 
 def centred(photos: PhotoSet) -> PhotoSet:
@@ -121,13 +140,8 @@ def write_blender(folder: Path, photos: PhotoSet, train: int, val: int = 0) -> P
         for file, pose in zip(photos.files[chosen], photos.c2w[chosen], strict=True):
             (folder / part).mkdir(parents=True, exist_ok=True)
             Image.open(file).save(folder / part / f"{file.stem}.png")
-            frames.append(
-                {
-                    "file_path": f"./{part}/{file.stem}",
-                    "rotation": 0.01,
-                    "transform_matrix": opengl(pose),
-                }
-            )
+            frame = {"file_path": f"./{part}/{file.stem}", "rotation": 0.01}
+            frames.append({**frame, "transform_matrix": opengl(pose)})
         if frames:
             angle = 2 * math.atan(photos.size[1] / 2 / photos.intrinsics[0])
             content = {"camera_angle_x": angle, "frames": frames}
@@ -158,7 +172,7 @@ def write_colmap(
     """kind: text or binary. Images are listed backwards, with two observations each."""
     names = copied(photos, folder / images, names)
     (folder / model).mkdir(parents=True)
-    poses = [world_to_camera(pose) for pose in photos.c2w]
+    poses = map(world_to_camera, photos.c2w)
     entries = list(zip(range(1, len(names) + 1), poses, names, strict=True))[::-1]
     write = {"text": _write_text, "binary": _write_binary}[kind]
     write(folder / model, entries, camera or photos.pinhole, photos.size)

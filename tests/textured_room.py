@@ -1,10 +1,9 @@
 """Photos of the inside of a textured box, with exact cameras, for matching features."""
 
-import io
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
+import photo_formats
 
 SIZE = (120, 180)
 INTRINSICS = (145.0, 147.0, 89.0, 61.0)
@@ -18,9 +17,7 @@ class Shot:
     c2w: np.ndarray
 
     def encoded(self, kind: str = "JPEG") -> bytes:
-        file = io.BytesIO()
-        Image.fromarray(self.image).save(file, kind, quality=92)
-        return file.getvalue()
+        return photo_formats.encoded(self.image, kind, quality=92)
 
 
 def walk(count: int, seed: int = 0) -> list[Shot]:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import pytest
 import torch
 from rich.console import Console
 
 from qgs.composer import Recipe
+from qgs.data.sampling import Batch
+from qgs.data.stream import SampleStream
 from qgs.engine import RunFolder, TrainingResult, train
 from qgs.engine.distributed import StopRequest
 from qgs.engine.tracking import TrainingProgress
@@ -59,3 +63,34 @@ def same(first: Mapping[str, torch.Tensor], second: Mapping[str, torch.Tensor]) 
 
 def losses(run: Path) -> list[float]:
     return [record["loss"] for record in RunFolder(run).history()]
+
+
+def read_jsonl(path: Path) -> list[dict[str, Any]]:
+    """The records of a JSONL file, each strictly JSON."""
+
+    def refuse(constant: str) -> float:
+        raise ValueError(f"{constant} is no JSON")
+
+    text = path.read_text(encoding="utf-8").splitlines()
+    return [json.loads(line, parse_constant=refuse) for line in text]
+
+
+def change_batches(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[Batch, Sequence[int]], None]
+) -> None:
+    """`change(batch, numbers of its samples)` alters each training batch in place."""
+    whole = SampleStream.batch
+
+    def changed(stream: SampleStream, numbers: Sequence[int]) -> Batch:
+        batch = whole(stream, numbers)
+        change(batch, numbers)
+        return batch
+
+    monkeypatch.setattr(SampleStream, "batch", changed)
+
+
+def tensorboard_events(folder: Path) -> Any:
+    """What TensorBoard reads of a run; the test is skipped without it."""
+    name = "tensorboard.backend.event_processing.event_accumulator"
+    module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
+    return module.EventAccumulator(str(folder / "tensorboard")).Reload()

@@ -100,11 +100,7 @@ def orbit_path(
 
 
 def orbit(inputs: Cameras, depth: float, frames: int, sway: float = 0.12) -> Cameras:
-    """A loop (1, frames) that runs past the input cameras (1, V), there and back.
-
-    The base path is the input poses under a Gaussian kernel, so it has no corners. Around it the
-    camera sways by `sway` times `depth`, and looks at what lies `depth` world units ahead.
-    """
+    """A loop (1, frames) past the input cameras (1, V), swaying by `sway` times `depth`."""
     angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
     count = inputs.shape[1]
     # From 0, the first input, to count - 1, the last, and back.
@@ -133,11 +129,7 @@ def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One rendered view against its photo; all PSNR in dB.
-
-    kind: one of KINDS. baselines: PSNR of the nearest input view and of the inputs' mean colour;
-    empty for inputs.
-    """
+    """A rendered view against its photo, of one of KINDS; PSNR in dB. baselines: not of inputs."""
 
     frame: int
     kind: str
@@ -170,11 +162,7 @@ def reconstruct(
     tuned: Gaussians | None = None,
     tuning: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
-    """Gaussians from the inputs of `sample`, rendered from its inputs, then its targets.
-
-    world, tuning: see `Reconstruction`. seen: frames that the model was trained on. tuned: the
-    Gaussians of tuned tokens, None for the model's own.
-    """
+    """Gaussians of `sample`, rendered from its views. seen: in training. tuned: given ones."""
     gaussians: Gaussians = model(sample.inputs).gaussians if tuned is None else tuned
     rendering = model.render(gaussians, _cameras(sample))
     truth = sample.targets.images

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
 from qgs.analysis.reconstruction import orbit_path
@@ -41,11 +41,7 @@ from qgs.types import Prediction
 
 @dataclass(frozen=True)
 class Contender:
-    """A trained model and its figures.
-
-    scores: means over unseen scenes of `Report.columns`. gaussians: per scene. seconds: of
-    training. recipe: the resolved recipe as YAML.
-    """
+    """A trained model. scores: means of `Report.columns`. seconds: of training. recipe: YAML."""
 
     name: str
     model: QueryGaussianModel
@@ -84,16 +80,11 @@ class Report:
     facts: Mapping[str, str]
 
 
-SIDE = 256
-"""Pixels on the longer side of pictures that models render for show."""
-
+SIDE = 256  # pixels on the longer side of pictures that models render for show
 TOKENS = 5
 ANCHORS = 12
 ORBIT_FRAMES = 32
-TARGETS = 2
-"""Target views of each scene that are shown."""
-
-
+TARGETS = 2  # target views of each scene that are shown
 Shown = Sequence[tuple[Contender, Prediction]]
 """Every contender with what it predicts for the sample that most sections picture."""
 
@@ -109,10 +100,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A heading, a paragraph, and figures below the name of their model.
-
-    width: least width of a figure on the page, CSS pixels.
-    """
+    """A heading, a text, and figures by model, at least `width` CSS pixels wide."""
 
     title: str
     text: str
@@ -131,17 +119,23 @@ def report_html(report: Report) -> str:
         scene_columns(report.contenders, sample, depth)
         for sample, depth in zip(report.samples, report.depths, strict=True)
     ]
+    environment = page_environment(uri=_uri, hex=hex_color)
+    return environment.get_template("report.html").render(
+        report=report, scenes=scenes, sections=sections
+    )
+
+
+def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:
+    """Jinja for pages whose templates are in `packages`, or else in qgs.analysis."""
     environment = Environment(
-        loader=PackageLoader("qgs.analysis", "template"),
+        loader=ChoiceLoader([PackageLoader(p, "template") for p in (*packages, "qgs.analysis")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(uri=_uri, hex=hex_color)
-    return environment.get_template("report.html").render(
-        report=report, scenes=scenes, sections=sections
-    )
+    environment.filters.update(filters)
+    return environment
 
 
 def _uri(image: Picture | list[Picture]) -> str:
@@ -151,10 +145,7 @@ def _uri(image: Picture | list[Picture]) -> str:
 def scene_columns(
     contenders: Sequence[Contender], sample: Sample, depth: Tensor | None
 ) -> dict[str, Any]:
-    """Of one unseen scene the name, the input photos, and by heading: truth, renders, depths.
-
-    depth: the true one (T, 1, H, W), where it is known.
-    """
+    """Name, inputs and columns of pictures of a scene. depth: the true one (T, 1, H, W)."""
     shown = sample.targets.select(slice(TARGETS))
     frames = [f"frame {frame}" for frame in (*sample.input_frames, *sample.target_frames)]
     inputs = len(sample.input_frames)
@@ -214,10 +205,7 @@ def tokens(shown: Shown, sample: Sample) -> ReportSection:
 
 
 def anchors(shown: Shown, sample: Sample) -> ReportSection:
-    """Supports on the first input view, before the decoder and after each layer.
-
-    Queries without a place in space have none.
-    """
+    """Supports on the first input view, before the decoder and after each layer."""
     figures: dict[str, list[Tile]] = {}
     camera = sample.inputs.cameras[:, :1]
     photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE)

@@ -24,11 +24,7 @@ from qgs.types import ImageMemory, QueryState, map_tensors
 
 @dataclass
 class LayerTrace:
-    """What one decoder layer did to the Q chosen queries.
-
-    before, after: states (B, Q, ...) entering the layer and leaving its refinement. Attention is
-    over image tokens (cross) and over all N queries (self); None where `absent` says why.
-    """
+    """A layer's Q queries: states (B, Q, ...), attention, and why one is `absent`."""
 
     before: QueryState
     after: QueryState | None = None
@@ -86,9 +82,7 @@ class _Recorder:
     """The hooks of one `trace` block. Layers run in order, so refinements may share a module."""
 
     def __init__(self, record: Trace, layers: Collection[int]) -> None:
-        self.record = record
-        self.layers = layers
-        self.current = 0
+        self.record, self.layers, self.current = record, layers, 0
 
     def hook_into(self, model: QueryGaussianModel) -> Iterator[RemovableHandle]:
         """Register the hooks, each when asked for the next one."""

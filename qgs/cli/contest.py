@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import platform
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+import typer
 import yaml
 from rich import box
 from rich.table import Table
@@ -24,10 +26,6 @@ SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
 
 PICTURED_SCENES = 3
-
-
-class StoppedError(Exception):
-    """Someone stopped the contest; the argument is the signal's name."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +58,11 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 
 
 def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry:
-    """Train and evaluate one recipe. Raises StoppedError when training was stopped."""
+    """Train and evaluate one recipe. Raises typer.Exit when training was stopped."""
     result = train(recipe, run, device=device)
     if result.stopped_by:
-        raise StoppedError(result.stopped_by)
+        typer.echo(f"stopped by {result.stopped_by}; no report", err=True)
+        raise typer.Exit(128 + signal.Signals[result.stopped_by])
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
     contender = Contender(

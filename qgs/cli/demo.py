@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from itertools import chain, count
 from pathlib import Path
 from typing import Annotated
@@ -46,9 +45,6 @@ def demo(
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
         try:
             entries.append(contest.compete(name, recipe, target / name, device))
-        except contest.StoppedError as stop:
-            typer.echo(f"stopped by {stop}; no report", err=True)
-            raise typer.Exit(128 + signal.Signals[str(stop)]) from None
         except TrainingError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None

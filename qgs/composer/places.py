@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from qgs.composer.errors import Problems, nearest
 from qgs.composer.files import merge
 from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, kind_of
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, Slot, slot_at
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, Slot, slot_at
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
         if section.named:
             written = tree.child(name).items()
             places += [_place(tree, (name, key)) for key, node in written if node is not None]
-        elif SLOTS[name].default or tree.get(name) is not None:
+        elif section.default or tree.get(name) is not None:
             places.append(_place(tree, (name,)))
     return {place.path: place for place in places}
 

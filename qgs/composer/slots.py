@@ -12,10 +12,19 @@ from qgs.composer.nodes import KeyPath, MapNode
 
 @dataclass(frozen=True)
 class Slot:
-    """One kind of place. default: the `type` of a place that names none; None if it must."""
+    """One kind of place. default: the `type` of a place that names none; None if it must.
+
+    The rest is for slots that are top-level sections. named: whether the section maps names to
+    components; else it is one component, and there is always one if there is a `default`.
+    defaults: name to type of the components of a recipe that lacks the section. defaults_stay:
+    whether they also stand beside those that are written; `NAME: null` drops one.
+    """
 
     contract: type[contracts.Component]
-    default: str | None
+    default: str | None = None
+    named: bool = False
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    defaults_stay: bool = False
 
     @property
     def name(self) -> str:
@@ -23,6 +32,8 @@ class Slot:
         return self.contract.slot
 
 
+DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
+DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
 SLOTS = {
     slot.name: slot
     for slot in (
@@ -36,15 +47,18 @@ SLOTS = {
         Slot(contracts.Centers, "qgs/free"),
         Slot(contracts.Supervision, "qgs/layers"),
         Slot(contracts.Renderer, "qgs/auto"),
-        Slot(contracts.Loss, None),
-        Slot(contracts.Metric, None),
+        Slot(contracts.Loss, named=True, defaults=DEFAULT_LOSSES),
+        Slot(contracts.Metric, named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
         Slot(contracts.Optimizer, "qgs/adamw"),
-        Slot(contracts.SceneSource, None),
+        Slot(contracts.SceneSource),
     )
 }
-
 MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
 LAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward", "refinement")
+<<<<<<< HEAD
+SECTIONS = {name: SLOTS[name] for name in ("losses", "data", "metrics", "optimizer")}
+"""Slots that are top-level sections of a recipe."""
+=======
 
 
 @dataclass(frozen=True)
@@ -71,6 +85,7 @@ SECTIONS = {
     "optimizer": Section(),
 }
 
+>>>>>>> r5
 MOVED = {
     "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
     "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",

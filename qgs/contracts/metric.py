@@ -14,10 +14,7 @@ from qgs.types import Gaussians, TensorContainer, Views
 
 @dataclass(frozen=True)
 class Column:
-    """How a value is shown. digits: after the point; comparisons show one more.
-
-    heading: without unit and arrow. unit: "" for a number without one.
-    """
+    """How a value is shown. digits: after the point; comparisons show one more."""
 
     heading: str
     better: Literal["higher", "lower"]
@@ -79,7 +76,7 @@ class Metric(Component, torch.nn.Module):
     unavailable: str = ""
 
     def columns(self) -> Mapping[str, Column]:
-        """How values are shown, by key. Override it for several values, or headings by option.
+        """How values are shown, by key; override it for several values or headings by option.
 
         A value is called as the recipe calls the metric, with `_KEY` behind unless the key is "".
         """
@@ -87,7 +84,7 @@ class Metric(Component, torch.nn.Module):
 
     @abstractmethod
     def forward(self, given: MetricInput) -> Tensor | Mapping[str, Tensor]:
-        """A tensor such as (1, T), one number for each view; several by the keys of `columns`.
+        """A tensor such as (1, T), one number per view, or several by the keys of `columns`.
 
-        The value of a sample is the mean of all numbers in float64, of a scene that of its samples.
+        A sample's value is the mean of all numbers in float64, a scene's that of its samples.
         """

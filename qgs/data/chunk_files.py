@@ -39,7 +39,6 @@ SUFFIX = ".torch"
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
 _DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
-_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 @dataclass(frozen=True)
@@ -98,10 +97,7 @@ class Record:
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """The scene that `data`, an entry of the chunk `file`, describes; numbers are not judged.
-
-    Raises ValueError, naming key and entry, where its structure is not that of the format.
-    """
+    """The scene in an entry of the chunk `file`. Raises ValueError for another structure."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {_described(data)}, expected a mapping with 'key', 'cameras' and "
@@ -218,12 +214,9 @@ def load_chunk(path: UPath) -> list[Any]:
     others are read whole. Raises FileNotFoundError, and ValueError for a file that is no list.
     """
     try:
-        if is_local(path):
-            mapped = path.stat().st_size > 0 and zipfile.is_zipfile(str(path))
-            data = torch.load(str(path), map_location="cpu", weights_only=True, mmap=mapped)
-        else:
-            content = io.BytesIO(path.read_bytes())
-            data = torch.load(content, map_location="cpu", weights_only=True)
+        file = str(path) if is_local(path) else io.BytesIO(path.read_bytes())
+        mapped = is_local(path) and path.stat().st_size > 0 and zipfile.is_zipfile(file)
+        data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
     except FileNotFoundError:
         raise FileNotFoundError(
             f"chunk {path} does not exist: download it, or take its scenes out of index.json"
@@ -248,7 +241,7 @@ def _why(error: Exception) -> str:
         return "it holds Python objects, whose reading could run code"
     if type(error).__name__ in ("UnpicklingError", "EOFError") or "central directory" in said:
         return "it is cut off or no torch file"
-    return _COLOURS.sub("", said or type(error).__name__).splitlines()[0]
+    return re.sub(r"\x1b\[[0-9;]*m", "", said or type(error).__name__).splitlines()[0]
 
 
 class Chunk:

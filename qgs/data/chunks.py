@@ -181,10 +181,7 @@ class ChunksSource(LazySource):
         return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
 
     def scenes(self, split: Split) -> LazyScenes:
-        """See `SceneSource`.
-
-        Without test chunks, the first training chunk is opened to see whether it holds out frames.
-        """
+        """See `SceneSource`. Without test chunks, a training scene says if frames are held out."""
         if split in self.splits:
             return self.splits[split]
         train, first = self.splits["train"], self.groups("train")[:1]

@@ -98,11 +98,7 @@ def _opened(name: str, place: Place, **options: Any) -> PhotoScene:
 
 
 def find_scenes(path: UPath) -> dict[str, Place]:
-    """The scenes below `path` by name, sorted; archives are not opened.
-
-    `path` may be a scene itself. A scene that is there as a folder and as an archive is read from
-    the folder, which is logged. Raises FileNotFoundError when there is none.
-    """
+    """Scenes at or below `path` by name, folders before archives. Raises FileNotFoundError."""
     if not path.exists():
         raise FileNotFoundError(
             f"the DL3DV folder {path} does not exist: give the folder that holds 1K/, {{hash}}.zip "
@@ -142,11 +138,7 @@ def _places(path: UPath, depth: int) -> Iterator[tuple[str, Place]]:
 
 
 def scene_folder(place: Place) -> UPath:
-    """The folder of a scene that holds transforms.json.
-
-    Raises FileNotFoundError when there is none, ValueError when an archive holds several scenes or
-    cannot be read.
-    """
+    """The folder with transforms.json. Raises FileNotFoundError; ValueError for a bad archive."""
     tops: list[Place] = [place]
     if isinstance(place, ArchivePath):
         tops += [item for item in place.iterdir() if item.is_dir() and item.name not in _INSIDE]

@@ -51,8 +51,7 @@ _SHOWN = 5
 def read_index(path: str) -> EvaluationIndex:
     """The index in the JSON file `path`, which may be an fsspec URL.
 
-    Raises FileNotFoundError, and ValueError for a file of another form, for a scene that is written
-    twice, and for an index without any scene to judge.
+    Raises FileNotFoundError, and ValueError for another form and for no scene to judge.
     """
     file = opened_path(path)
     if not file.is_file():
@@ -160,10 +159,7 @@ def evaluation_samples(
     evaluation: EvaluationConfig,
     index: EvaluationIndex | None = None,
 ) -> Sequence[Sample]:
-    """All samples of an `EvaluationPlan` at once, for pictures of a few scenes.
-
-    Raises ValueError for the first scene that fails.
-    """
+    """All samples of an `EvaluationPlan`; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
     for sample in EvaluationPlan(source, views, evaluation, index).samples():
         if isinstance(sample, SceneFailure):
@@ -194,10 +190,8 @@ def one_line(error: Exception) -> str:
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
     """Input and target frames such that every held-out frame is a target once.
 
-    For the first held-out frame not yet covered, a window of the largest gap (counted in training
-    frames) is centred on it and shifted to lie within the scene; the inputs are evenly spaced in
-    it. Its targets are the held-out frames of the window's span that are not yet covered, and the
-    frame itself.
+    A window of the largest gap (in training frames) is centred on the first held-out frame not yet
+    covered and shifted into the scene, inputs evenly spaced; all such frames within are targets.
     """
     usable = np.array(training_frames(scene))
     gap = gap_range(len(usable), views, scene.name)[1]

@@ -19,10 +19,7 @@ _UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBo
 
 @dataclass(frozen=True)
 class CropResize:
-    """A centre crop to the target's aspect ratio, then a resize.
-
-    source, target: (H, W) in pixels. The crop may end between pixels.
-    """
+    """A centre crop to the target's aspect ratio, then a resize; (H, W) in pixels."""
 
     source: tuple[int, int]
     target: tuple[int, int]
@@ -69,19 +66,13 @@ def image_size(path: UPath) -> tuple[int, int]:
 
 
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
-    """The image file as RGB, over `background` (in [0, 1]) where it is transparent.
-
-    Raises ValueError for a file that is no readable image.
-    """
+    """The file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable."""
     with _readable(path, "an image"), path.open("rb") as file:
         return decode_rgb(file, background)
 
 
 def open_mask(path: UPath) -> np.ndarray:
-    """A mask file as (H, W) uint8, 255 where the photo shows what is to be modelled.
-
-    Files of zeros and ones are read as such. Raises ValueError for a file that is no image.
-    """
+    """A mask as (H, W) uint8, 255 for what is modelled; 0/1 files too. Raises ValueError."""
     with _readable(path, "the mask of a photo"), path.open("rb") as file:
         grey = np.array(decode_gray(file))
     return grey * np.uint8(255) if grey.max() == 1 else grey

@@ -27,10 +27,7 @@ _PROTOCOLS = {
 
 
 def opened_path(path: str | Path | UPath) -> UPath:
-    """`path` as a UPath: an fsspec URL such as s3://bucket/folder, or a local path without ~.
-
-    Raises ValueError for a URL of an unknown file system or of one whose package is missing.
-    """
+    """`path`, a URL or local, as a UPath. Raises ValueError for an unusable file system."""
     try:
         url = UPath(path)
         url.fs  # noqa: B018  asks for the file system, whose package may be missing
@@ -103,10 +100,7 @@ open_archive = lru_cache(maxsize=8)(Archive)
 
 @dataclass(frozen=True)
 class ArchivePath:
-    """A file or folder inside a zip archive, with the part of pathlib's interface readers use.
-
-    archive: the zip file. member: name inside it, "" for its top.
-    """
+    """A member of a zip archive, "" for its top, with the part of pathlib's interface used."""
 
     archive: UPath
     member: str = ""

@@ -58,10 +58,7 @@ def training_frames(scene: Scene) -> list[int]:
 
 
 def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
-    """Smallest and largest gap that `count` frames of `scene` allow; below views.gap is logged.
-
-    Raises ValueError when the inputs do not fit into the gap, or the scene has too few frames.
-    """
+    """Least and largest gap that `count` frames allow. Raises ValueError for too few."""
     low, high = views.gap
     if views.inputs - 1 > high:
         raise ValueError(
@@ -112,10 +109,7 @@ def draw_frames(
 def make_sample(
     scene: Scene, input_frames: Frames, target_frames: Frames, views: ViewsConfig, mirror: bool
 ) -> Sample:
-    """Decode the frames, normalise their poses by the inputs, and mirror them if asked to.
-
-    Poses are normalised in the precision that the scene has; what is delivered is float32.
-    """
+    """Decode frames, normalise poses in the scene's precision, mirror if asked; float32."""
     frames = (*input_frames, *target_frames)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
@@ -177,10 +171,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Views (B, V) of several (b, V) with equal view counts and image size, on the CPU.
-
-    Where only some have masks, the others get masks that are 1 everywhere.
-    """
+    """Views (B, V) of several (b, V), on the CPU; masks of 1 where only others have some."""
     cameras = Cameras(
         torch.cat([v.cameras.c2w for v in views]),
         torch.cat([v.cameras.intrinsics for v in views]),

@@ -48,11 +48,7 @@ class EncodedScene(Scene):
 
 
 class BoundedCache(Generic[Value]):
-    """LRU cache, safe for threads; a copy made by pickling starts empty.
-
-    limit: what the costs of all values may add up to. cost: of a value, such as its bytes; 1 each
-    by default.
-    """
+    """LRU cache, safe for threads, empty after pickling. limit: of the values' summed `cost`."""
 
     def __init__(self, limit: int, cost: Callable[[Value], int] | None = None) -> None:
         self._limit, self._cost = limit, cost
@@ -80,11 +76,7 @@ class BoundedCache(Generic[Value]):
 
 
 class LazyScenes(Sequence[Scene]):
-    """Scenes by name, opened when they are indexed; the last 64 stay open.
-
-    places: name to where or what the scene is, of which only the first `limit` are taken; 0 for
-    all. open: makes the scene of a name and its place; picklable.
-    """
+    """Scenes of the first `limit` places (0: all), opened when indexed; 64 stay open."""
 
     def __init__(
         self, places: Mapping[str, Any], open: Callable[[str, Any], Scene], limit: int = 0

@@ -105,10 +105,7 @@ class SceneOrder:
 
 
 class SampleStream:
-    """Training samples of `source` by number; sample k depends on (seed, k) alone.
-
-    Raises ValueError when the source has no training scenes.
-    """
+    """Samples by number, each of (seed, number) alone. Raises ValueError without scenes."""
 
     def __init__(self, source: SceneSource, views: ViewsConfig, seed: int) -> None:
         self._views, self._seed = views, seed
@@ -118,10 +115,7 @@ class SampleStream:
         self.order = SceneOrder(source.groups("train"), len(self._scenes), seed)
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """The samples of these numbers, counted from 0 over all epochs.
-
-        Raises ValueError for a scene with too few frames, else SampleError.
-        """
+        """Samples by number. Raises ValueError for too few frames in a scene, else SampleError."""
         return collate([self._sample(number) for number in numbers])
 
     def _sample(self, number: int) -> Sample:
@@ -155,11 +149,7 @@ class _Failure:
 
 
 class _Batches(Dataset[Batch | _Failure]):
-    """The batches of one process by number.
-
-    A copy in a worker opens the data itself when it is first used: no scene travels, and what fails
-    then is told as any failure.
-    """
+    """The batches of one process; a copy in a worker opens the data itself when first used."""
 
     def __init__(
         self, source: SceneSource, views: ViewsConfig, seed: int, batch_size: int, share: Share
@@ -198,10 +188,7 @@ def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
 
 
 def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batch, None, None]:
-    """Batches start, start + 1, ..., made by `workers` processes; closing ends them.
-
-    They are spawned: threads of numba and torch do not survive a fork.
-    """
+    """Batches from `start` on by spawned processes: numba and torch do not survive a fork."""
     loader = DataLoader(
         batches,
         batch_size=None,
@@ -248,15 +235,13 @@ def _prepare_worker(number: int) -> None:
 class Feed:
     """The batches of the next optimiser step, or the error that fetching them raised.
 
-    They are fetched before the present step is over, so that processes can tell each other of a
-    failure where they exchange numbers anyway; one that ended alone would leave the others waiting.
+    Fetched within the present step, so that processes tell each other of failures at its end.
     """
 
     def __init__(self, stream: Iterator[Batch], count: int) -> None:
         self.batches: Sequence[Batch] = ()
         self.error: Exception | None = None
-        self._stream = stream
-        self._count = count
+        self._stream, self._count = stream, count
 
     def fetch(self) -> None:
         """Get the `count` batches of the next step; none, and `error`, when that fails."""

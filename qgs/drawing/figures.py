@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
@@ -45,8 +45,7 @@ def categorical(index: int) -> Color:
     return CATEGORICAL[index % len(CATEGORICAL)]
 
 
-@contextmanager
-def figure_style() -> Iterator[None]:
+def figure_style() -> AbstractContextManager[None]:
     """Matplotlib settings of every figure, for the `with` block only."""
     ink = hex_color(INK)
     style: dict[Any, Any] = {
@@ -72,8 +71,7 @@ def figure_style() -> Iterator[None]:
         "legend.frameon": False,
         "figure.facecolor": "white",
     }
-    with rc_context(style):
-        yield
+    return rc_context(style)
 
 
 @dataclass(frozen=True)

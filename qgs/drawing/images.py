@@ -15,12 +15,8 @@ from torch import Tensor
 from qgs.io.files import replacing
 from qgs.types import Cameras
 
-Picture = np.ndarray
-"""uint8 (H, W, 3)."""
-
-NOTHING = (232, 233, 235)
-"""Colour of where there is nothing to show: no depth, no attention."""
-
+Picture = np.ndarray  # uint8 (H, W, 3)
+NOTHING = (232, 233, 235)  # where there is nothing to show: no depth, no attention
 DEPTH_MAP = "viridis_r"
 
 
@@ -73,11 +69,7 @@ def write_png(picture: Picture, path: str | Path) -> None:
 
 
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
-    """Write uint8 (H, W, 3) frames of one size as a GIF that loops for ever.
-
-    All frames share one palette, so that flat areas do not flicker. Raises ValueError for no
-    frames or frames of several sizes.
-    """
+    """Write frames of one size as an endless GIF with one palette. Raises ValueError."""
     sizes = {frame.shape for frame in frames}
     if len(sizes) != 1:
         raise ValueError(f"a GIF needs frames of one size, got {sorted(sizes) or 'none'}")

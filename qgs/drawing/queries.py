@@ -81,11 +81,7 @@ def _reduced(image: Image.Image) -> Picture:
 def support_picture(
     photo: Picture, support: SpatialSupport, cameras: Cameras, colors: Mapping[int, Color]
 ) -> Picture:
-    """All centres as dots, the queries of `colors` as outlined ellipses in their colours.
-
-    photo: the view of cameras (1, 1), at any size of its aspect. An outline that passes behind the
-    camera is not drawn; its centre is, if it lies in front.
-    """
+    """All centres as dots, queries of `colors` as ellipses, on the view of cameras (1, 1)."""
     ellipses = project_support(support, cameras)
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
     angle = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS)
@@ -129,11 +125,7 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
 
 @dataclass(frozen=True)
 class Token:
-    """A query whose Gaussians are shown.
-
-    weight: pixels it accounts for, the sum of its blending weights. spread: mean distance of its
-    Gaussians to their centroid, world units.
-    """
+    """A query. weight: sum of blending, pixels. spread: mean distance to centroid, world units."""
 
     query: int
     color: Color
@@ -142,10 +134,7 @@ class Token:
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Blending weight of each Gaussian, summed over all pixels of all cameras: (B, G), in pixels.
-
-    A render is linear in the colours, so this is the gradient of its sum, for any renderer.
-    """
+    """Blending weight (B, G) over all pixels: the gradient of a render's sum by the colours."""
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
         rgb = model.render(replace(gaussians, colors=colors), cameras).rgb
@@ -156,11 +145,7 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
 def notable_tokens(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[Token]:
-    """`count` tokens that matter to cameras (1, V) and stand apart, the heaviest first.
-
-    Of the heaviest eighth, each next token is the one farthest from those already taken, by the
-    pixel of its weighted centroid in the first camera.
-    """
+    """`count` of the heaviest eighth of tokens that stand apart in cameras (1, V), in order."""
     queries = model.queries.count
     weights_G = rendered_weights(model, gaussians, cameras)[0]
     weights_NK = rearrange(weights_G, "(n k) -> n k", n=queries)
@@ -183,10 +168,7 @@ def notable_tokens(
 def token_picture(
     model: QueryGaussianModel, gaussians: Gaussians, tokens: Sequence[Token], cameras: Cameras
 ) -> Picture:
-    """The scene in pale grey, the Gaussians of `tokens` in their colours, on top of everything.
-
-    cameras (1, 1). Lines join each Gaussian in front of the camera to its token's centroid.
-    """
+    """The Gaussians of `tokens` in colour with lines to centroids, over a grey scene; (1, 1)."""
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = gaussians.count // model.queries.count
     members = [range(t.query * per_query, (t.query + 1) * per_query) for t in tokens]

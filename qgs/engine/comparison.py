@@ -48,15 +48,6 @@ class Difference:
     wins: int
     losses: int
 
-    def cells(self) -> list[str]:
-        """A row of the table, one digit finer than an evaluation's."""
-        digits, interval = self.column.digits + 1, "–"
-        if self.low is not None:
-            interval = f"[{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
-        means = [f"{self.first:.{digits}f}", f"{self.second:.{digits}f}"]
-        apart, score = f"{self.difference:+.{digits}f}", f"{self.wins} : {self.losses}"
-        return [self.column.title, *means, apart, interval, score]
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -76,7 +67,7 @@ class Comparison:
         return {
             "first": first.name,
             "second": second.name,
-            "same_protocol": first.sha256 == second.sha256,
+            "same_protocol": first.protocol.sha256 == second.protocol.sha256,
             "other_frames": list(self.moved),
             "differences": [asdict(difference) for difference in self.differences],
             "wanted": max(first.wanted, second.wanted),
@@ -100,9 +91,15 @@ class Comparison:
         return f"{first.name} against {second.name}, {scenes}"
 
     def rows(self) -> list[list[str]]:
-        """The table, headers first."""
-        header = ["metric", "first", "second", "difference", "95 % interval", "won : lost"]
-        return [header, *(difference.cells() for difference in self.differences)]
+        """The table, headers first; one digit finer than an evaluation's."""
+        rows = [["metric", "first", "second", "difference", "95 % interval", "won : lost"]]
+        for d in self.differences:
+            digits = d.column.digits + 1
+            means = [f"{d.first:.{digits}f}", f"{d.second:.{digits}f}"]
+            change = f"{d.difference:+.{digits}f}"
+            ends = "–" if d.low is None else f"[{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
+            rows.append([d.column.title, *means, change, ends, f"{d.wins} : {d.losses}"])
+        return rows
 
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
@@ -113,12 +110,11 @@ class Comparison:
         )
         if len(self.shared) == 1:
             yield "one scene is too few for an interval"
-        for r in (first, second):
-            if r.missing:
-                yield f"{r.name} is incomplete: no score of {listed(r.missing)}"
         if null := facts["null"]:
             yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
         for result, only in ((first, facts["only_first"]), (second, facts["only_second"])):
+            if result.missing:
+                yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
             if only:
                 yield f"{len(only)} scenes only in {result.name}, left out: {listed(only)}"
         for d in self.differences:
@@ -184,14 +180,13 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
     first, *others = results
     pairs = []
     for other in others:
-        if other.sha256 != first.sha256 and not across_protocols:
-            keys = sorted({*first.protocol, *other.protocol})
-            unequal = [key for key in keys if first.protocol.get(key) != other.protocol.get(key)]
+        if other.protocol.sha256 != first.protocol.sha256 and not across_protocols:
+            ours, theirs = first.protocol.content, other.protocol.content
+            unequal = sorted(k for k in {*ours, *theirs} if ours.get(k) != theirs.get(k))
             raise ValueError(
-                f"{first.name} was judged by {first.protocol_name} ({first.sha256[:12]}), "
-                f"{other.name} by {other.protocol_name} ({other.sha256[:12]}), which differ in "
-                f"{', '.join(unequal)}: evaluate both alike, or add --across-protocols to compare "
-                "them all the same"
+                f"{first.name} was judged by {first.protocol}, {other.name} by {other.protocol}, "
+                f"which differ in {', '.join(unequal)}: evaluate both alike, or add "
+                "--across-protocols to compare them all the same"
             )
         shared = [name for name in first.scenes if name in other.scenes]
         if not shared:
@@ -206,7 +201,7 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         metrics = [name for name in first.columns if name in other.columns]
         found = (_difference(metric, first, other, shared) for metric in metrics)
         pairs.append(Comparison(first, other, shared, moved, [d for d in found if d]))
-    protocols = {r.name: f"{r.protocol_name}, sha256 {r.sha256}" for r in results}
+    protocols = {r.name: f"{r.protocol.name}, sha256 {r.protocol.sha256}" for r in results}
     return Comparisons(protocols, pairs)
 
 

@@ -19,7 +19,7 @@ from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
 from qgs.metrics.baselines import mean_colour, nearest_input
-from qgs.metrics.dispersion import gaussians_used
+from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
@@ -98,7 +98,6 @@ class _Judge:
                 self.columns[name], self._owners[name] = column, metric
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
-        """Values that some scenes or all lack, and why."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:
@@ -136,17 +135,15 @@ class _Judge:
     def _score(
         self, sample: Sample, gaussians: Gaussians | None = None
     ) -> SceneScore | SceneFailure:
-        """The score of `sample`. gaussians: (1, G), None to predict or tune them here."""
         values: dict[str, float] = {}
         try:
             inputs = sample.inputs.to(self._device)
-            if gaussians is None and self._tune:
+            if self._tune:
                 tuning = self._tune(inputs)
                 gaussians = tuning.prediction.gaussians
                 values = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            elif gaussians is None:
-                gaussians = self._model(inputs).gaussians
-            values = {**self._values(sample, inputs, gaussians), **values}
+            found: Gaussians = gaussians or self._model(inputs).gaussians
+            values = {**self._values(sample, inputs, found), **values}
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         broken = [name for name, value in values.items() if not math.isfinite(value)]
@@ -155,7 +152,6 @@ class _Judge:
         return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
 
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
-        """Everything measured on the Gaussians (1, G) of `sample`."""
         targets = sample.targets.to(self._device)
         rendering = self._model.render(gaussians, targets.cameras)
         depth = true_depth(self._source, sample) if "true_depth" in self._needed else None
@@ -177,7 +173,7 @@ class _Judge:
             found = found if isinstance(found, Mapping) else {"": found}
             for key in metric.columns():
                 values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
-        return {**values, "gaussians_used": float(gaussians_used(gaussians.opacities))}
+        return {**values, "gaussians_used": float((gaussians.opacities > OPACITY_USED).sum())}
 
 
 def _name(metric: str, key: str) -> str:

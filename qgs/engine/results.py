@@ -41,8 +41,8 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 class SceneScore:
     """One scene. views: input and target frames of each of its samples.
 
-    values: METHOD_METRIC to a mean over the samples; "gaussians_used"; of tuned scenes TUNING. A
-    value is missing where the method or the scene lacks what its metric needs.
+    values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNING; less
+    those whose metric needs what the method or the scene lacks.
     """
 
     scene: str
@@ -161,7 +161,6 @@ class Evaluation:
         return {**settings, "loss_before": before, "loss_after": after}
 
     def _rows(self) -> list[list[str]]:
-        """A row per method, headers first, in it how many scenes it is over."""
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
@@ -169,7 +168,6 @@ class Evaluation:
         return rows
 
     def _rows_over_scenes(self) -> list[list[str]]:
-        """A row per value of the model, headers first."""
         rows = [["over scenes", "mean", "variance", "median", "scenes"]]
         for name, found in self.summary()["over_scenes"].items():
             column = self.columns[name]
@@ -183,7 +181,6 @@ class Evaluation:
         return "\n\n".join([*tables, bullets(self._notes())]) + "\n"
 
     def _csv(self) -> str:
-        """A line per scene that the protocol names, in its order; those without a score say why."""
         judged = {score.scene: score for score in self.scores}
         reasons = {failure.scene: failure.reason for failure in self.missing}
         columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
@@ -200,7 +197,6 @@ class Evaluation:
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
-        """What is to be known beside the tables, one line each."""
         yield self.statement
         protocol, poses = self.protocol, self.protocol.content["poses"]
         height, width = protocol.content["image_size"]
@@ -284,7 +280,7 @@ def print_lines(console: Console, lines: Iterable[str]) -> None:
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of one evaluation. name: the folder, as it was given. protocol: its content.
+    """Results of one evaluation. name: the folder, as it was given.
 
     scenes: `SceneScore.values` of the judged scenes. frames: their input and target frames, as
     scenes.csv writes them. wanted: how many scenes the protocol names. columns, missing and null
@@ -292,9 +288,7 @@ class StoredResults:
     """
 
     name: str
-    protocol_name: str
-    sha256: str
-    protocol: Mapping[str, Any]
+    protocol: Protocol
     columns: Mapping[str, Column]
     scenes: Mapping[str, Mapping[str, float]]
     frames: Mapping[str, tuple[str, str]]
@@ -316,14 +310,15 @@ def read_results(path: str | Path) -> StoredResults:
             "evaluation/ in it"
         )
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary, content = (
+            json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+            for name in ("summary", "protocol")
+        )
         with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
             judged = {row["scene"]: row for row in csv.DictReader(file) if not row["problem"]}
         return StoredResults(
             name=str(path),
-            protocol_name=summary["protocol"]["name"],
-            sha256=summary["protocol"]["sha256"],
-            protocol=json.loads((folder / "protocol.json").read_text(encoding="utf-8")),
+            protocol=Protocol(summary["protocol"]["name"], content),
             columns={name: Column(**column) for name, column in summary["columns"].items()},
             scenes={
                 scene: {k: float(v) for k, v in row.items() if k not in _FRAMES and v}

@@ -46,9 +46,8 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
 
     plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered view, row, column.
     """
-    batch = plucker.shape[0]
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
-    return pooled.flatten(2).transpose(1, 2).reshape(batch, -1, 6)
+    return pooled.flatten(2).transpose(1, 2).reshape(plucker.shape[0], -1, 6)
 
 
 @full_precision

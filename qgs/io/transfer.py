@@ -74,8 +74,7 @@ def import_weights(
     if recipe is None:
         layout, tree = fitting_recipe(shapes, str(weights))
         recipe = resolve(tree, overrides)
-        tree = recipe.tree if overrides else tree
-        text = recipe_text(tree, layout, file.path.name, overrides)
+        text = recipe_text(recipe.tree if overrides else tree, layout, file.path.name, overrides)
     names = _fitting_names(file, recipe)
     tensors, converted = _as_float32(file, names, to_float32)
     origin = {"imported": f"{names.layout.name} weights {file.path.name}"}
@@ -133,8 +132,8 @@ def _fitting_names(file: WeightFile, recipe: Recipe) -> Names:
     if found:
         counts = Counter(line.partition(":")[0].partition(" of ")[0] for line in found)
         kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-        lines = [*advice(recipe, names.layout, shapes), f"the differences ({kinds}):"]
-        lines += [f"  {line}" for line in found]
+        lines = advice(recipe, names.layout, shapes)
+        lines += [f"the differences ({kinds}):", *(f"  {line}" for line in found)]
         raise PublishedError(
             f"{file.path} does not fit the recipe, whose model is a {names.layout.name}; nothing "
             "is written" + "".join(f"\n  {line}" for line in lines)

@@ -71,10 +71,7 @@ class Photometric(Loss):
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
-        """Terms `mse` and `ssim`; a term with weight 0 is left out.
-
-        Raises ValueError when images are too small for the SSIM window.
-        """
+        """Terms `mse` and `ssim`; raises ValueError for images that are too small for SSIM."""
         terms = {}
         if self.config.mse_weight:
             terms["mse"] = self.config.mse_weight * mean_squared_error(rendering.rgb, target.images)

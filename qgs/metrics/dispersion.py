@@ -1,4 +1,4 @@
-"""What is measured on Gaussians alone: how far those of one token scatter, how many are used."""
+"""What is measured on Gaussians alone: how far those of one token scatter."""
 
 from __future__ import annotations
 
@@ -50,8 +50,3 @@ def token_dispersion(means: Tensor, gaussians_per_query: int) -> Tensor:
         )
     tokens = means.unflatten(-2, (-1, gaussians_per_query))
     return (tokens - tokens.mean(-2, keepdim=True)).norm(dim=-1).flatten(-2)
-
-
-def gaussians_used(opacities: Tensor) -> Tensor:
-    """How many of opacities (..., G) are above OPACITY_USED -> (...)."""
-    return (opacities > OPACITY_USED).sum(-1)

@@ -30,10 +30,7 @@ _SMALLEST = 2 ** (len(_BLOCKS) - 1)
 
 
 class Lpips(Metric):
-    """Distance of each view to the truth in the features of VGG-16, weighted as people judge.
-
-    Nothing is downloaded: `unavailable` says which package or file is missing, and how to get it.
-    """
+    """Distance of each view to the truth in features of VGG-16; nothing is downloaded."""
 
     name: ClassVar[str] = "lpips"
     definition: ClassVar[str] = "VGG-16, version 0.1, images in [-1, 1]"
@@ -47,13 +44,8 @@ class Lpips(Metric):
         """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
         the one in torch's cache."""
 
-    shift: Tensor
-    scale: Tensor
-
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None])
-        self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None])
         self.unavailable = self._load(config.weights)
         self.requires_grad_(False)
 
@@ -75,7 +67,8 @@ class Lpips(Metric):
 
     def _pair(self, image: Tensor, truth: Tensor) -> Tensor:
         x = torch.stack([image, truth]).clamp(0, 1) * 2 - 1
-        x = (x - self.shift) / self.scale
+        shift, scale = (x.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
+        x = (x - shift) / scale
         total = x.new_zeros(())
         for index, (block, weight) in enumerate(zip(self.blocks, self.linear, strict=True)):
             x = block(F.max_pool2d(x, 2) if index else x)

@@ -90,9 +90,8 @@ class _Splat(torch.autograd.Function):
             scene = opacities[image[0]], colors[image[0]]
             kernels.forward_unit(rows[image], *scene, stripe, blending, out[image])
 
-        _in_threads(
-            (project, _scene_units(batch, count)), (blend, _image_units(batch, views, size[0]))
-        )
+        stripes = _image_units(batch, views, size[0])
+        _in_threads((project, _scene_units(batch, count)), (blend, stripes))
         ctx.save_for_backward(*tensors, splats, sums)
         ctx.config = config
         return sums

@@ -37,10 +37,7 @@ class GsplatRenderer(Renderer):
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """See `Renderer`.
-
-        Also raises ValueError for tensors that are not on CUDA, RuntimeError without gsplat.
-        """
+        """See `Renderer`; ValueError for tensors not on CUDA, RuntimeError without gsplat."""
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
         rasterization = import_module("gsplat").rasterization

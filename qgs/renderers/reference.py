@@ -4,6 +4,7 @@ EWA projection after Zwicker et al. 2001 and gsplat 1.5.3.
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -68,15 +69,11 @@ def project(
     usable = torch.isfinite(determinant) & (determinant > 0)
     determinant = torch.where(usable, determinant, 1.0)
     conics = torch.stack([yy + dilation, -xy, xx + dilation], -1) / determinant[..., None]
+    conics = torch.where(usable[..., None], conics, 0.0)
     visible = in_range & usable
     deviations = torch.stack([xx, yy], -1).detach().add(dilation).sqrt()
-    return Splats(
-        means=means,
-        conics=torch.where(usable[..., None], conics, 0.0),
-        depths=z,
-        deviations=torch.where(visible[..., None], deviations, 0.0),
-        visible=visible,
-    )
+    deviations = torch.where(visible[..., None], deviations, 0.0)
+    return Splats(means, conics, z, deviations, visible)
 
 
 def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tensor:
@@ -104,9 +101,8 @@ class TorchRenderer(Renderer):
             backdrop = background_of(background, config.background, gaussians.means)
             splats = project(gaussians, cameras, config.near, config.far, config.dilation)
             sums = [
-                _composite(splats, gaussians, (b, v), cameras.size, config)
-                for b in range(cameras.shape[0])
-                for v in range(cameras.shape[1])
+                _composite(splats, gaussians, image, cameras.size, config)
+                for image in product(range(cameras.shape[0]), range(cameras.shape[1]))
             ]
             sums = torch.stack(sums).reshape(*cameras.shape, 5, *cameras.size)
             return resolve(sums, backdrop)

@@ -25,7 +25,7 @@ def bench(*words: str | Path) -> Result:
 
 def test_tokengs_against_locusgs(tmp_path: Path) -> None:
     file = tmp_path / "reports/bench.json"
-    result = bench(TOKENGS, LOCUS, "--step", "--renderer", "--views", "3", "--json", file)
+    result = bench(TOKENGS, LOCUS, "--step", "--memory", "--views", "3", "--json", file)
     assert result.exit_code == 0, result.output
     report = json.loads(file.read_text())
     tokengs, locus = report["recipes"]
@@ -36,9 +36,10 @@ def test_tokengs_against_locusgs(tmp_path: Path) -> None:
         assert (recipe["views"], recipe["size"], recipe["precision"]) == (3, [16, 24], "float32")
         assert recipe["gaussians"] == 8 * 8
         assert recipe["parameters"]["weight_bytes"] == 4 * recipe["parameters"]["count"]
-        assert list(recipe["seconds"]) == ["forward", "render", "step"]
+        assert list(recipe["seconds"]) == list(recipe["memory"]) == ["forward", "step"]
+        assert all(m["peak_bytes"] > m["idle_bytes"] > 0 for m in recipe["memory"].values())
         assert all(len(times["samples"]) == 3 for times in recipe["seconds"].values())
-    assert tokengs["seconds"]["step"]["ratio"]["median"] == 1
+    assert tokengs["seconds"]["step"]["ratio"]["median"] == tokengs["memory"]["step"]["ratio"] == 1
     forward = [recipe["seconds"]["forward"]["samples"] for recipe in (tokengs, locus)]
     paired = sorted(ours / theirs for theirs, ours in zip(*forward, strict=True))
     assert locus["seconds"]["forward"]["ratio"]["median"] == paired[1]
@@ -46,20 +47,12 @@ def test_tokengs_against_locusgs(tmp_path: Path) -> None:
     assert re.search(r"tokengs +│ 3 x 16 x 24", result.output)
 
 
-def test_memory(tmp_path: Path) -> None:
-    file = tmp_path / "bench.json"
-    assert bench(LOCUS, "--memory", "--json", file).exit_code == 0
-    (recipe,) = json.loads(file.read_text())["recipes"]
-    assert list(recipe["memory"]) == ["forward"]
-    assert recipe["memory"]["forward"]["ratio"] == 1
-    assert recipe["memory"]["forward"]["peak_bytes"] > recipe["memory"]["forward"]["idle_bytes"] > 0
-
-
 def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     assert bench(TOKENGS, "--json", file).exit_code == 0
-    assert bench(LOCUS, "--json", file).exit_code == 0
-    assert json.loads(file.read_text())["recipes"][0]["recipe"] == str(LOCUS)
+    assert bench(LOCUS, "--renderer", "--json", file).exit_code == 0
+    (recipe,) = json.loads(file.read_text())["recipes"]
+    assert (recipe["recipe"], list(recipe["seconds"])) == (str(LOCUS), ["forward", "render"])
     notes = tmp_path / "notes.json"
     notes.write_text('{"mine": true}')
     refused = bench(TOKENGS, "--json", notes)

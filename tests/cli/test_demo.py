@@ -56,7 +56,9 @@ def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
     assert "count: 12" in page
 
 
-def test_recipes_with_other_data_are_not_compared(recipes):
+def test_recipes_with_other_data_or_of_one_name_are_not_compared(recipes):
+    with pytest.raises(ValueError, match="told apart by file name"):
+        resolve_fairly([recipes[0], recipes[0]], seconds=1, seed=0)
     overlay = {"recipe": 1, "extends": "few.yaml", "views": {"gap": [2, 5]}}
     recipes[1].write_text(yaml.safe_dump(overlay))
     with pytest.raises(ValueError, match="more and few differ in views"):
@@ -69,30 +71,20 @@ def test_budget_and_seed_are_those_asked_for(recipes):
         assert recipe.tree["seed"] == 3
 
 
-def test_two_recipes_of_one_name_are_refused(recipes):
-    with pytest.raises(ValueError, match="told apart by file name"):
-        resolve_fairly([recipes[0], recipes[0]], seconds=1, seed=0)
-
-
-def test_missing_recipes_say_where_they_were_looked_for(tmp_path, monkeypatch):
+def test_recipes_beside_the_user_come_first_and_missing_ones_say_where_they_were_looked_for(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(qgs, "__file__", str(tmp_path / "site-packages" / "qgs" / "__init__.py"))
     with pytest.raises(FileNotFoundError, match=r"recipes/tiny.*--recipe-folder FOLDER"):
         default_recipes(None)
     with pytest.raises(FileNotFoundError, match="elsewhere"):
         default_recipes(tmp_path / "elsewhere")
-
-
-def test_recipes_beside_the_user_come_first(tmp_path, monkeypatch):
-    folder = tmp_path / "recipes" / "tiny"
-    folder.mkdir(parents=True)
-    for name in ("tokengs.yaml", "locus.yaml"):
-        (folder / name).touch()
-    monkeypatch.chdir(tmp_path)
-    assert [path.resolve() for path in default_recipes(None)] == [
-        folder / "tokengs.yaml",
-        folder / "locus.yaml",
-    ]
+    files = [tmp_path / "recipes" / "tiny" / name for name in ("tokengs.yaml", "locus.yaml")]
+    files[0].parent.mkdir(parents=True)
+    for file in files:
+        file.touch()
+    assert [path.resolve() for path in default_recipes(None)] == files
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from qgs.composer.errors import Problems
 from qgs.composer.files import merge
 from qgs.composer.nodes import Origin, from_plain
 from qgs.composer.recipe import annotated
-from qgs.composer.slots import DEFAULT_LOSSES, SECTIONS, Section
+from qgs.composer.slots import SECTIONS
 from qgs.composer.yaml_text import dump, load_text
 
 RECIPES = sorted(
@@ -187,7 +188,7 @@ def test_null_leaves_the_default(write):
 
 
 def test_defaults_that_stay_lie_under_what_is_written_and_null_drops_one(monkeypatch):
-    monkeypatch.setitem(SECTIONS, "losses", Section(True, DEFAULT_LOSSES, defaults_stay=True))
+    monkeypatch.setitem(SECTIONS, "losses", replace(SECTIONS["losses"], defaults_stay=True))
     written = {"photometric": {"mse_weight": 2.0}, "visibility": None}
     recipe = resolve(SMALL | {"losses": written}, ["losses.mine.type=qgs/opacity"])
     assert list(recipe.build_losses()) == ["photometric", "mine"]

@@ -1,11 +1,12 @@
-import io
 import json
 import os
 import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
+import photo_formats
 import pytest
 import torch
 from PIL import Image
@@ -15,10 +16,13 @@ from qgs.data.chunk_files import camera_problems, load_chunk, parse_record
 from qgs.data.chunks import ChunksSource
 
 
-def encoded(color, size=(64, 36), kind="PNG", **options) -> torch.Tensor:
-    file = io.BytesIO()
-    Image.new("RGB" if len(color) == 3 else "RGBA", size, color).save(file, kind, **options)
-    return torch.tensor(list(file.getvalue()), dtype=torch.uint8)
+def encoded(color, size=(64, 36)) -> torch.Tensor:
+    image = Image.new("RGB" if len(color) == 3 else "RGBA", size, color)
+    return as_tensor(photo_formats.encoded(image))
+
+
+def as_tensor(data: bytes) -> torch.Tensor:
+    return torch.tensor(list(data), dtype=torch.uint8)
 
 
 def camera(x: float = 0.0) -> list[float]:
@@ -54,8 +58,7 @@ def data_set(path) -> None:
     write(path / "test", {"a.torch": [record("t0")]})
 
 
-def opened(path, **options) -> ChunksSource:
-    return ChunksSource(ChunksSource.Config(path=str(path), **{"image_size": (16, 16), **options}))
+opened = partial(photo_formats.opened, size=(16, 16), source=ChunksSource)
 
 
 def test_frames_and_cameras(tmp_path):
@@ -165,11 +168,8 @@ def test_threads_share_few_open_chunks(tmp_path):
 
 
 def test_masks_names_and_sizes_of_the_writer(tmp_path):
-    mask = io.BytesIO()
-    Image.fromarray(np.repeat([[0], [255]], [18, 18], 0).repeat(64, 1).astype(np.uint8)).save(
-        mask, "PNG"
-    )
-    masks = [torch.tensor(list(mask.getvalue()), dtype=torch.uint8), torch.empty(0).byte()]
+    mask = np.repeat([[0], [255]], [18, 18], 0).repeat(64, 1).astype(np.uint8)
+    masks = [as_tensor(photo_formats.encoded(mask)), torch.empty(0).byte()]
     images = [encoded((0, 0, 0)), encoded((0, 0, 0), size=(36, 36))]
     sizes = torch.tensor([[36, 64], [36, 36]])
     names = ["a/0.jpg", "b.jpg"]
@@ -181,9 +181,7 @@ def test_masks_names_and_sizes_of_the_writer(tmp_path):
     assert delivered[0, 0, [0, 15], 3].tolist() == [0, 1]
     assert delivered[1].min() == 1
     assert scene.frame_name(0) == "a/0.jpg"
-    assert scene.cameras.intrinsics[1].tolist() == pytest.approx(
-        (np.array([0.5, 0.9, 0.45, 0.55]) * 16).tolist()
-    )
+    assert scene.cameras.intrinsics[1].tolist() == pytest.approx([8, 14.4, 7.2, 8.8])
 
 
 def test_transparent_pixels_show_the_background(tmp_path):
@@ -262,6 +260,15 @@ def test_an_index_does_not_lead_outside(tmp_path):
         opened(tmp_path)
 
 
+def test_folders_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        opened(tmp_path / "nothing")
+    with pytest.raises(FileNotFoundError, match=r"holds no chunks.*qgs data pack"):
+        opened(tmp_path)
+    with pytest.raises(ValueError, match="cannot be opened as a path or URL"):
+        opened("nosuch://bucket")
+
+
 def test_code_in_a_chunk_is_not_run(tmp_path):
     class Payload:
         def __reduce__(self):
@@ -271,15 +278,6 @@ def test_code_in_a_chunk_is_not_run(tmp_path):
     with pytest.raises(ValueError, match="cannot be read as a torch file"):
         load_chunk(UPath(tmp_path / "a.torch"))
     assert not (tmp_path / "made").exists()
-
-
-def test_folders_that_are_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        opened(tmp_path / "nothing")
-    with pytest.raises(FileNotFoundError, match=r"holds no chunks.*qgs data pack"):
-        opened(tmp_path)
-    with pytest.raises(ValueError, match="cannot be opened as a path or URL"):
-        opened("nosuch://bucket")
 
 
 def test_a_chunk_with_python_objects_is_told_without_torchs_advice(tmp_path):

@@ -1,6 +1,7 @@
 """COLMAP models: camera models, lenses, names, and models that are broken."""
 
 import struct
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -99,12 +100,11 @@ def test_other_camera_models_are_refused_and_listed(tmp_path):
 def test_names_in_folders_are_read_in_their_order(tmp_path, kind, model):
     photos = synthetic(tmp_path / "photos", 3)
     names = ["right/1 a.png", "left/2.png", "left/10.png"]
+    written = "model" if model == "." else model
+    write_colmap(tmp_path, photos, kind, model=written, names=names)
     if model == ".":
-        write_colmap(tmp_path, photos, kind, model="model", names=names)
-        for file in (tmp_path / "model").iterdir():
+        for file in (tmp_path / written).iterdir():
             file.rename(tmp_path / file.name)
-    else:
-        write_colmap(tmp_path, photos, kind, model=model, names=names)
     scene = read(tmp_path)
     ordered = ["left/10.png", "left/2.png", "right/1 a.png"]
     assert [scene.frame_name(i) for i in range(3)] == [f"images/{name}" for name in ordered]
@@ -140,28 +140,25 @@ def test_quaternions_of_any_length_and_no_rotation_at_all(tmp_path):
     ]
 
 
-def cut(file: Path, size: int) -> None:
-    file.write_bytes(file.read_bytes()[:size])
-
-
 BROKEN = {
-    "no count": lambda model: cut(model / "images.bin", 4),
-    "a pose cut off": lambda model: cut(model / "images.bin", 60),
-    "a name cut off": lambda model: cut(model / "images.bin", 76),
-    "points cut off": lambda model: cut(model / "images.bin", 110),
-    "an image cut off": lambda model: cut(model / "images.bin", 200),
-    "a camera cut off": lambda model: cut(model / "cameras.bin", 40),
-    "an unknown camera": lambda model: (model / "cameras.bin").write_bytes(
-        struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)
-    ),
-    "no camera": lambda model: (model / "cameras.bin").write_bytes(struct.pack("<Q", 0)),
+    "no count": ("images.bin", 4),
+    "a pose cut off": ("images.bin", 60),
+    "a name cut off": ("images.bin", 76),
+    "points cut off": ("images.bin", 110),
+    "an image cut off": ("images.bin", 200),
+    "a camera cut off": ("cameras.bin", 40),
+    "an unknown camera": ("cameras.bin", struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)),
+    "no camera": ("cameras.bin", struct.pack("<Q", 0)),
 }
+"""A file of the model, and its size or its content."""
 
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_broken_binary_models_are_told(tmp_path, what):
     folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "binary")
-    BROKEN[what](folder / "sparse" / "0")
+    name, content = BROKEN[what]
+    file = folder / "sparse" / "0" / name
+    file.write_bytes(content if isinstance(content, bytes) else file.read_bytes()[:content])
     with pytest.raises(ValueError, match=r"COLMAP model .*sparse/0 .*cannot be read: .*again"):
         read(folder)
 
@@ -201,8 +198,6 @@ def test_a_missing_package_is_told(tmp_path, monkeypatch):
 
 
 def test_pycolmap_is_imported_for_models_alone(tmp_path):
-    import subprocess
-
     folder = write_nerfstudio(tmp_path, synthetic(tmp_path / "photos", 2))
     code = (
         "import sys; from qgs.data import read_photos;"

@@ -37,20 +37,20 @@ def _warnings_are_told_again():
     warn_once.cache_clear()
 
 
-def variants(folder: Path, photos: PhotoSet) -> dict[str, PhotoScene]:
+def variants(folder: Path, photos: PhotoSet) -> list[PhotoScene]:
     """The set at its own size: of a centred pinhole in formats that know no other, or in others."""
     if photos.intrinsics == centred(photos).intrinsics:
-        some = {
-            "llff": write_llff(folder / "llff", photos),
-            "blender": write_blender(folder / "blender", photos, len(photos.files)),
-        }
-        return {name: scene(path, photos.size) for name, path in some.items()}
-    some = {
-        "nerfstudio": write_nerfstudio(folder / "nerfstudio", photos),
-        "colmap text": write_colmap(folder / "text", photos, "text"),
-        "colmap binary": write_colmap(folder / "binary", photos, "binary", model="sparse"),
-    }
-    return {name: scene(path, photos.size) for name, path in some.items()}
+        paths = [
+            write_llff(folder / "llff", photos),
+            write_blender(folder / "blender", photos, len(photos.files)),
+        ]
+    else:
+        paths = [
+            write_nerfstudio(folder / "nerfstudio", photos),
+            write_colmap(folder / "text", photos, "text"),
+            write_colmap(folder / "binary", photos, "binary", model="sparse"),
+        ]
+    return [scene(path, photos.size) for path in paths]
 
 
 def assert_same(read: PhotoScene, photos: PhotoSet, poses: float = 1e-9) -> None:
@@ -67,7 +67,7 @@ def assert_same(read: PhotoScene, photos: PhotoSet, poses: float = 1e-9) -> None
 def test_a_synthetic_set(tmp_path):
     given = synthetic(tmp_path / "photos")
     for photos in (given, centred(given)):
-        for read in variants(tmp_path / str(photos.intrinsics[1]), photos).values():
+        for read in variants(tmp_path / str(photos.intrinsics[1]), photos):
             assert_same(read, photos)
 
 
@@ -86,9 +86,9 @@ def test_real_photos_written_in_every_format(name, tmp_path):
     camera = tuple(given.cameras.intrinsics[0].tolist())
     poses = given.cameras.c2w[every].numpy()
     photos = PhotoSet(files, poses, camera, given.cameras.size)  # pyright: ignore[reportArgumentType]
-    for read in variants(tmp_path / "own", photos).values():
+    for read in variants(tmp_path / "own", photos):
         assert_same(read, photos, poses=1e-5)
-    for read in variants(tmp_path / "centred", centred(photos)).values():
+    for read in variants(tmp_path / "centred", centred(photos)):
         assert_same(read, centred(photos), poses=1e-5)
 
 

@@ -6,13 +6,13 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
+from line_scenes import Line, Lines
+from photo_formats import opened, synthetic, write_nerfstudio
 from torch import Tensor
 
-from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.contracts import EvaluationConfig, Scene, ViewsConfig
 from qgs.data.evaluation import (
     EvaluationPlan,
     IndexEntry,
@@ -20,39 +20,26 @@ from qgs.data.evaluation import (
     evaluation_samples,
     read_index,
 )
-from qgs.data.photos.source import PhotosConfig, PhotosSource
 from qgs.data.sampling import Sample
-from qgs.types import Cameras
 
 VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
 
 
-class Strip(Scene):
-    """Frame f is an image of the value f / 10; cameras along a line. Counts what it decodes."""
+class Strip(Line):
+    """A line that counts what it decodes, or cannot be decoded."""
 
     def __init__(self, name: str, frames: int = 8, broken: Exception | None = None) -> None:
-        self.name, self.frames, self.broken, self.decoded = name, frames, broken, 0
-
-    @property
-    def cameras(self) -> Cameras:
-        c2w = torch.eye(4).repeat(self.frames, 1, 1)
-        c2w[:, 0, 3] = torch.arange(self.frames)
-        return Cameras(c2w, torch.tensor([8.0, 8, 8, 8]).expand(self.frames, 4), (16, 16))
+        super().__init__(frames, name=name)
+        self.broken, self.decoded = broken, 0
 
     def images(self, frames: Sequence[int]) -> Tensor:
         if self.broken:
             raise self.broken
         self.decoded += 1
-        return torch.tensor(list(frames))[:, None, None, None] / 10 + torch.zeros(3, 16, 16)
+        return super().images(frames)
 
 
-class Strips(SceneSource):
-    name = "strips"
-
-    def __init__(self, *scenes: Scene) -> None:
-        super().__init__(SceneSourceConfig(image_size=(16, 16)))
-        self._scenes = scenes
-
+class Strips(Lines):
     def scenes(self, split: str) -> Sequence[Scene]:
         return self._scenes if split == "test" else ()
 
@@ -73,14 +60,8 @@ def test_a_published_index_is_read(tmp_path: Path) -> None:
     [
         ('{"a": {"context": [0]}}', "a.target: Field required"),
         ('{"a": {"context": [], "target": [1]}}', "a.context: List should have at least 1 item"),
-        (
-            '{"a": {"context": ["0"], "target": [1]}}',
-            "a.context.0: Input should be a valid integer",
-        ),
-        (
-            '{"a": {"context": [0.5], "target": [1]}}',
-            "a.context.0: Input should be a valid integer",
-        ),
+        ('{"a": {"context": ["0"], "target": [1]}}', "a.context.0: Input should be a valid int"),
+        ('{"a": {"context": [0.5], "target": [1]}}', "a.context.0: Input should be a valid int"),
         ('["a"]', "file: Input should be a valid dictionary"),
         ('{"a": null}', "names no scene to judge"),
         ('{"a": null, "a": {"context": [0], "target": [1]}}', "written twice: a"),
@@ -106,7 +87,7 @@ def test_samples_are_those_of_the_index_in_its_order() -> None:
     assert [s.scene for s in samples] == ["three", "one"]
     first = samples[0]
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
-    assert first.targets.images[0, :, 0, 0, 0].tolist() == pytest.approx([0.2, 0.3, 0.2])
+    assert first.targets.images[0, :, 0, 0, 0].tolist() == pytest.approx([0.02, 0.03, 0.02])
     assert first.inputs.cameras.c2w[0, 0].tolist() == torch.eye(4).tolist()
 
 
@@ -140,39 +121,26 @@ def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on() -> None:
     assert sample.scene == "good"
 
 
-def write_photos(folder: Path, count: int) -> None:
-    folder.mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    frames = []
-    for number in range(count):
-        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{number}.png")
-        pose = np.eye(4)
-        pose[0, 3] = 0.1 * number
-        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
-    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
-
-
 def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(
     tmp_path: Path,
 ) -> None:
+    photos, sets = synthetic(tmp_path / "photos", 5), tmp_path / "sets"
     for name in ("broken", "cut", "gap", "good"):
-        write_photos(tmp_path / name, 5)
-    (tmp_path / "broken" / "transforms.json").write_text("{")
-    photo = tmp_path / "cut" / "2.png"
+        write_nerfstudio(sets / name, photos)
+    (sets / "broken" / "transforms.json").write_text("{")
+    photo = sets / "cut" / "images" / "view_002.png"
     photo.write_bytes(photo.read_bytes()[:200])
-    (tmp_path / "gap" / "1.png").unlink()
-    source = PhotosSource(PhotosConfig(path=str(tmp_path), image_size=(16, 16)))
+    (sets / "gap" / "images" / "view_001.png").unlink()
+    source = opened(sets, (16, 16))
     index = {name: entry([0, 3], [2]) for name in ("broken", "cut", "gap", "good")}
     found = list(EvaluationPlan(source, VIEWS, EvaluationConfig(), index).samples())
     assert [sample.scene for sample in found] == ["broken", "cut", "gap", "good"]
     assert [isinstance(sample, Sample) for sample in found] == [False, False, False, True]
     reasons = [sample.reason for sample in found if isinstance(sample, SceneFailure)]
     assert "transforms.json" in reasons[0]
-    assert "2.png" in reasons[1]
+    assert "view_002.png" in reasons[1]
     assert "1 of its listed images do not exist" in reasons[2]
-    assert "1.png" in reasons[2]
+    assert "view_001.png" in reasons[2]
 
 
 def test_scenes_are_decoded_one_at_a_time() -> None:

@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import threading
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
+from line_scenes import Line, Lines
+from photo_formats import synthetic, write_nerfstudio
 
 from qgs.composer import Recipe, resolve
-from qgs.contracts import Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.contracts import ViewsConfig
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
-from qgs.types import Cameras
 
 TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"
 ROOMS = resolve(TINY, ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"])
 
 
 def photos(folder: Path, broken: int | None = None) -> Recipe:
-    folder.mkdir()
-    frames = []
-    for number in range(8):
-        pixels = np.random.default_rng(number).integers(0, 256, (16, 16, 3), np.uint8)
-        Image.fromarray(pixels).save(folder / f"{number}.png")
-        matrix = np.eye(4)
-        matrix[0, 3] = number
-        frames.append({"file_path": f"{number}.png", "transform_matrix": matrix.tolist()})
+    write_nerfstudio(folder, synthetic(folder.with_name("photos"), 8))
     if broken is not None:
-        file = folder / f"{broken}.png"
+        file = folder / "images" / f"view_{broken:03d}.png"
         file.write_bytes(file.read_bytes()[:400])
-    meta = {"fl_x": 16, "fl_y": 16, "cx": 8, "cy": 8, "w": 16, "h": 16, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(meta))
     data = {"type": "qgs/photos", "path": str(folder), "image_size": [16, 16], "holdout": 0}
     return resolve({**ROOMS.tree, "data": data}, ["views.gap=[4, 7]", "views.targets=6"])
 
@@ -127,37 +116,15 @@ def test_data_that_vanished_is_told_by_workers_too(tmp_path):
         next(training_batches(source, recipe.views, 1, 0, workers=1))
 
 
-class Grouped(SceneSource):
-    """Scenes of equal cameras, stored in files of three."""
-
-    name = "grouped"
+class Grouped(Lines):
+    """Scenes of equal cameras, stored in groups."""
 
     def __init__(self, count: int, groups: Sequence[Sequence[int]]) -> None:
-        super().__init__(SceneSourceConfig(image_size=(4, 4)))
-        self._scenes = [Still(str(index)) for index in range(count)]
+        super().__init__(*(Line(4, name=str(index)) for index in range(count)))
         self._groups = groups
-
-    def scenes(self, split):
-        return self._scenes
 
     def groups(self, split):
         return self._groups
-
-
-class Still(Scene):
-    """Four grey frames, a step apart."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    @property
-    def cameras(self) -> Cameras:
-        c2w = torch.eye(4).repeat(4, 1, 1)
-        c2w[:, 0, 3] = torch.arange(4)
-        return Cameras(c2w, torch.ones(4, 4), (4, 4))
-
-    def images(self, frames):
-        return torch.full((len(frames), 3, 4, 4), 0.5)
 
 
 def test_groups_are_visited_one_after_another_in_changing_orders():

@@ -32,17 +32,18 @@ def change(folder: Path, frame: int | None = None, **values: Any) -> None:
     file.write_text(json.dumps(content))
 
 
-def save_mask(folder: Path, values: np.ndarray, frame: int = 1) -> None:
+def save_mask(folder: Path, value: int = 255, size=(30, 40), kind: type = np.uint8) -> None:
+    """The mask of frame 1: `value` in the left half."""
+    mask = np.zeros(size, kind)
+    mask[:, : size[1] // 2] = value
     (folder / "masks").mkdir(exist_ok=True)
-    Image.fromarray(values).save(folder / "masks" / "m.png")
-    change(folder, frame, mask_path="masks/m.png")
+    Image.fromarray(mask).save(folder / "masks" / "m.png")
+    change(folder, 1, mask_path="masks/m.png")
 
 
 @pytest.mark.parametrize("value", [255, 1, True])
 def test_masks_are_read_at_the_delivered_size(folder, value):
-    mask = np.zeros((30, 40), np.uint8 if value is not True else bool)
-    mask[:, :20] = value
-    save_mask(folder, mask)
+    save_mask(folder, value, kind=bool if value is True else np.uint8)
     masks = read(folder, (15, 20)).masks([1, 2])
     assert masks is not None
     assert masks.shape == (2, 1, 15, 20)
@@ -51,9 +52,7 @@ def test_masks_are_read_at_the_delivered_size(folder, value):
 
 
 def test_masks_reach_samples_and_views(folder):
-    mask = np.zeros((30, 40), np.uint8)
-    mask[:, :20] = 255
-    save_mask(folder, mask)
+    save_mask(folder)
     sample = make_sample(read(folder), (1, 3), (2,), ViewsConfig(inputs=2), mirror=True)
     assert sample.inputs.masks is not None
     assert sample.inputs.masks[0, :, 0, 5, 3].tolist() == [0, 1]
@@ -71,7 +70,7 @@ def test_masks_that_do_not_exist_or_do_not_fit_are_told(folder):
     change(folder, 1, mask_path="masks/none.png")
     with pytest.raises(FileNotFoundError, match=r"names 1 masks, of which 1 do not exist.*none"):
         read(folder)
-    save_mask(folder, np.zeros((30, 30), np.uint8))
+    save_mask(folder, size=(30, 30))
     scene = read(folder)
     with pytest.raises(ValueError, match=r"m\.png: the image is 30 x 30 pixels, but listed as 40"):
         scene.masks([1])

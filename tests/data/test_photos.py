@@ -1,14 +1,16 @@
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import photo_formats
 import pytest
 import torch
-from photo_formats import real_folder
+from photo_formats import real_folder, row_of_frames
 from PIL import Image
 
-from qgs.data import PhotosSource, read_photos
+from qgs.data import read_photos
 from qgs.data.images import CropResize
 from qgs.data.lenses import RadialTangential
 
@@ -18,19 +20,15 @@ GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48
 def folder(path: Path, count: int = 10, size=(64, 48), frame=None, **top) -> Path:
     """Photos whose red channel is the frame's number; `frame` changes entries of frame 1."""
     (path / "images").mkdir(exist_ok=True)
-    frames = []
     for i in range(count):
         Image.new("RGB", size, (10 * i, 50, 200)).save(path / "images" / f"{i}.png")
-        pose = np.eye(4)
-        pose[0, 3] = i
-        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
-    frames[1].update(frame or {})
-    (path / "transforms.json").write_text(json.dumps({**GLOBAL, **top, "frames": frames}))
+    content = row_of_frames(count, **GLOBAL | top)
+    content["frames"][1].update(frame or {})
+    (path / "transforms.json").write_text(json.dumps(content))
     return path
 
 
-def opened(path: Path, **options) -> PhotosSource:
-    return PhotosSource(PhotosSource.Config(path=str(path), **{"image_size": (24, 24), **options}))
+opened = partial(photo_formats.opened, size=(24, 24))
 
 
 def test_poses_become_opencv_and_intrinsics_follow(tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from photo_formats import PHOTOS
+from photo_formats import PHOTOS, opened
 from PIL import Image
 from qgs_datatools import packing
 from upath import UPath
@@ -24,23 +24,20 @@ SIZE = (144, 256)
 
 
 def photos(name: str) -> PhotosSource:
-    config = PhotosSource.Config(path=str(PHOTOS / name), format="nerfstudio", image_size=SIZE)
-    return PhotosSource(config)
+    return opened(PHOTOS / name, SIZE, format="nerfstudio")
 
 
 def as_chunks(name: str, folder: Path) -> Scene:
     source = photos(name)
     packing.pack(source, packing.own_splits(source), UPath(folder), {})
-    config = ChunksSource.Config(path=str(folder), image_size=SIZE)
-    return ChunksSource(config).scenes("train")[0]
+    return opened(folder, SIZE, ChunksSource).scenes("train")[0]
 
 
 def as_archive(name: str, folder: Path) -> Scene:
     with zipfile.ZipFile(folder / f"{name}.zip", "w") as archive:
         for file in (PHOTOS / name).rglob("*"):
             archive.write(file, file.relative_to(PHOTOS))
-    config = Dl3dvSource.Config(path=str(folder), image_size=SIZE, holdout=8)
-    return Dl3dvSource(config).scenes("train")[0]
+    return opened(folder, SIZE, Dl3dvSource, holdout=8).scenes("train")[0]
 
 
 @pytest.mark.parametrize("read", [as_chunks, as_archive])
@@ -69,8 +66,8 @@ def test_pixels_masks_intrinsics_and_poses(tmp_path, name, read):
     ],
 )
 def test_chunks_that_somebody_else_wrote(name, split, key, crop):
-    config = ChunksSource.Config(path=str(PHOTOS / "re10k_format"), image_size=(360, 640))
-    (chunk,) = [s for s in ChunksSource(config).scenes(split) if s.name == key]
+    chunks = opened(PHOTOS / "re10k_format", (360, 640), ChunksSource)
+    (chunk,) = [s for s in chunks.scenes(split) if s.name == key]
     source = photos(name).scenes("train")[0]
     assert isinstance(source, EncodedScene)
     distance = (source.cameras.c2w[:, None] - chunk.cameras.c2w).abs().amax((-1, -2))

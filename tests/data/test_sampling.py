@@ -3,29 +3,13 @@ from itertools import islice
 import numpy as np
 import pytest
 import torch
+from line_scenes import Line, Lines
 
-from qgs.contracts import EvaluationConfig, Scene, SceneSource, SceneSourceConfig, ViewsConfig
+from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views
 from qgs.data.stream import training_batches
 from qgs.types import Cameras, Views
-
-
-class Line(Scene):
-    """Cameras along a line; frame f is an image of the value f / 100, brighter to the right."""
-
-    def __init__(self, count: int, held_out=(), step: float = 0.5) -> None:
-        self.name, self.held_out, self.count, self.step = f"line{count}", held_out, count, step
-
-    @property
-    def cameras(self) -> Cameras:
-        c2w = torch.eye(4).repeat(self.count, 1, 1)
-        c2w[:, 0, 3] = self.step * torch.arange(self.count) + 3
-        return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
-
-    def images(self, frames):
-        value = torch.tensor(list(frames)).float() / 100
-        return value[:, None, None, None] + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
 
 
 class MaskedLine(Line):
@@ -39,17 +23,6 @@ class MaskedLine(Line):
         value = torch.tensor(list(frames)).float() / 100
         left = torch.arange(8) < 4
         return value[:, None, None, None] * left.expand(1, 8, 8)
-
-
-class Lines(SceneSource):
-    name = "lines"
-
-    def __init__(self, *scenes: Scene) -> None:
-        super().__init__(SceneSourceConfig(image_size=(8, 8)))
-        self._scenes = scenes
-
-    def scenes(self, split):
-        return self._scenes
 
 
 @pytest.mark.parametrize(("inputs", "gap"), [(2, (2, 5)), (4, (5, 9)), (1, (3, 3)), (3, (50, 90))])

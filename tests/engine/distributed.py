@@ -3,17 +3,35 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from qgs.composer import resolve
-from qgs.engine import train
+from qgs.data.sampling import Batch
+from qgs.data.stream import Share, training_batches
+from qgs.engine import train, training
 
 
-def main(recipe: str, run: str) -> None:
+def spoiled(*arguments: Any, share: Share, **options: Any) -> Generator[Batch, None, None]:
+    """`training_batches`, of which the second process's second batch has a bad pixel."""
+    stream = training_batches(*arguments, share=share, **options)
+    try:
+        for number, batch in enumerate(stream):
+            if share.rank == 1 and number == 1:
+                batch.targets.images[0, 0, 0, 0, 0] = torch.nan
+            yield batch
+    finally:
+        stream.close()
+
+
+def main(recipe: str, run: str, spoil: str = "") -> None:
     """Train, and print what this process knows of it."""
     torch.set_num_threads(1)
+    if spoil:
+        training.training_batches = spoiled
     result = train(resolve(Path(recipe)), run, device="cpu", resume=True)
     total = sum(float(p.detach().double().abs().sum()) for p in result.model.parameters())
     print(f"{result.main} {result.steps} {total:.6f}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from pathlib import Path
 
@@ -30,6 +29,15 @@ from qgs.io.checkpoint import load_extra
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
 DEAD = dict.fromkeys(ALIVE, 0.0)
+INVISIBLE = "model.head.opacity_bias=-20.0"
+
+
+def observed(*signs: dict[str, float]) -> CollapseDetector:
+    """A detector with a window of 10 steps, after steps with these signs of life."""
+    detector = CollapseDetector(10)
+    for step in signs:
+        detector.observe(step)
+    return detector
 
 
 @pytest.mark.parametrize(
@@ -41,10 +49,7 @@ DEAD = dict.fromkeys(ALIVE, 0.0)
     ],
 )
 def test_a_window_of_dead_steps_is_a_collapse(dead: dict[str, float], words: str) -> None:
-    detector = CollapseDetector(10)
-    detector.observe(ALIVE)
-    for _ in range(9):
-        detector.observe(ALIVE | dead)
+    detector = observed(ALIVE, *[ALIVE | dead] * 9)
     assert not detector.collapsed
     detector.observe(ALIVE | dead)
     assert detector.collapsed
@@ -52,19 +57,11 @@ def test_a_window_of_dead_steps_is_a_collapse(dead: dict[str, float], words: str
 
 
 def test_one_living_step_starts_the_count_again() -> None:
-    detector = CollapseDetector(10)
-    for _ in range(5):
-        for _ in range(9):
-            detector.observe(DEAD)
-        detector.observe(ALIVE)
-    assert not detector.collapsed
+    assert not observed(*[*[DEAD] * 9, ALIVE] * 5).collapsed
 
 
 def test_images_that_are_still_plain_at_the_start_are_no_collapse() -> None:
-    detector = CollapseDetector(10)
-    for _ in range(50):
-        detector.observe(ALIVE | {"deviation": 1e-4})
-    assert not detector.collapsed
+    assert not observed(*[ALIVE | {"deviation": 1e-4}] * 50).collapsed
 
 
 def test_good_weights_are_the_older_of_two_copies() -> None:
@@ -99,14 +96,9 @@ def mean_alpha(checkpoint: Path, recipe: Recipe) -> float:
 def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     tiny: Tiny, tmp_path: Path
 ) -> None:
-    recipe = tiny(
-        "tokengs",
-        "training.steps=300",
-        "optimizer.warmup=150",
-        "optimizer.learning_rate=0.5",
-        "optimizer.initial_divisor=1e5",
-        "training.save_every=25",
-    )
+    rising = ("warmup=150", "learning_rate=0.5", "initial_divisor=1e5")
+    options = ("training.steps=300", "training.save_every=25")
+    recipe = tiny("tokengs", *options, *(f"optimizer.{option}" for option in rising))
     assert recipe.training.collapse_window == TrainingConfig().collapse_window
     with pytest.raises(CollapseError) as caught:
         run_anywhere(recipe, tmp_path / "run")
@@ -125,21 +117,15 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
 def test_gaussians_invisible_from_the_start_are_noticed_within_the_window(
     tiny: Tiny, tmp_path: Path
 ) -> None:
-    recipe = tiny(
-        "tokengs",
-        "model.head.opacity_bias=-20.0",
-        "training.steps=400",
-        "training.collapse_window=20",
-    )
+    options = ("training.steps=400", "training.collapse_window=20")
     with pytest.raises(CollapseError, match="renderings are empty"):
-        run_anywhere(recipe, tmp_path / "run")
-    lines = (tmp_path / "run" / "history.jsonl").read_text().splitlines()
-    assert len(lines) == recipe.training.collapse_window
-    assert json.loads(lines[-1])["step"] == recipe.training.collapse_window
+        run_anywhere(tiny("tokengs", INVISIBLE, *options), tmp_path / "run")
+    history = RunFolder(tmp_path / "run").history()
+    assert [record["step"] for record in history] == list(range(1, 21))
 
 
 def test_a_run_that_ends_inside_a_collapse_fails_too(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
+    recipe = tiny("tokengs", INVISIBLE, "training.steps=12")
     with pytest.raises(CollapseError, match="for the last 12 steps"):
         run_anywhere(recipe, tmp_path / "run")
 
@@ -186,7 +172,5 @@ def test_a_stray_splat_is_no_sign_of_life() -> None:
     alpha, deviation = measure(rgb, 1 - rgb[:, :, :1], background)
     assert alpha < EMPTY_ALPHA
     assert deviation == pytest.approx(4 / 32**2)
-    detector = CollapseDetector(10)
-    detector.observe(ALIVE)
-    detector.observe(ALIVE | {"deviation": float(deviation)})
-    assert "equal the background" in detector.symptom
+    symptom = observed(ALIVE, ALIVE | {"deviation": float(deviation)}).symptom
+    assert "equal the background" in symptom

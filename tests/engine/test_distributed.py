@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -11,7 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from training_runs import Tiny, losses, run, run_calling
+from safetensors.torch import load_file
+from training_runs import Tiny, losses, read_jsonl, run, run_calling
 
 import qgs
 from qgs.composer import Recipe
@@ -26,13 +28,13 @@ PARTS = 'optimizer.parts={"decoder.0.feed_forward": 0, "head": 0.5}'
 """One sublayer stays as it is, and the head learns slower."""
 
 
-def train_in_two_processes(recipe: Recipe, run: Path, **environment: str) -> list[list[str]]:
-    """Continue or start `run` by torchrun; what each process said of it."""
+def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "", **environment: str) -> None:
+    """Continue or start `run` by torchrun; both processes must say the same of it."""
     file = run.with_suffix(".yaml")
     file.write_text(yaml.safe_dump(dict(recipe.tree)))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     done = subprocess.run(
-        [*command, str(WORKER), str(file), str(run)],
+        [*command, str(WORKER), str(file), str(run), spoil],
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         capture_output=True,
         text=True,
@@ -40,7 +42,9 @@ def train_in_two_processes(recipe: Recipe, run: Path, **environment: str) -> lis
     )
     assert done.returncode == 0, done.stderr
     # wherever they stand: what libraries print meanwhile lands in the same lines
-    return [list(words) for words in re.findall(r"(True|False) (\d+) (\d+\.\d+)", done.stdout)]
+    said = re.findall(r"(True|False) (\d+) (\d+\.\d+)", done.stdout)
+    assert sorted(main for main, *_ in said) == ["False", "True"]
+    assert said[0][1:] == said[1][1:] == ("4", said[0][2]), "the same weights everywhere"
 
 
 @pytest.mark.parametrize("accumulate", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -50,11 +54,7 @@ def test_two_processes_have_the_loss_curve_of_one(
     options = ("training.save_every=2", f"training.accumulate={accumulate}", PARTS)
     alone = tiny("locus", "training.batch_size=2", *options)
     run(alone, tmp_path / "alone")
-    said = train_in_two_processes(
-        tiny("locus", "training.batch_size=1", *options), tmp_path / "two"
-    )
-    assert sorted(main for main, *_ in said) == ["False", "True"]
-    assert said[0][1:] == said[1][1:] == ["4", said[0][2]], "the same weights everywhere"
+    train_in_two_processes(tiny("locus", "training.batch_size=1", *options), tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
     names = {path.name for path in (tmp_path / "two").iterdir()}
     assert names == {
@@ -69,10 +69,15 @@ def test_shards_continue_what_one_process_began(
     options = ("training.save_every=2", "training.ema=0.9", PARTS)
     alone = tiny("locus", "training.batch_size=4", *options)
     run(alone, tmp_path / "alone")
-    begin(alone, tmp_path / "shards")
+
+    def kill(trainer: Trainer, stop: StopRequest) -> None:
+        if trainer.step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_calling(kill, alone, tmp_path / "shards")
     part = f"training.batch_size={2 // accumulate}", f"training.accumulate={accumulate}"
-    said = train_in_two_processes(tiny("locus", *part, *options), tmp_path / "shards", **FSDP)
-    assert said[0][1:] == said[1][1:] == ["4", said[0][2]]
+    train_in_two_processes(tiny("locus", *part, *options), tmp_path / "shards", **FSDP)
     assert losses(tmp_path / "shards") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
     ours, theirs = (
         read_state(tmp_path / n / "state.safetensors").parts for n in ("shards", "alone")
@@ -84,12 +89,21 @@ def test_shards_continue_what_one_process_began(
     qgs.load(tmp_path / "shards" / "checkpoint.safetensors")
 
 
-def begin(recipe: Recipe, folder: Path) -> None:
-    """The first two steps of a run, killed in the third."""
-
-    def kill(trainer: Trainer, stop: StopRequest) -> None:
-        if trainer.step == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_calling(kill, recipe, folder)
+def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path: Path) -> None:
+    parts = ("training.batch_size=1", "training.render_views=1", "training.on_nonfinite=skip")
+    judged = ("training.ema=0.9", "training.evaluate_every=2", "evaluation.scenes=1")
+    train_in_two_processes(tiny("locus", *parts, *judged), tmp_path / "run", "spoil")
+    run = tmp_path / "run"
+    records = read_jsonl(run / "history.jsonl")
+    assert ["loss" in record for record in records] == [True, False, True, True]
+    incident = run / "incidents" / "step-2"
+    report = json.loads((incident / "report.json").read_text())
+    first = {found["process"]: found["first"] for found in report["found"]}
+    assert first[0] is None
+    assert first[1]["tensor"] == "targets.images"
+    seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
+    assert [int(images.isnan().sum()) for images in seen] == [0, 1]
+    judged = read_jsonl(run / "evaluations.jsonl")
+    assert [(record["step"], record["weights"]) for record in judged] == [
+        (step, weights) for step in (2, 4) for weights in ("raw", "ema")
+    ]

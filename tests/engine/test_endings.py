@@ -7,15 +7,15 @@ import multiprocessing
 import resource
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from training_runs import QUIET, Tiny, losses, run, run_calling, same, weights
+import torch
+from training_runs import QUIET, Tiny, change_batches, losses, run, run_calling, same, weights
 
 from qgs.data.sampling import Batch
-from qgs.data.stream import SampleStream, WorkerError
+from qgs.data.stream import WorkerError
 from qgs.engine import NonFiniteError, periodic
 from qgs.engine.checkpoint import read_state
 from qgs.engine.distributed import StopRequest, signal
@@ -30,14 +30,12 @@ def saved_step(folder: Path) -> int:
 
 def spoil(monkeypatch: pytest.MonkeyPatch, from_sample: int) -> None:
     """From this sample on, the data cannot be read."""
-    batch = SampleStream.batch
 
-    def broken(stream: SampleStream, numbers: Sequence[int]) -> Batch:
+    def broken(batch: Batch, numbers: Sequence[int]) -> None:
         if max(numbers) >= from_sample:
             raise OSError("the disk is gone")
-        return batch(stream, numbers)
 
-    monkeypatch.setattr(SampleStream, "batch", broken)
+    change_batches(monkeypatch, broken)
 
 
 def test_data_that_fails_leaves_a_run_that_goes_on(
@@ -133,16 +131,11 @@ def test_a_full_disk_is_told_with_what_to_do(tiny: Tiny, tmp_path: Path) -> None
 def test_bad_poses_are_told_as_data_with_the_remedy_first(
     tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    batch = SampleStream.batch
+    def without_pose(batch: Batch, numbers: Sequence[int]) -> None:
+        if numbers[0] >= 4:
+            batch.inputs.cameras.c2w.fill_(torch.nan)
 
-    def without_pose(stream: SampleStream, numbers: Sequence[int]) -> Batch:
-        made = batch(stream, numbers)
-        if numbers[0] < 4:
-            return made
-        cameras = replace(made.inputs.cameras, c2w=made.inputs.cameras.c2w * float("nan"))
-        return replace(made, inputs=replace(made.inputs, cameras=cameras))
-
-    monkeypatch.setattr(SampleStream, "batch", without_pose)
+    change_batches(monkeypatch, without_pose)
     with pytest.raises(NonFiniteError) as caught:
         run(tiny("tokengs", "training.batch_size=2"), tmp_path / "run")
     message = str(caught.value)

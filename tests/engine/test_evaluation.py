@@ -9,9 +9,10 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain, repeat
 from pathlib import Path
+from typing import TypeAlias
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -19,8 +20,9 @@ from qgs_rooms.source import RoomsSource
 from rich.console import Console
 
 from qgs.composer import Recipe
-from qgs.contracts import MetricInput, Scene
+from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
+from qgs.data.sampling import Sample
 from qgs.engine import evaluate
 from qgs.engine.comparison import compare
 from qgs.engine.results import METHODS, Evaluation, read_results
@@ -29,19 +31,20 @@ from qgs.metrics.dispersion import token_dispersion
 from qgs.metrics.images import Psnr, psnr, ssim
 from qgs.metrics.lpips import Lpips
 
+Tiny: TypeAlias = Callable[..., Recipe]
 FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
 
 
 def write_index(folder: Path, **scenes: tuple[Sequence[int], Sequence[int]] | None) -> str:
     file = folder / "some_index.json"
-    entries = {
-        name.replace("room", "test/00000"): {"context": frames[0], "target": frames[1]}
-        if frames
-        else None
-        for name, frames in scenes.items()
-    }
-    file.write_text(json.dumps(entries))
+    names = (name.replace("room", "test/00000") for name in scenes)
+    entries = [f and {"context": f[0], "target": f[1]} for f in scenes.values()]
+    file.write_text(json.dumps(dict(zip(names, entries, strict=True))))
     return f"evaluation.index={file}"
+
+
+def first_sample(recipe: Recipe) -> Sample:
+    return evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
 
 
 def shown(evaluation: Evaluation) -> str:
@@ -50,31 +53,44 @@ def shown(evaluation: Evaluation) -> str:
     return console.export_text()
 
 
-def test_twice_gives_the_same_files(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    recipe = tiny("locus")
+def test_twice_gives_the_same_files_from_data_opened_once(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny("locus", "evaluation.protocol=rooms-2view")
+    opened: list[RoomsSource] = []
+    scenes = RoomsSource.scenes
+    monkeypatch.setattr(
+        RoomsSource, "scenes", lambda self, split: opened.append(self) or scenes(self, split)
+    )
     for name in ("a", "b"):
-        evaluate(recipe.build_model(), recipe).write(tmp_path / name)
+        model = recipe.build_model().train()
+        evaluate(model, recipe).write(tmp_path / name)
+        assert model.training
+    assert len({id(source) for source in opened}) == 2
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == FILES
     for file in FILES:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    told = json.loads((tmp_path / "a" / "summary.json").read_text())["protocol"]
+    assert told["name"] == "rooms-2view"
+    content = (tmp_path / "a" / "protocol.json").read_bytes()
+    assert hashlib.sha256(content).hexdigest() == told["sha256"]
 
 
-def test_scores_hold_the_metrics_of_model_and_baselines(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_scores_hold_the_metrics_of_model_and_baselines(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs")
     model = recipe.build_model().eval()
     evaluation = evaluate(model, recipe)
-    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[1]
+    sample = first_sample(recipe)
+    cameras, truth = sample.targets.cameras, sample.targets.images
     with torch.no_grad():
         gaussians = model(sample.inputs).gaussians
-        rgb = model.render(gaussians, sample.targets.cameras).rgb
+        rgb = model.render(gaussians, cameras).rgb
     images = {
         "model": rgb,
-        "nearest_input": nearest_input(sample.inputs, sample.targets.cameras),
-        "mean_colour": mean_colour(sample.inputs, sample.targets.cameras),
+        "nearest_input": nearest_input(sample.inputs, cameras),
+        "mean_colour": mean_colour(sample.inputs, cameras),
     }
-    score, truth = evaluation.scores[1], sample.targets.images
+    score = evaluation.scores[0]
     assert score.views == [(sample.input_frames, sample.target_frames)]
     for method, image in images.items():
         for name, metric in (("psnr", psnr), ("ssim", ssim)):
@@ -96,52 +112,35 @@ def test_scores_hold_the_metrics_of_model_and_baselines(
         assert (summary[method]["dispersion_mean"] is None) == (method != "model")
 
 
-@pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_batches_change_no_score(tiny: Callable[..., Recipe], name: str) -> None:
-    recipe = tiny(name, "evaluation.scenes=3", "evaluation.samples=2")
+def assert_batches_change_no_score(recipe: Recipe, batch: int) -> list[tuple[int, ...]]:
+    """Scenes and views of each pass of the model under `batch`."""
     model = recipe.build_model()
     alone = evaluate(model, recipe)
-    for batch in (4, 16):
-        together = evaluate(model, recipe, batch=batch)
-        assert [score.scene for score in together.scores] == [s.scene for s in alone.scores]
-        for ours, theirs in zip(together.scores, alone.scores, strict=True):
-            assert ours.views == theirs.views
-            assert ours.values == pytest.approx(theirs.values, rel=0, abs=1e-6)
-
-
-def test_batches_pass_through_the_model_together(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
-    index = write_index(
-        tmp_path, room0=([0, 2], [1]), room1=([0, 2], [1]), room2=([0, 2, 4], [1]), room3=([1], [2])
-    )
-    recipe = tiny("tokengs", index)
-    model = recipe.build_model()
     sizes: list[tuple[int, ...]] = []
     model.encoder.register_forward_pre_hook(
         lambda module, arguments: sizes.append(tuple(arguments[0].images.shape[:2]))
     )
-    evaluate(model, recipe, batch=4)
+    together = evaluate(model, recipe, batch=batch)
+    for ours, theirs in zip(together.scores, alone.scores, strict=True):
+        assert (ours.scene, ours.views) == (theirs.scene, theirs.views)
+        assert ours.values == pytest.approx(theirs.values, rel=0, abs=1e-6)
+    return sizes
+
+
+@pytest.mark.parametrize(("name", "batch"), [("tokengs", 4), ("locus", 16)])
+def test_batches_change_no_score(tiny: Tiny, name: str, batch: int) -> None:
+    recipe = tiny(name, "evaluation.scenes=3", "evaluation.samples=2")
+    assert_batches_change_no_score(recipe, batch)
+
+
+def test_batches_pass_through_the_model_together(tiny: Tiny, tmp_path: Path) -> None:
+    frames = {"room0": ([0, 4], [2]), "room1": ([0, 4], [1, 2, 3])}
+    index = write_index(tmp_path, **frames, room2=([0, 2, 4], [1]), room3=([1], [2]))
+    sizes = assert_batches_change_no_score(tiny("tokengs", index), 4)
     assert sizes == [(2, 2), (1, 3), (1, 1)]
 
 
-def test_scenes_with_other_numbers_of_targets_pass_together(
-    tiny: Callable[..., Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [2]), room1=([0, 4], [1, 2, 3])))
-    model = recipe.build_model()
-    alone = evaluate(model, recipe)
-    sizes = []
-    model.register_forward_hook(lambda module, args, out: sizes.append(len(args[0].images)))
-    together = evaluate(model, recipe, batch=2)
-    assert sizes == [2]
-    for first, second in zip(alone.scores, together.scores, strict=True):
-        assert second.values == pytest.approx(first.values, rel=1e-4, abs=1e-5)
-
-
-def test_frames_that_a_model_is_given_and_judged_on_are_told(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_frames_that_a_model_is_given_and_judged_on_are_told(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [4, 2, 0]), room1=([0, 4], [2])))
     evaluation = evaluate(recipe.build_model(), recipe)
     assert evaluation.summary()["context_and_target"] == {"test/000000": [0, 4]}
@@ -150,9 +149,7 @@ def test_frames_that_a_model_is_given_and_judged_on_are_told(
     assert line.endswith("test/000000 (0 4)")
 
 
-def test_what_is_missing_is_told_in_the_same_line_as_the_score(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_path: Path) -> None:
     index = write_index(
         tmp_path, room0=([0, 3], [1, 2]), room1=([0, 99], [1]), gone=([0, 3], [1]), nil=None
     )
@@ -181,10 +178,11 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(
     assert rows["gone"]["problem"] == "not among the test scenes of the data"
     assert rows["test/000000"]["input_frames"] == "0 3"
     assert rows["test/000000"]["problem"] == ""
+    assert read_results(tmp_path).missing == ["test/000001", "gone"]
 
 
 def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
-    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = tiny("tokengs", "evaluation.scenes=4")
     model, forward = recipe.build_model(), type(recipe.build_model().encoder).forward
@@ -211,28 +209,25 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
     )
     evaluation = evaluate(model, recipe, batch=4)
     assert [score.scene for score in evaluation.scores] == ["test/000003"]
-    reasons = {failure.scene: failure.reason for failure in evaluation.missing}
-    assert reasons["test/000000"] == "RuntimeError: out of memory"
-    assert "is not finite" in reasons["test/000001"]
-    assert reasons["test/000002"] == "OSError: /data/set/truncated.png is cut off"
+    reasons = [failure.reason for failure in evaluation.missing]
+    assert reasons[0] == "RuntimeError: out of memory"
+    assert "is not finite" in reasons[1]
+    assert reasons[2] == "OSError: /data/set/truncated.png is cut off"
 
 
 def write_photos(folder: Path, count: int) -> None:
     folder.mkdir(parents=True)
-    rng = np.random.default_rng(0)
     frames = []
     for number in range(count):
-        pixels = rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{number}.png")
-        pose = np.eye(4)
-        pose[0, 3] = 0.1 * number
-        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
+        Image.effect_noise((32, 32), 50).convert("RGB").save(folder / f"{number}.png")
+        pose = [[1, 0, 0, 0.1 * number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose})
     camera = {"fl_x": 32, "fl_y": 32, "cx": 16, "cy": 16, "w": 32, "h": 32}
     (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
 
 
 def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(
-    tiny: Callable[..., Recipe], tmp_path: Path
+    tiny: Tiny, tmp_path: Path
 ) -> None:
     for name in ("a", "b", "c"):
         write_photos(tmp_path / name, 12)
@@ -245,51 +240,28 @@ def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(
     assert list(summary["missing"]) == ["b", "c"]
     assert summary["held_out_frames"] == (3, 3)
     assert str(tmp_path) not in json.dumps(summary)
-    for reason in summary["missing"].values():
-        assert reason
+    assert all(summary["missing"].values())
 
 
-def test_no_scene_at_all_is_an_error_with_the_first_reason(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_no_scene_at_all_and_an_empty_batch_are_errors(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", write_index(tmp_path, a=([0], [1]), b=([0], [1])))
+    model = recipe.build_model()
     with pytest.raises(ValueError, match="none of 2 scenes could be judged; the first, a: not amo"):
-        evaluate(recipe.build_model(), recipe)
+        evaluate(model, recipe)
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        evaluate(model, recipe, batch=0)
 
 
-def test_failed_samples_fail_their_scene(
-    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_samples_fail_their_scene(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = tiny("tokengs", "evaluation.samples=3")
-    score = Psnr.forward
-    calls = []
-
-    def failing(self: Psnr, given: MetricInput) -> torch.Tensor:
-        calls.append(1)
-        return score(self, given) * (math.inf if len(calls) == 2 * len(METHODS) else 1)
-
-    monkeypatch.setattr(Psnr, "forward", failing)
+    score, factors = Psnr.forward, chain([1] * (2 * len(METHODS) - 1), [math.inf], repeat(1))
+    monkeypatch.setattr(Psnr, "forward", lambda self, given: score(self, given) * next(factors))
     evaluation = evaluate(recipe.build_model(), recipe)
     assert [failure.scene for failure in evaluation.missing] == ["test/000000"]
     assert [len(score.views) for score in evaluation.scores] == [3]
 
 
-def test_the_mode_of_the_model_is_left_alone(tiny: Callable[..., Recipe]) -> None:
-    recipe = tiny("tokengs")
-    model = recipe.build_model().train()
-    evaluate(model, recipe)
-    assert model.training
-
-
-def test_an_empty_batch_is_refused(tiny: Callable[..., Recipe]) -> None:
-    recipe = tiny("tokengs")
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        evaluate(recipe.build_model(), recipe, batch=0)
-
-
-def test_the_table_shows_all_methods_and_why_a_column_is_empty(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_the_table_shows_all_methods_and_why_a_column_is_empty(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", f"metrics.lpips={{type: qgs/lpips, weights: {tmp_path / 'none.pth'}}}")
     evaluation = evaluate(recipe.build_model(), recipe)
     text = " ".join(shown(evaluation).split())
@@ -299,9 +271,7 @@ def test_the_table_shows_all_methods_and_why_a_column_is_empty(
     assert evaluation.mean("lpips") is None
 
 
-def test_the_form_of_ssim_is_named_where_it_is_not_the_default(
-    tiny: Callable[..., Recipe], tmp_path: Path
-) -> None:
+def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny, tmp_path: Path) -> None:
     plain, sample = tiny("tokengs"), tiny("tokengs", "metrics.ssim.covariance=sample")
     model = plain.build_model()
     evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
@@ -318,9 +288,7 @@ def test_the_form_of_ssim_is_named_where_it_is_not_the_default(
     assert text.count(f"SSIM in {stored[0].name} is SSIM (sample covariance) in") == 1
 
 
-def test_lpips_fills_its_column_where_it_can(
-    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lpips_fills_its_column_where_it_can(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = tiny("tokengs", "metrics.lpips={type: qgs/lpips, weights: mine.pth}")
     asked = []
     monkeypatch.setattr(Lpips, "_load", lambda self, weights: asked.append(weights) or "")
@@ -329,7 +297,7 @@ def test_lpips_fills_its_column_where_it_can(
     )
     evaluation = evaluate(recipe.build_model(), recipe)
     assert asked == ["mine.pth"]
-    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
+    sample = first_sample(recipe)
     copied = nearest_input(sample.inputs, sample.targets.cameras)
     expected = float((copied - sample.targets.images).abs().mean())
     assert evaluation.scores[0].values["nearest_input_lpips"] == pytest.approx(expected, rel=1e-5)
@@ -337,9 +305,7 @@ def test_lpips_fills_its_column_where_it_can(
     assert "is empty" not in shown(evaluation)
 
 
-def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(
-    tiny: Callable[..., Recipe],
-) -> None:
+def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(tiny: Tiny) -> None:
     plain, tuned = tiny("locus"), tiny("locus", "evaluation.tuning_steps=2")
     model = plain.build_model()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
@@ -352,25 +318,3 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(
     assert told["loss_after"] < told["loss_before"]
     assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
     assert "tokens tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)
-
-
-def test_protocol_file_hashes_to_the_protocol(tiny: Callable[..., Recipe], tmp_path: Path) -> None:
-    recipe = tiny("tokengs", "evaluation.protocol=rooms-2view")
-    evaluate(recipe.build_model(), recipe).write(tmp_path)
-    told = json.loads((tmp_path / "summary.json").read_text())["protocol"]
-    assert told["name"] == "rooms-2view"
-    content = (tmp_path / "protocol.json").read_bytes()
-    assert hashlib.sha256(content).hexdigest() == told["sha256"]
-
-
-def test_rooms_are_opened_once(
-    tiny: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = tiny("tokengs")
-    opened = []
-    scenes = RoomsSource.scenes
-    monkeypatch.setattr(
-        RoomsSource, "scenes", lambda self, split: opened.append(id(self)) or scenes(self, split)
-    )
-    evaluate(recipe.build_model(), recipe)
-    assert len(set(opened)) == 1

@@ -11,43 +11,30 @@ from rich.console import Console
 
 from qgs.contracts import Column
 from qgs.engine.comparison import compare, paired_interval
+from qgs.engine.protocol import Protocol
 from qgs.engine.results import StoredResults, read_results
 
-HASHES = {"rooms": "a" * 64, "halls": "b" * 64}
 COLUMNS = {"psnr": Column("PSNR", "higher", 2), "lpips": Column("LPIPS", "lower")}
 
 
 def results(name: str, protocol: str = "rooms", **psnr: float) -> StoredResults:
     scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
-    content = {"format": 1, "views": protocol}
+    judged_by = Protocol(protocol, {"format": 1, "views": protocol})
     frames = dict.fromkeys(scenes, ("0 3", "1 2"))
-    return StoredResults(
-        name, protocol, HASHES[protocol], content, COLUMNS, scenes, frames, len(scenes)
-    )
+    return StoredResults(name, judged_by, COLUMNS, scenes, frames, len(scenes))
 
 
 def test_the_interval_is_that_of_scipy() -> None:
     bootstrap = pytest.importorskip("scipy.stats").bootstrap
     differences = np.random.default_rng(1).normal(0.3, 1.0, 60)
-    expected = bootstrap(
-        (differences,), np.mean, method="percentile", n_resamples=10_000, rng=0
-    ).confidence_interval
-    low, high = paired_interval(differences) or (np.nan, np.nan)
-    assert low == pytest.approx(expected.low, abs=0.02)
-    assert high == pytest.approx(expected.high, abs=0.02)
+    expected = bootstrap((differences,), np.mean, method="percentile", n_resamples=10_000, rng=0)
+    found = paired_interval(differences)
+    assert found == pytest.approx(tuple(expected.confidence_interval), abs=0.02)
+    assert found == paired_interval(differences.copy())
 
 
-def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
-    rng = np.random.default_rng(2)
-    intervals = [paired_interval(rng.normal(1.0, 2.0, 40)) or (9.0, 9.0) for _ in range(100)]
-    covered = sum(low <= 1.0 <= high for low, high in intervals)
-    assert 86 <= covered <= 100
-
-
-def test_the_interval_is_the_same_each_time_and_none_for_one_scene() -> None:
-    differences = np.linspace(-1, 2, 7)
-    assert paired_interval(differences) == paired_interval(differences.copy())
-    assert paired_interval(differences[:1]) is None
+def test_the_interval_is_none_for_one_scene() -> None:
+    assert paired_interval(np.ones(1)) is None
 
 
 def test_scenes_pair_by_name_and_lower_is_better_for_lpips() -> None:
@@ -67,14 +54,10 @@ def test_scenes_pair_by_name_and_lower_is_better_for_lpips() -> None:
 
 
 def test_the_first_is_compared_with_each_of_the_others() -> None:
-    three = [
-        results(name, a=value, b=value) for name, value in (("x", 3.0), ("y", 2.0), ("z", 5.0))
-    ]
-    pairs = compare(three).pairs
-    assert [(p.first.name, p.second.name, p.differences[0].difference) for p in pairs] == [
-        ("x", "y", 1.0),
-        ("x", "z", -2.0),
-    ]
+    values = {"x": 3.0, "y": 2.0, "z": 5.0}
+    pairs = compare([results(name, a=value, b=value) for name, value in values.items()]).pairs
+    found = [(p.first.name, p.second.name, p.differences[0].difference) for p in pairs]
+    assert found == [("x", "y", 1.0), ("x", "z", -2.0)]
 
 
 def test_what_cannot_be_compared_is_refused() -> None:

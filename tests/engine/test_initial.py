@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 from torch import Generator, Tensor
-from training_runs import Tiny
+from training_runs import Tiny, same
 
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
@@ -25,19 +24,8 @@ from qgs.model import QueryGaussianModel
 
 COUNT = 24
 GROWTH_NOISE = 0.01  # LocusGS release
+GAUSSIANS = "head.gaussians_per_query=5"
 PER_QUERY = {"tokengs": ["features"], "locus": ["features", "center", "raw_radius"]}
-
-
-@pytest.fixture
-def learned(tiny: Tiny, tmp_path: Path) -> Callable[[str], Path]:
-    """`learned("locus")`: a checkpoint of that tiny model, of another seed than the recipe's."""
-
-    def make(name: str) -> Path:
-        path = tmp_path / f"{name}.safetensors"
-        save(tiny(name, "seed=7").build_model(), path)
-        return path
-
-    return make
 
 
 def started(recipe: Recipe) -> tuple[QueryGaussianModel, list[str]]:
@@ -45,15 +33,30 @@ def started(recipe: Recipe) -> tuple[QueryGaussianModel, list[str]]:
     return model, initialise(model, recipe)
 
 
+@pytest.fixture
+def learned(tiny: Tiny, tmp_path: Path) -> Tiny:
+    """`learned("locus", "a.b=c")`: that tiny model, from a checkpoint of another seed."""
+
+    def make(name: str, *options: str, of: str = "") -> Recipe:
+        path = tmp_path / f"{of or name}.safetensors"
+        save(tiny(of or name, "seed=7").build_model(), path)
+        return tiny(name, f"init_from={path}", *options)
+
+    return make
+
+
+def old_weights(recipe: Recipe) -> dict[str, Tensor]:
+    return load_file(recipe.tree["init_from"])
+
+
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 @pytest.mark.parametrize("count", [25, 60, 96])
 def test_old_queries_stay_and_new_ones_are_noisy_copies(
-    tiny: Tiny, learned: Callable[[str], Path], name: str, count: int
+    learned: Tiny, name: str, count: int
 ) -> None:
-    path = learned(name)
-    recipe = tiny(name, f"model.queries.count={count}", f"init_from={path}")
+    recipe = learned(name, f"model.queries.count={count}")
     model, told = started(recipe)
-    old = load_file(path)
+    old = old_weights(recipe)
     copied = torch.arange(COUNT, count) % COUNT
     for parameter in PER_QUERY[name]:
         before = old[f"queries.{parameter}"]
@@ -77,31 +80,27 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_shrinking_keeps_the_first(tiny: Tiny, learned: Callable[[str], Path], name: str) -> None:
-    path = learned(name)
-    model, told = started(tiny(name, "model.queries.count=10", f"init_from={path}"))
+def test_shrinking_keeps_the_first(learned: Tiny, name: str) -> None:
+    recipe = learned(name, "model.queries.count=10")
+    model, told = started(recipe)
     for parameter in PER_QUERY[name]:
         after = model.queries.get_parameter(parameter)
-        assert torch.equal(after, load_file(path)[f"queries.{parameter}"][:10])
+        assert torch.equal(after, old_weights(recipe)[f"queries.{parameter}"][:10])
     assert "queries.features: 24 -> 10, the first are kept" in told
 
 
-def test_the_same_size_is_taken_as_it_is(tiny: Tiny, learned: Callable[[str], Path]) -> None:
-    path = learned("locus")
-    model, told = started(tiny("locus", f"init_from={path}"))
-    own, old = model.state_dict(), load_file(path)
-    assert own.keys() == old.keys()
-    assert all(torch.equal(own[key], old[key]) for key in own)
-    assert told == [f"weights start from {path}"]
+def test_the_same_size_is_taken_as_it_is(learned: Tiny) -> None:
+    recipe = learned("locus")
+    model, told = started(recipe)
+    assert same(model.state_dict(), old_weights(recipe))
+    assert told == [f"weights start from {recipe.tree['init_from']}"]
 
 
-def test_the_recipes_seed_decides_the_noise(tiny: Tiny, learned: Callable[[str], Path]) -> None:
-    path = learned("tokengs")
-
+def test_the_recipes_seed_decides_the_noise(learned: Tiny) -> None:
     def features(seed: int) -> torch.Tensor:
         torch.rand(seed)  # the global random state plays no part
-        options = ("model.queries.count=30", f"init_from={path}", f"seed={seed}")
-        return started(tiny("tokengs", *options))[0].queries.get_parameter("features").detach()
+        model, _ = started(learned("tokengs", "model.queries.count=30", f"seed={seed}"))
+        return model.queries.get_parameter("features").detach()
 
     assert torch.equal(features(1), features(1))
     assert not torch.equal(features(1), features(2))
@@ -111,30 +110,25 @@ def test_the_recipes_seed_decides_the_noise(tiny: Tiny, learned: Callable[[str],
 def test_a_recipe_without_it_starts_from_its_own_seed(tiny: Tiny) -> None:
     recipe = tiny("tokengs")
     model, told = started(recipe)
-    fresh = recipe.build_model().state_dict()
     assert told == []
-    assert all(torch.equal(tensor, fresh[key]) for key, tensor in model.state_dict().items())
+    assert same(model.state_dict(), recipe.build_model().state_dict())
 
 
 def test_queries_may_have_a_rule_of_their_own(
-    tiny: Tiny, learned: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+    learned: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def doubled(queries: Queries, learned: dict[str, Tensor], _: Generator) -> dict[str, Tensor]:
         return {name: torch.cat([values, values]) for name, values in learned.items()}
 
     monkeypatch.setattr(LatentQueries, "resized", doubled)
-    path = learned("tokengs")
-    model, _ = started(tiny("tokengs", "model.queries.count=48", f"init_from={path}"))
-    features = model.queries.get_parameter("features")
-    assert torch.equal(features, load_file(path)["queries.features"].repeat(2, 1))
+    recipe = learned("tokengs", "model.queries.count=48")
+    features = started(recipe)[0].queries.get_parameter("features")
+    assert torch.equal(features, old_weights(recipe)["queries.features"].repeat(2, 1))
 
 
-def test_every_difference_is_told_with_the_options_that_fit(
-    tiny: Tiny, learned: Callable[[str], Path]
-) -> None:
-    path = learned("tokengs")
-    recipe = tiny("tokengs", f"init_from={path}", "model.head.gaussians_per_query=5",
-                  "model.queries.count=48", "model.head.norm=false")  # fmt: skip
+def test_every_difference_is_told_with_the_options_that_fit(learned: Tiny) -> None:
+    options = (GAUSSIANS, "queries.count=48", "head.norm=false")
+    recipe = learned("tokengs", *(f"model.{option}" for option in options))
     model = recipe.build_model()
     before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
     with pytest.raises(CheckpointError) as caught:
@@ -149,58 +143,46 @@ def test_every_difference_is_told_with_the_options_that_fit(
     ):
         assert words in str(caught.value)
     assert "queries" not in str(caught.value).split("only the number of queries may differ")[1]
-    assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
+    assert same(model.state_dict(), before)
 
 
-def test_a_refusal_lists_no_options_that_play_no_part(
-    tiny: Tiny, learned: Callable[[str], Path]
-) -> None:
-    recipe = tiny("locus", f"init_from={learned('locus')}", "model.head.gaussians_per_query=5",
-                  "model.queries.std=0.3", "model.queries.init_radius=0.7",
-                  "model.encoder.layer_scale=0.3")  # fmt: skip
+def test_a_refusal_lists_no_options_that_play_no_part(learned: Tiny) -> None:
+    idle = ("queries.std=0.3", "queries.init_radius=0.7", "encoder.layer_scale=0.3")
+    recipe = learned("locus", *(f"model.{option}" for option in (GAUSSIANS, *idle)))
     with pytest.raises(CheckpointError) as caught:
         initialise(recipe.build_model(), recipe)
     options = str(caught.value).split("was trained with:")[1]
     assert options.split() == ["model.head.gaussians_per_query:", "4", "(here", "5)"]
 
 
-def test_options_that_no_weight_shows_are_told(tiny: Tiny, learned: Callable[[str], Path]) -> None:
+def test_options_that_no_weight_shows_are_told(tiny: Tiny, learned: Tiny) -> None:
     options = ("model.head.scale_cap=0.3", "model.queries.init_radius=0.7")
-    _, told = started(tiny("locus", f"init_from={learned('locus')}", *options))
+    _, told = started(learned("locus", *options))
     cap = tiny("locus").tree["model"]["head"]["scale_cap"]
     assert told[1:] == [f"learned with model.head.scale_cap: {cap} (here 0.3)"]
 
 
 def test_published_weights_are_to_be_imported_first(tiny: Tiny, tmp_path: Path) -> None:
     save_file({"gs_tokens": torch.zeros(2)}, tmp_path / "w.safetensors")
-    recipe = tiny("tokengs", f"init_from={tmp_path / 'w.safetensors'}")
     with pytest.raises(CheckpointError, match=r"`qgs import .* --recipe auto"):
-        initialise(recipe.build_model(), recipe)
+        started(tiny("tokengs", f"init_from={tmp_path / 'w.safetensors'}"))
 
 
-def test_another_width_is_no_other_number_of_queries(
-    tiny: Tiny, learned: Callable[[str], Path]
-) -> None:
-    path = learned("tokengs")
-    recipe = tiny("tokengs", f"init_from={path}", "model.width=64", "model.queries.count=48")
-    with pytest.raises(
-        CheckpointError, match=r"queries\.features: \(24, 32\).*\(48, 64\) in the rec"
-    ):
-        initialise(recipe.build_model(), recipe)
+def test_another_width_is_no_other_number_of_queries(learned: Tiny) -> None:
+    recipe = learned("tokengs", "model.width=64", "model.queries.count=48")
+    message = r"queries\.features: \(24, 32\).*\(48, 64\) in the rec"
+    with pytest.raises(CheckpointError, match=message):
+        started(recipe)
 
 
-def test_anchors_are_not_taken_from_a_model_without(
-    tiny: Tiny, learned: Callable[[str], Path]
-) -> None:
-    recipe = tiny("locus", f"init_from={learned('tokengs')}")
+def test_anchors_are_not_taken_from_a_model_without(learned: Tiny) -> None:
     with pytest.raises(CheckpointError, match=r"missing: queries\.center"):
-        initialise(recipe.build_model(), recipe)
+        started(learned("locus", of="tokengs"))
 
 
 def test_a_missing_checkpoint_is_named(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", f"init_from={tmp_path / 'gone'}")
     with pytest.raises(FileNotFoundError, match="gone"):
-        initialise(recipe.build_model(), recipe)
+        started(tiny("tokengs", f"init_from={tmp_path / 'gone'}"))
 
 
 def test_imported_weights_grow_too(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import pytest
 import torch
@@ -24,6 +24,7 @@ from qgs.contracts import (
     Metric,
     MetricInput,
     Plugin,
+    Scene,
 )
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
@@ -37,20 +38,14 @@ from qgs.engine.tracking import Trackers
 
 
 class MeanAbsoluteError(Metric):
-    """Mean absolute error of a view."""
-
     name: ClassVar[str] = "mae"
     definition: ClassVar[str] = "mean absolute error"
     column: ClassVar[Column] = Column("MAE", "lower", digits=5)
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"log"})
 
     class Config(ComponentConfig):
-        """Options of the error."""
-
         power: float = 1.0
-        """Exponent of the error."""
         log: str | None = None
-        """File that changes no value."""
 
     def forward(self, given: MetricInput) -> Tensor:
         error = (given.images - given.targets.images).abs() ** self.config.power
@@ -58,21 +53,15 @@ class MeanAbsoluteError(Metric):
 
 
 class DepthError(Metric):
-    """Mean error of depth, in the model's units."""
-
     name: ClassVar[str] = "depth"
     needs = ("depth", "true_depth")
     column: ClassVar[Column] = Column("depth error", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
-        assert given.depth is not None
-        assert given.true_depth is not None
         return given.depth - given.true_depth
 
 
 class Masked(Metric):
-    """Share of masked pixels."""
-
     name: ClassVar[str] = "masked"
     needs = ("masks",)
 
@@ -86,16 +75,18 @@ class Masked(Metric):
 PLUGIN = Plugin("mine", CONTRACT_VERSION, (MeanAbsoluteError, DepthError, Masked))
 
 
-@pytest.fixture
+Judged: TypeAlias = tuple[Recipe, Evaluation]
+
+
+@pytest.fixture(scope="module")
 def mine(tiny: Callable[..., Recipe]) -> Callable[..., Recipe]:
     """`mine("metrics.mae={type: mine/mae}")`: a small TokenGS with the plugin above."""
-    return lambda *more: resolve(
-        tiny("tokengs").tree, ["plugins=[rooms, mine]", *more], plugins=[PLUGIN]
-    )
+    tree, plugins = tiny("tokengs").tree, "plugins=[rooms, mine]"
+    return lambda *more: resolve(tree, [plugins, *more], plugins=[PLUGIN])
 
 
 @pytest.fixture
-def judged(mine: Callable[..., Recipe]) -> tuple[Recipe, Evaluation]:
+def judged(mine: Callable[..., Recipe]) -> Judged:
     recipe = mine("metrics.error={type: mine/mae}")
     return recipe, evaluate(recipe.build_model(), recipe)
 
@@ -106,7 +97,7 @@ def shown(thing: object) -> str:
     return console.export_text()
 
 
-def test_evaluations_and_their_files(judged: tuple[Recipe, Evaluation], tmp_path: Path) -> None:
+def test_evaluations_and_their_files(judged: Judged, tmp_path: Path) -> None:
     recipe, evaluation = judged
     sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
     grey = sample.inputs.images.mean((1, 3, 4))[0, :, None, None]
@@ -126,7 +117,7 @@ def test_evaluations_and_their_files(judged: tuple[Recipe, Evaluation], tmp_path
 
 
 def test_comparisons_need_no_plugin_and_know_which_way_is_better(
-    mine: Callable[..., Recipe], judged: tuple[Recipe, Evaluation], tmp_path: Path
+    mine: Callable[..., Recipe], judged: Judged, tmp_path: Path
 ) -> None:
     judged[1].write(tmp_path / "a")
     other = mine("metrics.error={type: mine/mae}", "seed=1")
@@ -150,28 +141,26 @@ def test_the_protocol_has_its_definition_and_options(mine: Callable[..., Recipe]
     assert plain.sha256 == same.sha256 != other.sha256
 
 
-def test_training_records_and_tracks_it(mine: Callable[..., Recipe], tmp_path: Path) -> None:
+def test_training_records_and_tracks_it(judged: Judged, tmp_path: Path) -> None:
     told: dict[str, float] = {}
 
     class Told(Trackers):
         def log(self, values: Mapping[str, float], step: int) -> None:
             told.update(values)
 
-    recipe = mine("metrics.error={type: mine/mae}")
-    model = recipe.build_model()
-    accelerator = make_accelerator("cpu")
+    recipe, evaluation = judged
+    accelerator, model = make_accelerator("cpu"), recipe.build_model()
     PeriodicEvaluation(accelerator, recipe, model, None, tmp_path, Told(())).run(3)
     record = json.loads((tmp_path / "evaluations.jsonl").read_text())
-    assert record["scores"]["error"] == evaluate(model, recipe).mean("error")
+    assert record["scores"]["error"] == evaluation.mean("error")
     assert told["evaluation/raw/error"] == record["scores"]["error"]
 
 
-def test_contests_and_their_report_show_it(judged: tuple[Recipe, Evaluation]) -> None:
+def test_contests_and_their_report_show_it(judged: Judged) -> None:
     recipe, evaluation = judged
     scores = evaluation.means()
-    contender = Contender(
-        "one", recipe.build_model(), scores, 96, 1000, 1.0, Curves([], [], []), "recipe: 1"
-    )
+    model, curves = recipe.build_model(), Curves([], [], [])
+    contender = Contender("one", model, scores, 96, 1000, 1.0, curves, "recipe: 1")
     entry = Entry(recipe, contender, evaluation)
     table = shown(table_of([entry]))
     assert "MAE ↓" in table
@@ -185,11 +174,11 @@ def test_what_a_metric_needs(mine: Callable[..., Recipe], monkeypatch: pytest.Mo
     recipe = mine("metrics={depth: {type: mine/depth}, mask: {type: mine/masked}}")
     source = recipe.build_data()
     second = source.names("test")[1]
-    monkeypatch.setattr(
-        type(source.scenes("test")[0]),
-        "masks",
-        lambda self, frames: None if self.name == second else torch.ones(len(frames), 1, 16, 16),
-    )
+
+    def masks(scene: Scene, frames: Sequence[int]) -> Tensor | None:
+        return None if scene.name == second else torch.ones(len(frames), 1, 16, 16)
+
+    monkeypatch.setattr(type(source.scenes("test")[0]), "masks", masks)
     model = recipe.build_model().eval()
     evaluation = evaluate(model, recipe)
     sample = evaluation_samples(source, recipe.views, recipe.evaluation)[0]
@@ -200,9 +189,8 @@ def test_what_a_metric_needs(mine: Callable[..., Recipe], monkeypatch: pytest.Mo
     assert evaluation.mean("depth", "nearest_input") is None
     assert evaluation.mean("mask_mean") == evaluation.mean("mask_mean", "mean_colour") == 1.0
     assert set(evaluation.incomplete) == {"mask_mean"}
-    assert "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes" in shown(
-        evaluation
-    )
+    told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
+    assert told in shown(evaluation)
 
 
 def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(

@@ -51,6 +51,11 @@ class Step:
             self.gradients(self.batches)
         return watch.first
 
+    def first_bad(self) -> Finding:
+        found = self.first()
+        assert found
+        return found
+
 
 @pytest.fixture
 def step(tiny: Tiny) -> Step:
@@ -88,10 +93,8 @@ def test_a_weight_comes_before_everything(step: Step) -> None:
     name, parameter = list(step.model.named_parameters())[5]
     with torch.no_grad():
         parameter.view(-1)[:2] = torch.tensor([NAN, INF])
-    found = step.first()
-    assert found
-    assert found.tensor == f"weight model.{name}"
-    assert found.values == f"1 NaN and 1 infinite of {parameter.numel()} values"
+    values = f"1 NaN and 1 infinite of {parameter.numel()} values"
+    assert step.first() == Finding(f"weight model.{name}", values, 0)
 
 
 @pytest.mark.parametrize(("side", "field"), [("inputs", "images"), ("targets", "cameras.c2w")])
@@ -106,8 +109,7 @@ def test_data_is_named_with_its_batch(step: Step, side: str, field: str) -> None
 def test_a_module_is_named_by_its_output(step: Step) -> None:
     layer = step.model.decoder[2]
     layer.self_attention.register_forward_hook(spoiling(call=2))
-    found = step.first()
-    assert found
+    found = step.first_bad()
     assert found.tensor == "output of model.decoder.2.self_attention"
     assert found.batch == 1, "its second call is that of the second batch"
 
@@ -121,9 +123,7 @@ def test_a_layer_and_its_gaussians_are_named(step: Step, monkeypatch: pytest.Mon
         return replace(gaussians, scales=gaussians.scales * INF) if len(calls) == 2 else gaussians
 
     monkeypatch.setattr(step.model, "decode", broken)
-    found = step.first()
-    assert found
-    assert found.tensor == "prediction of layer 4.gaussians.scales"
+    assert step.first_bad().tensor == "prediction of layer 4.gaussians.scales"
 
 
 def test_a_rendering_and_a_loss_are_named(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,14 +131,10 @@ def test_a_rendering_and_a_loss_are_named(step: Step, monkeypatch: pytest.Monkey
     blank = lambda *a: replace(render(*a), depth=torch.full_like(render(*a).depth, NAN))  # noqa: E731
     with monkeypatch.context() as patch:
         patch.setattr(step.model, "render", blank)
-        found = step.first()
-        assert found
-        assert found.tensor == "rendering of layer 2.depth"
+        assert step.first_bad().tensor == "rendering of layer 2.depth"
     loss = step.objective.losses["visibility"]
     loss.register_forward_hook(lambda m, a, out: {k: t / 0 for k, t in out.items()})
-    found = step.first()
-    assert found
-    assert found.tensor == "loss of layer 2.visibility"
+    assert step.first_bad().tensor == "loss of layer 2.visibility"
 
 
 class Poison(torch.autograd.Function):
@@ -156,9 +152,8 @@ class Poison(torch.autograd.Function):
 def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
     layer = step.model.decoder[1]
     handle = layer.cross_attention.register_forward_hook(lambda m, a, out: Poison.apply(out))
-    found = step.first()
+    found = step.first_bad()
     handle.remove()
-    assert found
     assert found.tensor.startswith("gradient of the output of model.decoder.1.cross_attention")
     render = step.model.render
 
@@ -166,9 +161,7 @@ def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPat
         return render(replace(gaussians, quats=Poison.apply(gaussians.quats)), cameras)
 
     monkeypatch.setattr(step.model, "render", poisoned)
-    found = step.first()
-    assert found
-    assert found.tensor == "gradient of layer 2.gaussians.quats"
+    assert step.first_bad().tensor == "gradient of layer 2.gaussians.quats"
 
 
 def guard_of(step: Step, folder: Path) -> Guard:

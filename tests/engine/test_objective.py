@@ -1,16 +1,28 @@
-"""The objective as the weighted sum of its losses over layers."""
+"""The objective: the weighted sum of its losses, with all target views at once or few at a time."""
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, TypeAlias
+
 import pytest
 import torch
+from torch import Tensor, nn
 from training_runs import Tiny
 
 from qgs.composer import Recipe
+from qgs.contracts import ComponentConfig, Loss
 from qgs.data.sampling import Batch
 from qgs.data.stream import training_batches
-from qgs.engine.objective import Objective
+from qgs.engine.objective import Objective, Outcome, measure
+from qgs.losses import Mask, Opacity
 from qgs.metrics.images import psnr
+from qgs.types import LayerPrediction, Rendering, Views, map_tensors
 
 
 def first_batch(recipe: Recipe) -> Batch:
@@ -39,10 +51,8 @@ def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Tiny) -> None:
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 def test_every_parameter_gets_a_finite_gradient(tiny: Tiny, name: str) -> None:
     recipe = tiny(name)
-    objective, batch = (
-        Objective(recipe.build_model().train(), recipe.build_losses()),
-        first_batch(recipe),
-    )
+    objective = Objective(recipe.build_model().train(), recipe.build_losses())
+    batch = first_batch(recipe)
     objective(batch.inputs, batch.targets).total.backward()
     for parameter_name, parameter in objective.named_parameters():
         assert parameter.grad is not None, parameter_name
@@ -60,3 +70,214 @@ def test_two_losses_with_one_term_are_refused(tiny: Tiny) -> None:
 def test_no_loss_at_all_is_refused(tiny: Tiny) -> None:
     with pytest.raises(ValueError, match="at least one loss"):
         Objective(tiny("tokengs").build_model("meta"), {})
+
+
+TOOL = Path(__file__).parents[2] / "tools" / "measure_render_memory.py"
+TARGETS = 5
+Setting: TypeAlias = Callable[..., tuple]
+RENDERERS = ("qgs/torch", "qgs/cpu")
+
+
+class Flicker(Loss):
+    """How much views differ in brightness: no mean over views, and undeclared as such."""
+
+    name: ClassVar[str] = "flicker"
+
+    def __init__(self) -> None:
+        super().__init__(ComponentConfig())
+        self.gain = nn.Parameter(torch.tensor(0.7))
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        assert rendering.rgb.shape[1] == TARGETS
+        brightness = rendering.rgb.mean((-3, -2, -1))
+        return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
+
+
+class Blind(Loss):
+    """Wants no rendering, and gets none, nor views at a time."""
+
+    name: ClassVar[str] = "blind"
+    renderings = "none"
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+    ) -> dict[str, Tensor]:
+        assert rendering.rgb.shape[1] == 0
+        assert target.images.shape[1] == TARGETS
+        return {"blind": prediction.state.features.square().mean()}
+
+
+def every_loss(recipe: Recipe) -> dict[str, Loss]:
+    extra = {
+        "mask": Mask(Mask.Config()),
+        "opacity": Opacity(Opacity.Config()),
+        "blind": Blind(ComponentConfig()),
+    }
+    return {**recipe.build_losses(), **extra}
+
+
+def with_masks(views: Views) -> Views:
+    masks = (views.images.mean(2, keepdim=True) > 0.4).float()
+    return replace(views, masks=masks)
+
+
+@pytest.fixture(scope="module")
+def setting(tiny: Tiny) -> Setting:
+    def make(renderer: str, *, dtype: torch.dtype = torch.float32) -> tuple:
+        recipe = tiny("locus", f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
+        torch.manual_seed(0)
+        batch = first_batch(recipe)
+        model = recipe.build_model().train().to(dtype)
+        inputs, targets = batch.inputs.to(dtype), with_masks(batch.targets).to(dtype)
+        return model, every_loss(recipe), inputs, targets
+
+    return make
+
+
+def written_out(
+    model: nn.Module, losses: Mapping[str, Loss], inputs: Views, targets: Views
+) -> Tensor:
+    """The objective as its definition reads: one graph for all layers and views."""
+    prediction = model(inputs)
+    total = torch.zeros(())
+    for number, weight in model.supervision.weights().items():
+        layer = prediction.layers[number]
+        rendering = model.render(layer.gaussians, targets.cameras)
+        for loss in losses.values():
+            shown = rendering
+            if loss.renderings == "none":
+                shown = map_tensors(lambda tensor: tensor[:, :0], rendering)
+            total = total + weight * torch.stack(list(loss(layer, shown, targets).values())).sum()
+    return total
+
+
+def gradients(module: nn.Module, total: Tensor) -> dict[str, Tensor]:
+    module.zero_grad()
+    total.backward()
+    return {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
+
+
+def furthest(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> float:
+    """Largest difference, relative to the largest gradient."""
+    assert found.keys() == wanted.keys()
+    largest = max(float(g.abs().max()) for g in wanted.values())
+    return max(float((found[n] - g).abs().max()) for n, g in wanted.items()) / largest
+
+
+def error(objective: Objective, *batch: Views) -> float:
+    """How far its gradients are from those of the definition."""
+    wanted = gradients(objective, written_out(objective.model, objective.losses, *batch))
+    return furthest(gradients(objective, objective(*batch).total), wanted)
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("render_views", [0, 1, 2, 9])
+@pytest.mark.parametrize("all_at_once", [False, True])
+def test_gradients_do_not_depend_on_it(
+    setting: Setting, renderer: str, render_views: int, all_at_once: bool
+) -> None:
+    model, losses, *batch = setting(renderer)
+    if all_at_once:
+        losses["flicker"] = Flicker()
+    objective = Objective(model, losses, render_views)
+    assert error(objective, *batch) < 1e-6
+    outcome = objective(*batch)
+    assert float(outcome.total.detach()) == pytest.approx(float(sum(outcome.terms.values())))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
+@pytest.mark.parametrize("render_views", [1, 2])
+def test_gradients_through_gsplat_do_not_depend_on_it(setting: Setting, render_views: int) -> None:
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    model, losses, *batch = setting("qgs/gsplat")
+    objective = Objective(model, losses, render_views).cuda()
+    found = error(objective, *(views.to("cuda") for views in batch))
+    assert found < 1e-5, "its kernels add in no fixed order"
+
+
+def test_in_float64_they_are_the_same_numbers(setting: Setting) -> None:
+    model, losses, *batch = setting("qgs/torch", dtype=torch.float64)
+    assert error(Objective(model, losses, 2), *batch) < 1e-13
+
+
+def test_under_autocast_the_gaussians_get_the_same_gradients(
+    setting: Setting,
+) -> None:
+    model, losses, *batch = setting("qgs/cpu")
+    found: dict[int, dict[str, Tensor]] = {}
+    for render_views in (0, 2):
+        objective = Objective(model, losses, render_views)
+        seen = found[render_views] = {}
+
+        def note(name: str, value: Mapping[str, Tensor], seen: dict = seen) -> None:
+            if name.startswith("gradient"):
+                seen.update({f"{name} {key}": tensor.float() for key, tensor in value.items()})
+
+        objective.hook = note
+        with torch.autocast("cpu", torch.bfloat16):
+            outcome = objective(*batch)
+        outcome.total.backward()
+    assert len(found[0]) >= 10, "Gaussians and states of two layers"
+    assert furthest(found[2], found[0]) < 1e-6
+
+
+def test_a_scaled_total_scales_every_gradient(setting: Setting) -> None:
+    model, losses, *batch = setting("qgs/cpu")
+    objective = Objective(model, losses, 2)
+    whole = gradients(objective, objective(*batch).total)
+    quarter = gradients(objective, objective(*batch).total / 4)
+    assert furthest({n: 4 * g for n, g in quarter.items()}, whole) < 1e-6
+
+
+@pytest.mark.parametrize("render_views", [0, 2])
+def test_signs_are_those_of_all_views_of_the_last_layer(
+    setting: Setting, render_views: int
+) -> None:
+    model, losses, inputs, targets = setting("qgs/cpu")
+    outcome: Outcome = Objective(model, losses, render_views)(inputs, targets)
+    with torch.no_grad():
+        rendering = model.render(model(inputs).gaussians, targets.cameras)
+    background = torch.tensor(model.renderer.config.background)
+    wanted = (
+        psnr(rendering.rgb, targets.images).mean(),
+        *measure(rendering.rgb, rendering.alpha, background),
+    )
+    torch.testing.assert_close(tuple(outcome.signs.values()), wanted)
+
+
+def test_without_gradients_it_only_measures(setting: Setting) -> None:
+    model, losses, *batch = setting("qgs/cpu")
+    with torch.no_grad():
+        outcome = Objective(model, losses, 2)(*batch)
+    assert not outcome.total.requires_grad
+    assert float(outcome.total) == pytest.approx(float(sum(outcome.terms.values())))
+
+
+def test_every_shipped_loss_says_which_renderings_it_needs() -> None:
+    from qgs_locus.visibility import AnchorVisibility
+
+    from qgs.losses import COMPONENTS
+
+    said = {loss.name: loss.renderings for loss in (*COMPONENTS, AnchorVisibility)}
+    assert said == {
+        "photometric": "each",
+        "mask": "each",
+        "visibility": "none",
+        "anchor_visibility": "none",
+        "opacity": "none",
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="reads Linux's accounts")
+def test_memory_does_not_grow_with_target_views() -> None:
+    """The script prints a pair of ratios without parts and a pair with parts."""
+    done = subprocess.run([sys.executable, TOOL], check=True, capture_output=True, text=True)
+    last = done.stdout.splitlines()[-1]
+    found = re.fullmatch(r" *ratio: peak (\S+), step (\S+)", last)
+    assert found, done.stdout
+    of_peak, of_step = map(float, found.groups())
+    assert of_peak <= 1.3
+    assert of_step <= 1.3

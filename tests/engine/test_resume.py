@@ -1,19 +1,26 @@
-"""A run that was interrupted and continued is the run that was not."""
+"""A run that was interrupted or killed, and continued, is the run that was not."""
 
 from __future__ import annotations
 
 import json
+import os
 import random
+import re
 import signal
+import subprocess
+import sys
 from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from training_runs import QUIET, Tiny, run, run_calling
+from training_runs import QUIET, Tiny, run, run_calling, same, weights
 
 from qgs.composer import Recipe
 from qgs.engine import RunFolder
@@ -60,6 +67,12 @@ def losses(folder: Path) -> list[tuple[float, float, float]]:
     return [(record["step"], record["loss"], record["lr"]) for record in history]
 
 
+def change_counters(folder: Path, **values: Any) -> None:
+    state = read_state(folder / "state.safetensors")
+    parts = {**state.parts, "counters": {**state.parts["counters"], **values}}
+    write_state(folder / "state.safetensors", state.recipe.tree, parts)
+
+
 CASES = [
     ("locus", ()),
     ("tokengs", ("training.accumulate=2", "training.batch_size=1", "views.mirror=0.5")),
@@ -71,13 +84,8 @@ CASES = [
 def test_17_and_23_steps_are_40(
     tiny: Tiny, tmp_path: Path, name: str, overrides: Sequence[str]
 ) -> None:
-    recipe = tiny(
-        name,
-        "training.steps=40",
-        "training.save_every=5",
-        "training.collapse_window=10",
-        *overrides,
-    )
+    options = ("steps=40", "save_every=5", "collapse_window=10")
+    recipe = tiny(name, *(f"training.{option}" for option in options), *overrides)
     run(recipe, tmp_path / "through")
     kill_after(17, recipe, tmp_path / "killed")
     assert len(RunFolder(tmp_path / "killed").history()) == 17
@@ -88,9 +96,9 @@ def test_17_and_23_steps_are_40(
 
 @pytest.mark.slow
 def test_workers_and_several_kills_change_nothing(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("locus", "training.steps=40", "training.save_every=1")
+    options = ("training.steps=40", "training.save_every=1")
+    recipe, with_workers = (tiny("locus", *options, f"training.workers={n}") for n in (0, 2))
     run(recipe, tmp_path / "through")
-    with_workers = tiny("locus", "training.steps=40", "training.save_every=1", "training.workers=2")
     kill_after(9, with_workers, tmp_path / "killed")
     kill_after(17, with_workers, tmp_path / "killed", resume=True)
     kill_after(18, recipe, tmp_path / "killed", resume=True)
@@ -115,10 +123,8 @@ def test_a_run_stopped_before_it_showed_signs_of_life_goes_on_too(
     tiny: Tiny, tmp_path: Path
 ) -> None:
     recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
-    trainer = Trainer(recipe, tmp_path / "run")
-    stop = StopRequest(signal.SIGTERM)
-    trainer.run(TrainingProgress(QUIET), stop)
-    trainer.close()
+    with closing(Trainer(recipe, tmp_path / "run")) as trainer:
+        trainer.run(TrainingProgress(QUIET), StopRequest(signal.SIGTERM))
     assert load_extra(tmp_path / "run" / "checkpoint.safetensors") == {"step": "0"}
     assert Trainer(recipe, tmp_path / "run", resume=True).resumed_at == 1
 
@@ -133,8 +139,7 @@ def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
     again = resumed(recipe, folder)
     assert (again.resumed_at, again.steps, again.stopped_by) == (4, 4, None)
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == files
-    ours, theirs = first.model.state_dict(), again.model.state_dict()
-    assert all(torch.equal(theirs[name], tensor) for name, tensor in ours.items())
+    assert same(weights(first), weights(again))
 
 
 def test_a_kill_between_the_first_two_files_loses_nothing(
@@ -142,11 +147,8 @@ def test_a_kill_between_the_first_two_files_loses_nothing(
 ) -> None:
     recipe, folder = tiny("tokengs", "training.save_every=0"), tmp_path / "run"
 
-    def die(*_: object, **__: object) -> None:
-        raise Killed
-
     with monkeypatch.context() as patch:
-        patch.setattr("qgs.engine.checkpoint.save", die)
+        patch.setattr("qgs.engine.checkpoint.save", Mock(side_effect=Killed))
         with pytest.raises(Killed):
             run(recipe, folder)
     assert not (folder / "checkpoint.safetensors").exists()
@@ -167,9 +169,7 @@ def test_a_longer_budget_continues_a_finished_run(tiny: Tiny, tmp_path: Path) ->
 def test_the_clock_goes_on(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.5")
     kill_after(5, tiny("tokengs", "training.steps=5", "training.save_every=4"), tmp_path / "run")
-    state = read_state(tmp_path / "run" / "state.safetensors")
-    parts = {**state.parts, "counters": {**state.parts["counters"], "seconds": 1.0}}
-    write_state(tmp_path / "run" / "state.safetensors", state.recipe.tree, parts)
+    change_counters(tmp_path / "run", seconds=1.0)
     result = resumed(recipe, tmp_path / "run")
     history = result.folder.history()
     assert [record["seconds"] for record in history[4:6]] == [1.0, history[5]["seconds"]]
@@ -194,11 +194,9 @@ def test_another_recipe_is_refused_by_its_keys(tiny: Tiny, tmp_path: Path) -> No
     folder = tmp_path / "run"
     kill_after(2, tiny("tokengs", "training.save_every=1"), folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    other = ("optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
     with pytest.raises(OtherRunError) as caught:
-        resumed(
-            tiny("tokengs", "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3"),
-            folder,
-        )
+        resumed(tiny("tokengs", *other), folder)
     message = str(caught.value)
     assert "optimizer.learning_rate: 0.001 here, 0.0015 in the run" in message
     assert "seed: 4 here, 0 in the run" in message
@@ -222,10 +220,7 @@ def test_a_step_must_see_as_many_samples(tiny: Tiny, tmp_path: Path) -> None:
 def test_other_scenes_are_refused(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.save_every=1")
     kill_after(2, recipe, tmp_path / "run")
-    file = tmp_path / "run" / "state.safetensors"
-    state = read_state(file)
-    counters = {**state.parts["counters"], "scenes": "others"}
-    write_state(file, state.recipe.tree, {**state.parts, "counters": counters})
+    change_counters(tmp_path / "run", scenes="others")
     with pytest.raises(OtherRunError, match="other training scenes"):
         resumed(recipe, tmp_path / "run")
 
@@ -259,15 +254,15 @@ def test_a_state_that_is_damaged_or_newer_is_refused(tiny: Tiny, tmp_path: Path)
     kill_after(2, recipe, folder)
     file = folder / "state.safetensors"
     whole = file.read_bytes()
-    file.write_bytes(whole[:-100])
-    with pytest.raises(CheckpointError, match="not a whole safetensors file"):
-        resumed(recipe, folder)
-    file.write_bytes(whole.replace(b'"qgs.state_version":"1"', b'"qgs.state_version":"9"'))
-    with pytest.raises(CheckpointError, match="install the newer qgs"):
-        resumed(recipe, folder)
-    file.write_bytes((folder / "checkpoint.safetensors").read_bytes())
-    with pytest.raises(CheckpointError, match="no training state"):
-        resumed(recipe, folder)
+    newer = whole.replace(b'"qgs.state_version":"1"', b'"qgs.state_version":"9"')
+    for content, message in (
+        (whole[:-100], "not a whole safetensors file"),
+        (newer, "install the newer qgs"),
+        ((folder / "checkpoint.safetensors").read_bytes(), "no training state"),
+    ):
+        file.write_bytes(content)
+        with pytest.raises(CheckpointError, match=message):
+            resumed(recipe, folder)
 
 
 def test_random_states_come_back() -> None:
@@ -283,3 +278,29 @@ def test_random_states_come_back() -> None:
     draw()
     states.load_state({**saved, **json.loads(json.dumps(as_json))})
     assert draw() == first
+
+
+@pytest.mark.parametrize(
+    ("kills", "inside", "options"),
+    [
+        (2, 0, ("--width=64", "--steps=12", "--longest=0.2")),
+        pytest.param(50, 1, ("--width=192", "--steps=150"), marks=pytest.mark.slow),
+    ],
+)
+def test_killed_runs_go_on_from_whole_files(
+    kills: int, inside: int, options: tuple[str, ...]
+) -> None:
+    """inside: how many kills, at least, must have come inside a save for this to prove anything."""
+    tool = Path(__file__).parents[2] / "tools" / "kill_training.py"
+    done = subprocess.run(
+        [sys.executable, str(tool), f"--kills={kills}", *options],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=1200 if inside else 240,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = re.match(r"(\d+) kills, (\d+) inside a save", done.stdout)
+    assert found, done.stdout
+    assert int(found[1]) == kills
+    assert int(found[2]) >= inside

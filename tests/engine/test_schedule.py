@@ -36,22 +36,19 @@ def test_steps_alone_follow_torch(steps: int, warmup: int) -> None:
             reference.step()
 
 
-def test_a_time_budget_takes_over_when_it_runs_out_first() -> None:
-    schedule = adamw(10_000, 10, seconds=20.0)
-    rates = [schedule.learning_rate(step, step * 0.1) for step in range(201)]
+@pytest.mark.parametrize(
+    ("warmup", "seconds", "top"),
+    [(10, 20.0, 9), pytest.param(2000, 10.0, 20, id="warm-up cut to a tenth of the time")],
+)
+def test_a_time_budget_takes_over_when_it_runs_out_first(
+    warmup: int, seconds: float, top: int
+) -> None:
+    schedule = adamw(10_000, warmup, seconds)
+    rates = [schedule.learning_rate(step, step * seconds / 200) for step in range(201)]
     assert max(rates) == pytest.approx(schedule.peak)
-    assert rates.index(max(rates)) == 9
-    assert rates[9:] == sorted(rates[9:], reverse=True)
-    assert rates[-1] == pytest.approx(schedule.last)
-
-
-def test_a_short_time_budget_cuts_the_warm_up() -> None:
-    schedule = adamw(10_000, 2000, seconds=10.0)
-    rates = [schedule.learning_rate(step, step * 0.05) for step in range(201)]
-    assert max(rates) == pytest.approx(schedule.peak)
-    assert rates.index(max(rates)) == 20, "a tenth of the time"
-    assert rates[:21] == sorted(rates[:21])
-    assert rates[20:] == sorted(rates[20:], reverse=True)
+    assert rates.index(max(rates)) == top
+    assert rates[:top] == sorted(rates[:top])
+    assert rates[top:] == sorted(rates[top:], reverse=True)
     assert rates[-1] == pytest.approx(schedule.last)
 
 

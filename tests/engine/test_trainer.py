@@ -24,10 +24,8 @@ from qgs.io.checkpoint import load_extra
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 def test_training_lowers_the_loss(tiny: Tiny, tmp_path: Path, name: str) -> None:
-    recipe = tiny(
-        name, "training.steps=40", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0"
-    )
-    result = run_anywhere(recipe, tmp_path / "run")
+    options = ("training.steps=40", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
+    result = run_anywhere(tiny(name, *options), tmp_path / "run")
     losses = [record["loss"] for record in result.folder.history()]
     assert result.steps == len(losses) == 40
     assert sum(losses[-10:]) < 0.95 * sum(losses[:10])
@@ -44,10 +42,8 @@ def test_a_run_leaves_recipe_history_and_checkpoint(tiny: Tiny, tmp_path: Path) 
     for record in history:
         assert record["loss"] == pytest.approx(sum(record[term] for term in terms))
     assert load_extra(result.folder.checkpoint) == {"step": "4"}
-    loaded, batch = (
-        qgs.load(result.folder.checkpoint),
-        next(training_batches(recipe.build_data(), recipe.views, 1, seed=1)),
-    )
+    loaded = qgs.load(result.folder.checkpoint)
+    batch = next(training_batches(recipe.build_data(), recipe.views, 1, seed=1))
     with torch.no_grad():
         torch.testing.assert_close(
             loaded(batch.inputs).gaussians.means, result.model(batch.inputs).gaussians.means
@@ -62,15 +58,10 @@ def test_the_same_recipe_trains_the_same(tiny: Tiny, tmp_path: Path) -> None:
 
 def test_accumulated_batches_are_one_larger_batch(tiny: Tiny, tmp_path: Path) -> None:
     first = []
-    for batch_size, accumulate in ((2, 1), (1, 2)):
-        recipe = tiny(
-            "tokengs",
-            f"training.batch_size={batch_size}",
-            f"training.accumulate={accumulate}",
-            "training.steps=1",
-            "optimizer.warmup=0",
-        )
-        result = run_anywhere(recipe, tmp_path / str(accumulate))
+    for size, count in ((2, 1), (1, 2)):
+        options = (f"batch_size={size}", f"accumulate={count}", "steps=1")
+        recipe = tiny("tokengs", "optimizer.warmup=0", *(f"training.{o}" for o in options))
+        result = run_anywhere(recipe, tmp_path / str(count))
         first.append(result.folder.history()[0])
     for key in ("loss", "mse", "visibility", "gradient"):
         assert first[0][key] == pytest.approx(first[1][key], rel=1e-4)

@@ -10,28 +10,25 @@ from typing import Any
 
 import pytest
 import torch
-from training_runs import Tiny, run, same, weights
+from training_runs import (
+    Tiny,
+    change_batches,
+    read_jsonl,
+    run,
+    same,
+    tensorboard_events,
+    weights,
+)
 
 import qgs
 from qgs.cli.contest import curves_of
 from qgs.composer import Recipe
 from qgs.contracts.component import MissingExtraError
 from qgs.data.sampling import Batch
-from qgs.data.stream import SampleStream
 from qgs.engine import NonFiniteError
 from qgs.engine import tracking as trackers
 from qgs.engine.checkpoint import read_state
 from qgs.engine.guard import MAX_SKIPPED
-
-
-def lines(path: Path) -> list[dict[str, Any]]:
-    """The records of a JSONL file, each strictly JSON."""
-
-    def refuse(constant: str) -> float:
-        raise ValueError(f"{constant} is no JSON")
-
-    text = path.read_text(encoding="utf-8").splitlines()
-    return [json.loads(line, parse_constant=refuse) for line in text]
 
 
 @pytest.fixture
@@ -39,15 +36,11 @@ def bad_batches(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """`bad_batches(2, 3)`: the training batches of these numbers, from 0, hold a NaN pixel."""
 
     def spoil(*numbers: int) -> None:
-        whole = SampleStream.batch
-
-        def spoiled(stream: SampleStream, samples: Sequence[int]) -> Batch:
-            batch = whole(stream, samples)
+        def spoiled(batch: Batch, samples: Sequence[int]) -> None:
             if samples[0] // len(samples) in numbers:
                 batch.targets.images[0, 0, 0, 0, 0] = torch.nan
-            return batch
 
-        monkeypatch.setattr(SampleStream, "batch", spoiled)
+        change_batches(monkeypatch, spoiled)
 
     return spoil
 
@@ -75,7 +68,7 @@ def test_the_average_is_saved_and_judged_at_the_end(tiny: Tiny, tmp_path: Path) 
     assert not same(average, weights(plain))
     largest = max(float((average[n] - t).abs().max()) for n, t in weights(plain).items())
     assert largest < 0.1, "near the weights it follows"
-    records = lines(folder.path / "evaluations.jsonl")
+    records = read_jsonl(folder.path / "evaluations.jsonl")
     assert [(r["step"], r["weights"]) for r in records] == [(4, "raw"), (4, "ema")]
     assert not plain.folder.checkpoint_ema.exists()
 
@@ -87,7 +80,7 @@ def test_evaluations_do_not_touch_the_training(tiny: Tiny, tmp_path: Path) -> No
     losses = [[r["loss"] for r in result.folder.history()] for result in (plain, watched)]
     assert losses[0] == losses[1]
     folder = watched.folder.path
-    assert [record["step"] for record in lines(folder / "evaluations.jsonl")] == [2, 4]
+    assert [record["step"] for record in read_jsonl(folder / "evaluations.jsonl")] == [2, 4]
     assert {p.name for p in (folder / "pictures").iterdir()} == {"step-2.png", "step-4.png"}
 
 
@@ -100,7 +93,7 @@ def test_a_bad_step_ends_the_run_before_the_optimiser(
         run(tiny("tokengs"), folder)
     incident = folder / "incidents" / "step-3"
     assert str(incident) in str(error.value)
-    assert [record["step"] for record in lines(folder / "history.jsonl")] == [1, 2]
+    assert [record["step"] for record in read_jsonl(folder / "history.jsonl")] == [1, 2]
     saved = qgs.load(incident / "weights.safetensors").state_dict()
     assert all(tensor.isfinite().all() for tensor in saved.values())
     report = json.loads((incident / "report.json").read_text())
@@ -142,7 +135,7 @@ def test_a_bad_step_is_skipped_on_demand(
     told = [r.message for r in caplog.records if "is skipped" in r.message]
     assert [message.split(" is skipped")[0] for message in told] == ["step 2", "step 4"]
     folder = result.folder.path
-    records = lines(folder / "history.jsonl")
+    records = read_jsonl(folder / "history.jsonl")
     assert [record["step"] for record in records] == [1, 2, 3, 4]
     assert ["loss" in record for record in records] == [True, False, True, False]
     assert [record.get("skipped", False) for record in records] == [False, True, False, True]
@@ -180,7 +173,7 @@ def test_skipping_comes_to_an_end(
     recipe = tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50")
     with pytest.raises(NonFiniteError, match=f"{MAX_SKIPPED} steps in a row were skipped"):
         run(recipe, tmp_path / "run")
-    steps = [record["step"] for record in lines(tmp_path / "run" / "history.jsonl")]
+    steps = [record["step"] for record in read_jsonl(tmp_path / "run" / "history.jsonl")]
     assert steps == list(range(1, MAX_SKIPPED + 2))
 
 
@@ -195,11 +188,9 @@ def test_a_missing_tracker_is_told_before_anything_is_made(
 
 def test_tensorboard_gets_what_the_history_gets(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     options = ("training.trackers=[tensorboard]", "training.evaluate_every=4")
     result = run(tiny("locus", *options), tmp_path / "run")
-    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    events = tensorboard_events(tmp_path / "run")
     for name in ("loss", "psnr", "lr"):
         told = [event.value for event in events.Scalars(name)]
         assert told == pytest.approx([record[name] for record in result.folder.history()])

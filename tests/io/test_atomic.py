@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from qgs.io.files import is_leftover, replacing, replacing_entries
+from qgs.io.files import is_leftover, replacing, replacing_entries, write_text
 
 
 def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:
@@ -29,6 +29,21 @@ def test_an_error_changes_nothing(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="the disk is full"):
         fail()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+
+    def fail() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert path.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from qgs.data.sampling import stack_views
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.types import Cameras, Views
 
@@ -40,23 +41,19 @@ def test_direction_decides_between_cameras_in_one_place() -> None:
 
 
 def test_scale_of_the_scene_does_not_matter() -> None:
-    choices = []
-    for scale in (0.01, 100.0):
-        inputs = views(pose(0.0, 0.3), pose(scale))
-        found = nearest_input(inputs, cameras(pose(0.6 * scale)))
-        choices.append((found == inputs.images[:, :1]).all())
-    assert choices[0] == choices[1]
+    small, large = (
+        nearest_input(views(pose(0.0, 0.3), pose(scale)), cameras(pose(0.6 * scale)))
+        for scale in (0.01, 100.0)
+    )
+    assert torch.equal(small, large)
 
 
 def test_each_scene_copies_its_own_views() -> None:
-    one, other = views(pose(0.0), pose(1.0)), views(pose(0.0), pose(1.0))
-    images = torch.cat([one.images, 1 - other.images])
-    c2w = torch.cat([one.cameras.c2w, other.cameras.c2w.flip(1)])
-    both = Views(images, Cameras(c2w, one.cameras.intrinsics.expand(2, -1, -1), (8, 8)))
-    target = cameras(pose(0.1))
-    targets = Cameras(target.c2w.expand(2, -1, -1, -1), target.intrinsics.expand(2, -1, -1), (8, 8))
-    found = nearest_input(both, targets)
-    torch.testing.assert_close(found, torch.stack([images[0, :1], images[1, 1:]]))
+    one, other = views(pose(0.0), pose(1.0)), views(pose(1.0), pose(0.0))
+    both = stack_views([one, Views(1 - other.images, other.cameras)])
+    target = views(pose(0.1))
+    found = nearest_input(both, stack_views([target, target]).cameras)
+    torch.testing.assert_close(found, torch.stack([one.images[0, :1], 1 - other.images[0, 1:]]))
 
 
 def test_mean_colour_is_flat_and_the_best_flat_guess() -> None:
@@ -64,9 +61,5 @@ def test_mean_colour_is_flat_and_the_best_flat_guess() -> None:
     found = mean_colour(inputs, cameras(pose(0.5), pose(2.0)))
     assert found.shape == (1, 2, 3, 8, 8)
     assert float(found.std((-1, -2)).max()) < 1e-6
-
-    def error(image: Tensor) -> Tensor:
-        return (inputs.images - image).square().mean()
-
-    assert error(found[:, :1]) < error(found[:, :1] + 0.01)
-    assert error(found[:, :1]) < error(found[:, :1] - 0.01)
+    errors = [(inputs.images - found[:, :1] - d).square().mean() for d in (0, 0.01, -0.01)]
+    assert errors[0] < min(errors[1:])

@@ -56,24 +56,12 @@ def test_psnr_equals_scikit_image_on_clipped_images(noise: float) -> None:
     )
 
 
-def test_leading_dimensions_are_kept() -> None:
-    images, truth = (x[:, None].expand(-1, 4, -1, -1, -1) for x in pair(0.1))
-    assert psnr(images, truth).shape == ssim(images, truth).shape == (2, 4)
-
-
-def test_identical_images() -> None:
-    _, truth = pair(0.0)
-    torch.testing.assert_close(ssim(truth, truth), torch.ones(2))
-    assert psnr(truth, truth).isfinite().all()
+def test_identical_images_with_leading_dimensions() -> None:
+    truth = pair(0.0)[1][:, None].expand(-1, 4, -1, -1, -1)
+    torch.testing.assert_close(ssim(truth, truth), torch.ones(2, 4))
+    torch.testing.assert_close(psnr(truth, truth), torch.full((2, 4), 100.0))
 
 
 def test_images_smaller_than_the_window_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 11 pixels a side, got 10x20"):
         ssim(*pair(0.1, (10, 20)))
-
-
-def test_the_two_forms_of_ssim_differ() -> None:
-    images, truth = pair(0.1)
-    difference = ssim(images, truth, "sample") - ssim(images, truth)
-    assert (difference.abs() > 1e-5).all()
-    assert (difference.abs() < 1e-3).all()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from qgs.metrics.lpips import Lpips
@@ -20,23 +21,20 @@ CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512
 def vgg16(pretrained: bool = False) -> nn.Module:
     """torchvision's VGG-16 without its classifier, random."""
     layers: list[nn.Module] = []
-    width = 3
+    widths = [3, *filter(None, CHANNELS)]
     for channels in CHANNELS:
-        if channels:
-            layers += [nn.Conv2d(width, channels, 3, padding=1), nn.ReLU()]
-            width = channels
-        else:
-            layers.append(nn.MaxPool2d(2))
+        pair = [nn.Conv2d(widths.pop(0), channels, 3, padding=1), nn.ReLU()] if channels else []
+        layers += pair or [nn.MaxPool2d(2)]
     model = nn.Module()
     model.features = nn.Sequential(*layers)
     return model
 
 
-@pytest.fixture(scope="module")
-def weights() -> dict[str, Tensor]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return dict(vgg16().state_dict())
+@pytest.fixture
+def vgg(tmp_path: Path) -> Path:
+    """Random weights of VGG-16."""
+    save_file(vgg16().state_dict(), tmp_path / "vgg.safetensors")
+    return tmp_path / "vgg.safetensors"
 
 
 @pytest.fixture
@@ -64,18 +62,17 @@ def images(*shape: int) -> tuple[Tensor, Tensor]:
     return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
 
 
-def by_the_formula(
-    vgg: dict[str, Tensor], linear: dict[str, Tensor], image: Tensor, truth: Tensor
-) -> float:
+@torch.no_grad()
+def by_the_formula(vgg: Path, linear: dict[str, Tensor], image: Tensor, truth: Tensor) -> float:
     """Zhang et al., 2018, equation 1, on relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3."""
-    trunk = vgg16().features
-    trunk.load_state_dict({k.removeprefix("features."): v for k, v in vgg.items()})
+    model = vgg16()
+    model.load_state_dict(load_file(vgg))
     shift = torch.tensor([-0.030, -0.088, -0.188])[:, None, None]
     scale = torch.tensor([0.458, 0.448, 0.450])[:, None, None]
     total = 0.0
     x, y = (((i * 2 - 1) - shift) / scale for i in (image[None], truth[None]))
     taps = {3: 0, 8: 1, 15: 2, 22: 3, 29: 4}
-    for place, layer in enumerate(trunk):
+    for place, layer in enumerate(model.features):
         x, y = layer(x), layer(y)
         if place in taps:
             unit = [f / f.square().sum(1, keepdim=True).sqrt() for f in (x, y)]
@@ -85,18 +82,16 @@ def by_the_formula(
 
 
 @pytest.mark.parametrize("form", ["safetensors", "pth"])
-def test_lpips_is_the_published_formula(
-    tmp_path: Path, weights: dict[str, Tensor], package: dict[str, Tensor], form: str
-) -> None:
-    file = tmp_path / f"vgg.{form}"
-    save_file(weights, file) if form == "safetensors" else torch.save(weights, file)
+def test_lpips_is_the_published_formula(vgg: Path, package: dict[str, Tensor], form: str) -> None:
+    file = vgg.with_suffix(f".{form}")
+    if form == "pth":
+        torch.save(load_file(vgg), file)
     lpips = lpips_of(file)
     assert not lpips.unavailable
     image, truth = images(2, 2, 3, 33, 40)
     values = lpips.distance(image, truth)
     assert values.shape == (2, 2)
-    with torch.no_grad():
-        expected = by_the_formula(weights, package, image[1, 0], truth[1, 0])
+    expected = by_the_formula(vgg, package, image[1, 0], truth[1, 0])
     assert float(values[1, 0]) == pytest.approx(expected, rel=1e-5)
     assert torch.equal(lpips.distance(truth, truth), torch.zeros(2, 2))
     assert torch.equal(lpips.distance(image[:1, :1], truth[:1, :1])[0, 0], values[0, 0])
@@ -104,13 +99,11 @@ def test_lpips_is_the_published_formula(
 
 
 @pytest.mark.skipif(find_spec("lpips") is None, reason="the lpips extra is not installed")
-def test_lpips_equals_the_package(
-    tmp_path: Path, weights: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lpips_equals_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torchvision, models = ModuleType("torchvision"), ModuleType("torchvision.models")
     torchvision.models, models.vgg16 = models, vgg16
-    monkeypatch.setitem(__import__("sys").modules, "torchvision", torchvision)
-    monkeypatch.setitem(__import__("sys").modules, "torchvision.models", models)
+    monkeypatch.setitem(sys.modules, "torchvision", torchvision)
+    monkeypatch.setitem(sys.modules, "torchvision.models", models)
     import lpips
 
     theirs = lpips.LPIPS(net="vgg", pnet_rand=True, verbose=False)
@@ -123,11 +116,9 @@ def test_lpips_equals_the_package(
     torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-7)
 
 
-def test_images_are_clipped_and_small_ones_refused(
-    tmp_path: Path, weights: dict[str, Tensor], package: dict[str, Tensor]
-) -> None:
-    save_file(weights, tmp_path / "vgg.safetensors")
-    lpips = lpips_of(tmp_path / "vgg.safetensors").distance
+@pytest.mark.usefixtures("package")
+def test_images_are_clipped_and_small_ones_refused(vgg: Path) -> None:
+    lpips = lpips_of(vgg).distance
     image, truth = images(1, 3, 16, 16)
     assert torch.equal(lpips(image * 3 - 1, truth), lpips((image * 3 - 1).clamp(0, 1), truth))
     with pytest.raises(ValueError, match="at least 16 pixels a side, got 15x16"):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from importlib.util import find_spec
 
 import pytest
@@ -60,13 +61,8 @@ def make_scene() -> Callable[..., tuple[Gaussians, Cameras]]:
         seed: int = 0,
     ) -> tuple[Gaussians, Cameras]:
         generator = torch.Generator().manual_seed(seed)
-
-        def rand(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-        def randn(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+        rand = partial(torch.rand, generator=generator, dtype=torch.float64)
+        randn = partial(torch.randn, generator=generator, dtype=torch.float64)
         depth = torch.linspace(1.5, 4.0, count, dtype=torch.float64)
         depth = torch.stack([depth[torch.randperm(count, generator=generator)]] * batch)
         means = torch.cat([(rand(batch, count, 2) * 2 - 1) * 1.2, depth[..., None]], -1)

@@ -19,16 +19,12 @@ def good(tmp_path_factory, shots):
     return root
 
 
-@pytest.fixture
-def room(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "room", tmp_path / "room"))
+def copy_of(name: str):
+    @pytest.fixture
+    def copied(good, tmp_path) -> Copy:
+        return Copy(shutil.copytree(good / name, tmp_path / name))
+
+    return copied
 
 
-@pytest.fixture
-def chunks(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "chunks", tmp_path / "chunks"))
-
-
-@pytest.fixture
-def archives(good, tmp_path) -> Copy:
-    return Copy(shutil.copytree(good / "archives", tmp_path / "archives"))
+room, chunks, archives = map(copy_of, ("room", "chunks", "archives"))

@@ -51,23 +51,29 @@ def photos(tmp_path_factory) -> photo_formats.PhotoSet:
     return photo_set(tmp_path_factory.mktemp("photos") / "files", shots, poses)
 
 
-def told(path) -> str:
+def write_blender(folder, photos):
+    return photo_formats.write_blender(folder, photo_formats.centred(photos), 3)
+
+
+def write_llff(folder, photos):
+    return photo_formats.write_llff(folder, photo_formats.centred(photos))
+
+
+def write_colmap(folder, photos):
+    pytest.importorskip("pycolmap")
+    return photo_formats.write_colmap(folder, photos, "binary")
+
+
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (write_blender, "these look like OpenCV poses read as OpenGL"),
+        (write_colmap, "these look like OpenGL poses read as OpenCV"),
+        (write_llff, "the axes look like (up, right, forward), OpenGL and OpenCV mixed"),
+    ],
+)
+def test_the_convention_is_named(photos, tmp_path, write, reason):
+    path = write(tmp_path / "set", photos)
     (finding,) = check(UPath(path), Options(threads=2)).findings
     assert finding.frames == (0, 1, 2)
-    return finding.reason
-
-
-def test_blender(photos, tmp_path):
-    path = photo_formats.write_blender(tmp_path / "set", photo_formats.centred(photos), 3)
-    assert "these look like OpenCV poses read as OpenGL" in told(path)
-
-
-def test_colmap(photos, tmp_path):
-    pytest.importorskip("pycolmap")
-    path = photo_formats.write_colmap(tmp_path / "set", photos, "binary")
-    assert "these look like OpenGL poses read as OpenCV" in told(path)
-
-
-def test_llff(photos, tmp_path):
-    path = photo_formats.write_llff(tmp_path / "set", photo_formats.centred(photos))
-    assert "the axes look like (up, right, forward), OpenGL and OpenCV mixed" in told(path)
+    assert reason in finding.reason

@@ -56,8 +56,8 @@ def moved(c2w, shots):
     return c2w
 
 
-def listed(change):
-    return lambda room, shots: room.listing(change)
+def listed(**values):
+    return lambda room, shots: room.listing(lambda data: data.update(values))
 
 
 IN_A_FOLDER = {
@@ -88,12 +88,12 @@ IN_A_FOLDER = {
         "scale than the rest of the scene: give the original image, or one scaled as the others",
     ),
     "width and height swapped": (
-        listed(lambda data: data.update(w=SIZE[0], h=SIZE[1])),
+        listed(w=SIZE[0], h=SIZE[1]),
         ALL + "the image is 180 x 120 pixels, but listed as 120 x 180, another aspect ratio, so "
         "that the intrinsics cannot be scaled: width and height are swapped; swap them back",
     ),
     "a listed size that intrinsics do not go with": (
-        listed(lambda data: data.update(w=360, h=240)),
+        listed(w=360, h=240),
         ALL + "the image is 180 x 120 pixels, but listed as 360 x 240: correct the listed width "
         "and height, which the intrinsics do not go with",
     ),
@@ -118,12 +118,12 @@ IN_A_FOLDER = {
         "remove one of the frames",
     ),
     "principal point off the image": (
-        listed(lambda data: data["frames"][1].update(cx=200.0)),
+        lambda room, shots: room.listing(lambda data: data["frames"][1].update(cx=200.0)),
         "frame 1 (images/1.jpg): the principal point lies off the image (fx 145, fy 147, cx 200, "
         "cy 61, 180 x 120 pixels): correct cx and cy, unless the photo is cut from a larger one",
     ),
     "normalised intrinsics read as pixels": (
-        listed(lambda data: data.update(fl_x=0.8, fl_y=1.2, cx=0.5, cy=0.5)),
+        listed(fl_x=0.8, fl_y=1.2, cx=0.5, cy=0.5),
         ALL + "the intrinsics look normalised (fx 0.8, fy 1.2, cx 0.5, cy 0.5): they must be in "
         "pixels; multiply fx and cx by the width, fy and cy by the height",
     ),
@@ -220,22 +220,29 @@ def test_zero_baseline_far_from_the_origin(room, shots):
     assert "room, frame 3 (images/3.jpg): the camera stands on the same point as that of" in line
 
 
-def test_index_scene_that_is_absent(chunks, tmp_path):
-    index = tmp_path / "wanted.json"
-    index.write_text(json.dumps({"nowhere": {"context": [0], "target": [1]}, "b": None}))
-    assert told(chunks.path, [index], geometry=0) == [
-        "error: nowhere: the index wanted.json names the scene, which is not there: add the scene, "
-        "or take it out of the index; correct the name if it is spelled wrong"
-    ]
-
-
-def test_index_frame_out_of_range(chunks):
-    index = {"b": {"context": [0, 2], "target": [3]}}
-    (chunks.path / "evaluation.json").write_text(json.dumps(index))
-    assert told(chunks.path, geometry=0) == [
-        "error: b, frame 3: the index evaluation.json has the target frame 3, but the scene's 3 "
-        "frames are 0 to 2: correct the index, or add the missing frames to the scene"
-    ]
+@pytest.mark.parametrize(
+    ("index", "fault"),
+    [
+        (
+            {"nowhere": {"context": [0], "target": [1]}, "b": None},
+            "nowhere: the index wanted.json names the scene, which is not there: add the scene, or "
+            "take it out of the index; correct the name if it is spelled wrong",
+        ),
+        (
+            {"b": {"context": [0, 2], "target": [3]}},
+            "b, frame 3: the index wanted.json has the target frame 3, but the scene's 3 frames "
+            "are 0 to 2: correct the index, or add the missing frames to the scene",
+        ),
+    ],
+)
+@pytest.mark.parametrize("beside", [False, True])
+def test_fault_in_an_index(chunks, tmp_path, index, fault, beside):
+    """An index is checked where it is given, and where it lies with the chunks."""
+    file = tmp_path / "wanted.json"
+    if beside:
+        fault, file = fault.replace("wanted", "evaluation"), chunks.path / "evaluation.json"
+    file.write_text(json.dumps(index))
+    assert told(chunks.path, [] if beside else [file], geometry=0) == [f"error: {fault}"]
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,10 @@ import os
 import shutil
 import signal
 import time
+from functools import partial
 
 import numpy as np
+import photo_formats
 import pytest
 import torch
 from PIL import Image
@@ -14,7 +16,8 @@ from typer.testing import CliRunner
 from upath import UPath
 
 from qgs.cli import app
-from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
+from qgs.composer import resolve
+from qgs.data import ChunksSource, Dl3dvSource
 from qgs.data.paths import opened_path
 
 SIZE = (24, 32)
@@ -43,14 +46,8 @@ def photos(path, frames: int = 4, suffix=".png", convert=lambda image: image, ma
     return path
 
 
-def source(path, **options) -> PhotosSource:
-    return PhotosSource(
-        PhotosSource.Config(path=str(path), **{"image_size": SIZE, "holdout": 3, **options})
-    )
-
-
-def packed(path, size=SIZE, **options) -> ChunksSource:
-    return ChunksSource(ChunksSource.Config(path=str(path), image_size=size, **options))
+source = partial(photo_formats.opened, size=SIZE, holdout=3)
+packed = partial(photo_formats.opened, size=SIZE, source=ChunksSource)
 
 
 def pack(photos, out, encoding=None, **options) -> packing.Packed:
@@ -66,12 +63,9 @@ def same(one, other, tolerance: float = 0.0) -> None:
     assert (one.images(frames) - other.images(frames)).abs().max() <= tolerance
     expected, given = one.masks(frames), other.masks(frames)
     assert given is None if expected is None else torch.equal(expected, given)
-    torch.testing.assert_close(
-        one.cameras.intrinsics, other.cameras.intrinsics, atol=1e-4, rtol=0, check_dtype=False
-    )
-    torch.testing.assert_close(
-        one.cameras.c2w, other.cameras.c2w, atol=1e-4, rtol=0, check_dtype=False
-    )
+    close = partial(torch.testing.assert_close, atol=1e-4, rtol=0, check_dtype=False)
+    close(one.cameras.intrinsics, other.cameras.intrinsics)
+    close(one.cameras.c2w, other.cameras.c2w)
 
 
 CASES = {
@@ -136,10 +130,8 @@ def test_to_urls_and_from_chunks_again(tmp_path, url):
     pack(packed(first), second)
     same(packed(first).scenes("train")[0], packed(second).scenes("train")[0])
     same(before.scenes("train")[0], packed(second).scenes("train")[0])
-    assert sorted(item.name for item in (second / "train").iterdir()) == [
-        "000000.torch",
-        "index.json",
-    ]
+    names = sorted(item.name for item in (second / "train").iterdir())
+    assert names == ["000000.torch", "index.json"]
 
 
 def many(path, count: int = 6):
@@ -220,15 +212,9 @@ def test_scenes_that_cannot_be_read_are_left_out_by_name(tmp_path):
     assert result.scenes["train"] == 5
     assert list(result.left_out) == ["s3"]
     assert "images/1.png" in result.left_out["s3"]
+    broken_alone = {"train": {"s3": packing.own_splits(before)["train"]["s3"]}, "test": {}}
     with pytest.raises(ValueError, match="no scene to pack: s3: "):
-        packing.pack(
-            before,
-            packing.splits_by_list(before, [])
-            | {"train": {"s3": packing.own_splits(before)["train"]["s3"]}},
-            UPath(tmp_path / "none"),
-            {},
-            leave_out_broken=True,
-        )
+        packing.pack(before, broken_alone, UPath(tmp_path / "none"), {}, leave_out_broken=True)
 
 
 def test_archives_of_dl3dv(tmp_path):
@@ -236,15 +222,14 @@ def test_archives_of_dl3dv(tmp_path):
     for scene in (tmp_path / "scenes").iterdir():
         shutil.make_archive(str(tmp_path / "1K" / scene.name), "zip", scene.parent, scene.name)
     (tmp_path / "1K" / "s1.zip").write_bytes(b"cut off")
-    config = Dl3dvSource.Config(path=str(tmp_path / "1K"), image_size=SIZE)
-    before = Dl3dvSource(config)
+    before = photo_formats.opened(tmp_path / "1K", SIZE, Dl3dvSource)
     result = pack(before, tmp_path / "chunks", leave_out_broken=True)
     assert (result.scenes["train"], result.kept) == (2, 4)
     assert "s1.zip is no zip archive" in result.left_out["s1"]
     same(before.scenes("train")[2], packed(tmp_path / "chunks").scenes("train")[1])
 
 
-def packed_until_killed(before: PhotosSource, out, seconds: float) -> bool:
+def packed_until_killed(before, out, seconds: float) -> bool:
     """Pack in a process of its own, killed after `seconds`; whether it was."""
     process = os.fork()
     if not process:
@@ -286,19 +271,20 @@ def test_a_journal_that_packing_did_not_write(tmp_path, content, message):
     assert (tmp_path / "out" / "packing.json").read_text() == content
 
 
+def command(*words) -> str:
+    result = CliRunner().invoke(app, ["data", "pack", *map(str, words)])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
 def test_the_command(tmp_path):
-    many(tmp_path / "scenes")
-    words = ["data", "pack", tmp_path / "scenes", "--out", tmp_path / "out", "--test-every", "3"]
-    result = CliRunner().invoke(app, [*map(str, words), "--set", "holdout=0"])
-    assert result.exit_code == 0, result.output
-    assert "scenes 4 train, 2 test; 12 images now, 12 kept" in result.output
-    assert packed(tmp_path / "out").scenes("train")[0].held_out == ()
-    words = ["data", "pack", tmp_path / "out", "--out", tmp_path / "small", "--image-size", 8, 12]
-    result = CliRunner().invoke(app, [*map(str, words), "--jpeg", "80"])
-    assert result.exit_code == 0, result.output
-    assert "scenes 4 train, 2 test; 12 images now, 0 kept as they were, 12 written" in result.output
-    small = packed(tmp_path / "small", (8, 12)).scenes("test")[0]
-    assert small.encoded(0).size == (8, 12)
+    scenes, out, small = many(tmp_path / "scenes"), tmp_path / "out", tmp_path / "small"
+    told = command(scenes, "--out", out, "--test-every", "3", "--set", "holdout=0")
+    assert "scenes 4 train, 2 test; 12 images now, 12 kept" in told
+    assert packed(out).scenes("train")[0].held_out == ()
+    told = command(out, "--out", small, "--image-size", 8, 12, "--jpeg", "80")
+    assert "scenes 4 train, 2 test; 12 images now, 0 kept as they were, 12 written" in told
+    assert packed(small, size=(8, 12)).scenes("test")[0].encoded(0).size == (8, 12)
 
 
 def test_the_command_packs_the_data_of_a_recipe(tmp_path):
@@ -308,12 +294,8 @@ def test_the_command_packs_the_data_of_a_recipe(tmp_path):
         "data: {type: rooms/procedural, scenes: 2, test_scenes: 1, views_per_scene: 2, "
         "image_size: [16, 16]}\n"
     )
-    words = ["data", "pack", str(recipe), "--out", str(tmp_path / "chunks")]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
-    after = packed(tmp_path / "chunks", (16, 16))
-    from qgs.composer import resolve
-
+    command(recipe, "--out", tmp_path / "chunks")
+    after = packed(tmp_path / "chunks", size=(16, 16))
     before = resolve(recipe).build_data()
     for split in ("train", "test"):
         for one, other in zip(before.scenes(split), after.scenes(split), strict=True):

@@ -1,6 +1,7 @@
 """Data of a source that a plugin brings is checked and packed as that of qgs is."""
 
 import numpy as np
+import photo_formats
 import pytest
 import tape_source
 from qgs_datatools import sources
@@ -45,9 +46,6 @@ def test_check(tapes, format):
 def test_pack(tapes, tmp_path):
     packed = run("pack", tapes, "--out", tmp_path / "chunks", "--set", "image_size=[16, 16]")
     assert packed.exception is None, packed.output
-    config = ChunksSource.Config(path=str(tmp_path / "chunks"), image_size=(16, 16))
-    scenes = ChunksSource(config).scenes("train")
-    assert [(scene.name, len(scene), tuple(scene.held_out)) for scene in scenes] == [
-        ("a", 6, (1, 4)),
-        ("b", 6, (1, 4)),
-    ]
+    scenes = photo_formats.opened(tmp_path / "chunks", (16, 16), ChunksSource).scenes("train")
+    told = [(scene.name, len(scene), tuple(scene.held_out)) for scene in scenes]
+    assert told == [("a", 6, (1, 4)), ("b", 6, (1, 4))]

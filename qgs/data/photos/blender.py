@@ -26,10 +26,7 @@ class Blender(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`: training frames first; those of the other files are held out.
-
-        Raises ValueError for `images`.
-        """
+        """See `PhotoReader`: training frames first, others held out. `images`: ValueError."""
         if images is not None:
             raise ValueError(
                 f"`images` is {images!r}, but the transforms files of {folder} name a folder for "

@@ -25,10 +25,7 @@ _FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
 
 @dataclass(frozen=True)
 class FrameProblem(Problem):
-    """Something wrong with a listed photo. option: the field of `PhotoFrame` that it is about.
-
-    fatal: whether `require_sound` refuses the frame for it.
-    """
+    """A fault of a `PhotoFrame`'s field. fatal: whether `require_sound` refuses the frame."""
 
     fatal: bool = True
 
@@ -60,10 +57,7 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """What is wrong with fx, fy, cx, cy in pixels of an image of `size` (H, W), where it is known.
-
-    Not fatal are a principal point off the image and a strange angle of view: they may be right.
-    """
+    """What is wrong with fx, fy, cx, cy in pixels of `size` (H, W); not all of it is fatal."""
 
     def problem(reason: str, fix: str, *, fatal: bool = True) -> FrameProblem:
         said = f"fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}"

@@ -36,10 +36,7 @@ _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
 class Colmap(PhotoReader):
-    """The posed images by name; a binary model before a text one, in the first of `_PLACES`.
-
-    Of a folder of photos and its scaled copies, the least reduced is read.
-    """
+    """The posed images by name, of a binary model before a text one, as `_PLACES` are ordered."""
 
     name = "colmap"
     listing = "sparse/0/{cameras,images}.{bin,txt}"

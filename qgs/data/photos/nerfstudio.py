@@ -30,11 +30,7 @@ _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Nerfstudio(PhotoReader):
-    """A folder with `transforms.json`: masks ('mask_path'), depth ('depth_file_path') and splits.
-
-    Where all the listed photos are missing and a reduced copy of their folder (images_2, _4, _8)
-    is there, that is read.
-    """
+    """`transforms.json` with masks, depth, splits; reduced copies if all photos are missing."""
 
     name = "nerfstudio"
     listing = "transforms.json"
@@ -208,11 +204,7 @@ def _coefficient(values: Mapping[str, Any], key: str) -> float:
 
 
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
-    """`frames` with the split that nerfstudio's 'train_filenames' and its like give them.
-
-    Validation photos are test photos too. With one kind of list, the other frames are of the other
-    kind; with both, frames that no list names are unused.
-    """
+    """`frames` with nerfstudio's splits: val is test; unnamed ones are the other, or unused."""
     known = {frame.name for frame in frames}
     splits: dict[str, set[str]] = {"train": set(), "test": set()}
     for part, split in (("train", "train"), ("test", "test"), ("val", "test")):

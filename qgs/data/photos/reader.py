@@ -58,10 +58,7 @@ class Listing:
 
 
 class PhotoReader(ABC):
-    """A format that lists the photos of a folder with their cameras.
-
-    A new one is a subclass in a file of its own, added to `qgs.data.photos.READERS`.
-    """
+    """A format that lists posed photos; subclasses are listed in `qgs.data.photos.READERS`."""
 
     name: ClassVar[str]
     """What the option `format` calls it."""
@@ -102,10 +99,7 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """The folder of photos: `wanted`, else images, else its least reduced copy, such as images_4.
-
-    Raises FileNotFoundError when there is none.
-    """
+    """`wanted`, else images, else its least reduced copy. Raises FileNotFoundError."""
     if wanted is not None:
         if not (folder / wanted).is_dir():
             raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
@@ -120,10 +114,7 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
 
 
 def with_images(frames: Sequence[PhotoFrame], folder: UPath, wanted: str) -> list[PhotoFrame]:
-    """`frames` with their photos taken from `folder`/`wanted` instead of their first folder.
-
-    Raises FileNotFoundError where that folder does not exist.
-    """
+    """`frames` with photos from `folder`/`wanted`. Raises FileNotFoundError without it."""
     image_folder(folder, wanted)
 
     def moved(frame: PhotoFrame) -> PhotoFrame:

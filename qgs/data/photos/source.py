@@ -71,10 +71,7 @@ def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
 
 
 class PhotoScene(EncodedScene):
-    """The photos of one listing, in its order. World: that of the listing's poses.
-
-    cache: an `image_cache` shared by scenes of different names. Raises as `present_frames`.
-    """
+    """A listing's photos, in its world and order. cache: shared. Raises as `present_frames`."""
 
     def __init__(
         self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
@@ -133,14 +130,12 @@ class PhotoScene(EncodedScene):
         """See `EncodedScene`."""
         listed = self._frames[frame]
         size = _checked(image_size(listed.path), listed, listed.path)
-        mask = None
+        buffer = io.BytesIO()
         if listed.mask is not None:
-            buffer = io.BytesIO()
             Image.fromarray(_whole_mask(listed)).save(buffer, "png")
-            mask = buffer.getvalue()
         return EncodedFrame(
             listed.name, listed.path.read_bytes(), listed.c2w, listed.at_size(size), size,
-            listed.lens, mask, self._config.background,
+            listed.lens, buffer.getvalue() or None, self._config.background,
         )  # fmt: skip
 
     def _stacked(
@@ -300,10 +295,7 @@ def read_photos(
     frames: Sequence[int] | None = None,
     format: Format = "auto",
 ) -> Views:
-    """Views (1, V) of a photo folder, in the world of its poses; all frames unless some are named.
-
-    Raises FileNotFoundError and ValueError as `PhotosSource`, IndexError for frames out of range.
-    """
+    """Views (1, V) of a folder, in its poses' world. Raises as `PhotosSource`, and IndexError."""
     folder = opened_path(path)
     config = PhotosConfig(path=str(path), image_size=image_size, format=format)
     scene = PhotoScene(folder_name(folder), folder, config, image_cache())

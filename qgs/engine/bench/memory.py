@@ -17,9 +17,8 @@ from qgs.engine.bench.work import Operation, Workload, make_task
 
 @dataclass(frozen=True)
 class Peak:
-    """peak_bytes: on the CPU the largest resident set of a process, interpreter and libraries
-    included; on a GPU the most that torch had allocated. idle_bytes: before the model was built.
-    """
+    """peak_bytes: on the CPU the largest resident set of the whole process; on a GPU the most that
+    torch had allocated. idle_bytes: before the model was built."""
 
     peak_bytes: int
     idle_bytes: int

@@ -36,14 +36,6 @@ class Workload:
         """The context in which the model runs."""
         return torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16")
 
-    def inputs(self) -> Views:
-        """Random photos (batch, views), the same each time."""
-        return posed_photos(self.batch, self.views, self.size, seed=0).to(self.device)
-
-    def supervision(self) -> Views:
-        """Random photos (batch, targets), the same each time."""
-        return posed_photos(self.batch, self.targets, self.size, seed=1).to(self.device)
-
 
 def workload_of(
     recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
@@ -66,8 +58,7 @@ def workload_of(
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
     """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point.
 
-    The first camera is the identity, as pose normalisation leaves it; the field of view is some 53
-    degrees across the longer side.
+    The first is the identity; the field of view is some 53 degrees across the longer side.
     """
     generator = torch.Generator().manual_seed(seed)
     images = torch.rand(batch, count, 3, *size, generator=generator)
@@ -90,11 +81,13 @@ def make_task(
 ) -> Task:
     """`operation` as a call without arguments that leaves nothing behind but changed weights.
 
-    forward: photos to the Gaussians of the last layer, no gradients. render: those Gaussians from
-    the cameras of the targets, no gradients. step: forward, every supervised layer rendered,
-    losses, backward, clipped gradients, an optimiser step.
+    forward: photos to the last layer's Gaussians, no gradients. render: those Gaussians at the
+    targets' cameras, no gradients. step: a whole training step.
     """
-    inputs, targets = workload.inputs(), workload.supervision()
+    inputs, targets = (
+        posed_photos(workload.batch, count, workload.size, seed).to(workload.device)
+        for seed, count in enumerate((workload.views, workload.targets))
+    )
     if operation == "step":
         losses, render_views = recipe.build_losses(), recipe.training.render_views
         objective = Objective(model.train(), losses, render_views).to(workload.device)

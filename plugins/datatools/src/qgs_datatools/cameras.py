@@ -19,10 +19,7 @@ _FAR_OFF_CENTRE = 0.25  # of a side, from the middle
 
 
 def camera_findings(scene: DecodedScene, sized: set[int]) -> tuple[list[Finding], list[Finding]]:
-    """What is wrong with single poses, and with intrinsics and the rest.
-
-    sized: frames whose listed size is wrong, so that their intrinsics cannot be judged.
-    """
+    """What is wrong with poses, and with the rest. sized: frames whose listed size is wrong."""
     poses: list[Finding] = []
     others: list[Finding] = []
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
@@ -56,10 +53,7 @@ def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[FrameProbl
 def sharing_findings(
     scene: DecodedScene, sound: Sequence[int], *, float32: bool
 ) -> Iterator[Finding]:
-    """Photos that share a pose, or only a place, among the frames whose poses are `sound`.
-
-    float32: whether the format holds poses in float32.
-    """
+    """Frames of `sound` that share a pose or a place. float32: the precision of the format."""
     if len(sound) < 2:
         return
     poses = np.stack([scene.photos[frame].listed.c2w for frame in sound])
@@ -85,11 +79,7 @@ def sharing_findings(
 
 
 def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
-    """How far apart two cameras, and all cameras, may be on one point, in the world's units.
-
-    Coordinates are as precise as the format, or as the rotations beside them; far from the origin
-    such errors exceed the steps between cameras, so that the extent bounds what is one place.
-    """
+    """How far two cameras, and all, may be apart on one point, given their poses' precision."""
     rotations, centres = poses[:, :3, :3], poses[:, :3, 3]
     off_rigid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     distance, extent = np.abs(centres).max(), np.ptp(centres, axis=0).max()
@@ -99,10 +89,7 @@ def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
 
 
 def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
-    """Groups of indices of `rows` (F, D) that differ from the group's first by no more.
-
-    Sorted by the first value, so that only rows near in it are compared.
-    """
+    """Groups of indices of rows (F, D) that differ from the group's first by no more."""
     order = np.argsort(rows[:, 0], kind="stable")
     sorted_ = rows[order, 0]
     groups: dict[int, list[int]] = {}

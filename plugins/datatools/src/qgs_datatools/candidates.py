@@ -17,10 +17,7 @@ from qgs_datatools.conventions import Convention
 
 @dataclass(frozen=True)
 class Photo:
-    """listed: as the listing says, with the faults that parsing found. read: the file's bytes.
-
-    exists, mask_exists: whether the files that are listed are there.
-    """
+    """A listed photo, what reads its bytes, and whether it and its mask exist."""
 
     listed: PhotoFrame
     read: Callable[[], bytes]
@@ -28,11 +25,7 @@ class Photo:
     mask_exists: bool = True
 
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
-        """The photo as a pinhole camera took it, RGB, with `side` pixels on its longer side.
-
-        size: (H, W) of the file, which intrinsics go with where none is listed. Also the intrinsics
-        (4,) in pixels of the picture. Raises OSError for a file that cannot be decoded.
-        """
+        """Pinhole RGB, `side` pixels long at most, and its intrinsics (4,). Raises OSError."""
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
         image = decode_rgb(io.BytesIO(self.read()), (1.0, 1.0, 1.0))
         scale = min(1.0, side / max(image.size))
@@ -46,11 +39,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to check, opened by `photos`, which raises ValueError or OSError for a bad listing.
-
-    name: for people; scene: as evaluation indices name it. kind: its format. split: train or test,
-    empty where the format knows no such folders.
-    """
+    """A scene to check. scene: its name in indices. photos: raises ValueError or OSError."""
 
     name: str
     scene: str

@@ -177,11 +177,8 @@ def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]
     if not options.geometry:
         return set(), ["no pose was judged by photos (--geometry 0)"]
     places = np.linspace(0, max(count - 1, 0), min(options.geometry, count)).round().astype(int)
-    chosen = set(places.tolist())
-    if len(chosen) == count:
-        return chosen, []
-    left = f"poses were judged by photos in {len(chosen)} of {count} scenes; --geometry {count}"
-    return chosen, [f"{left} judges all"]
+    left = f"poses were judged by photos in {len({*places})} of {count} scenes; --geometry {count}"
+    return set(places.tolist()), [f"{left} judges all"] if len({*places}) < count else []
 
 
 def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) -> SceneReport:
@@ -237,14 +234,11 @@ def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
     """What a picture of the cameras needs."""
     if not frames:
         return {}
-    fov = []
+    fov, c2w = [], []
     for frame in frames:
         listed = scene.photos[frame].listed
         height, width = listed.size or scene.decoded[frame].size or (1, 1)
         fov.append((width / 2 / listed.intrinsics[0], height / 2 / listed.intrinsics[1]))
-    c2w = np.stack([scene.photos[frame].listed.c2w[:3] for frame in frames])
-    return {
-        "frames": tuple(frames),
-        "c2w": c2w.astype(np.float32),
-        "fov": np.array(fov, np.float32),
-    }
+        c2w.append(listed.c2w[:3])
+    drawn = {"c2w": np.array(c2w, np.float32), "fov": np.array(fov, np.float32)}
+    return {"frames": tuple(frames), **drawn}

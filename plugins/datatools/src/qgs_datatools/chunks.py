@@ -62,11 +62,7 @@ def chunk_folders(path: UPath) -> list[ChunkFolder]:
 
 
 class ChunkFolder:
-    """What one folder of chunks holds.
-
-    split: train or test, or empty. index: scene to file name, as index.json has it. found: scenes
-    of all files that could be read.
-    """
+    """What a folder of chunks holds. split: train, test or empty. index, found: scenes."""
 
     def __init__(self, split: str) -> None:
         self.split = split

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -150,7 +149,11 @@ def pack(
     source, settings = _opened(path, options or [], image_size)
     splits = _splits(source, test_scenes, test_every)
     settings |= {"test_scenes": test_scenes, "test_every": test_every}
-    with _progress(console, sum(map(len, splits.values()))) as progress:
+    name = TextColumn("{task.description}")
+    columns = (MofNCompleteColumn(), BarColumn(), TimeRemainingColumn(), name)
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+        task = bar.add_task("", total=sum(map(len, splits.values())))
         packed = packing.pack(
             source,
             splits,
@@ -159,7 +162,7 @@ def pack(
             Encoding(image_size is not None, jpeg),
             chunk_bytes=chunk_mb * 2**20,
             leave_out_broken=leave_out_broken,
-            progress=progress,
+            progress=lambda name: bar.update(task, advance=1, description=name),
         )
     _print_packed(console, packed, out)
 
@@ -197,18 +200,6 @@ def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None
     if test_every is not None:
         return splits_by_number(source, test_every)
     return own_splits(source)
-
-
-@contextmanager
-def _progress(console: Console, scenes: int) -> Iterator[Callable[[str], None]]:
-    """A bar of scenes, moved by the name of each; nothing where no terminal is."""
-    left, name = TimeRemainingColumn(), TextColumn("{task.description}")
-    columns = (MofNCompleteColumn(), BarColumn(), left, name)
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("", total=scenes)
-        yield lambda name: bar.update(task, advance=1, description=name)
 
 
 def _print_packed(console: Console, packed: Packed, out: str) -> None:

@@ -15,11 +15,7 @@ _RIGHT_DOWN_FORWARD = np.eye(4)[:, [1, 0, 2, 3]] * [1, 1, -1, 1]
 
 @dataclass(frozen=True)
 class Misreading:
-    """What poses may have been meant as.
-
-    inverted: whether the matrix that was read is to be inverted. axes: (4, 4), the OpenCV camera
-    axes that were meant, by those that were read.
-    """
+    """What poses may have been meant as. axes: (4, 4), the OpenCV axes meant, by those read."""
 
     reason: str
     fix: str

@@ -28,10 +28,7 @@ _COPY = re.compile(r"images_\d+")
 
 @dataclass(frozen=True)
 class Decoded:
-    """size: (H, W); None for a photo that is missing or cannot be decoded. digest: of its bytes.
-
-    error, mask_error: why the photo and its mask cannot be; None where they can or do not exist.
-    """
+    """size: (H, W), None where it cannot be decoded. digest: of the bytes. Errors in words."""
 
     size: Size | None = None
     digest: bytes = b""
@@ -125,10 +122,6 @@ class _Sized:
             f"{self.listed[1]} x {self.listed[0]}"
         )
 
-    @property
-    def scale(self) -> float:
-        return self.file[1] / self.listed[1]
-
     def has_scale(self, scale: float) -> bool:
         return abs(self.file[1] - scale * self.listed[1]) <= _ROUNDING
 
@@ -169,7 +162,7 @@ def size_findings(scene: DecodedScene) -> Iterator[Finding]:
         yield scene.finding([frame], reason, fix)
     if not alike:
         return
-    usual = median_low(item.scale for item in alike)
+    usual = median_low(item.file[1] / item.listed[1] for item in alike)
     for item in alike:
         if not item.has_scale(usual):
             reason = f"{item.reason}, another scale than the rest of the scene"

@@ -24,33 +24,27 @@ _KEPT_FORMATS = {"JPEG", "MPO", "PNG"}  # MPO: a JPEG with further pictures behi
 
 @dataclass(frozen=True)
 class Encoding:
-    """How images are written that cannot stay as they are.
-
-    resized: whether all are written at the size that their source delivers; else they keep their
-    own. jpeg: quality; None for PNG, which loses nothing.
-    """
+    """How images are rewritten. resized: all, as delivered. jpeg: quality; None for PNG."""
 
     resized: bool = False
     jpeg: int | None = None
 
     def image(self, pixels: np.ndarray) -> bytes:
         """(H, W, 3) uint8 as the bytes of a file."""
-        if self.jpeg is None:
-            return _file(pixels, format="PNG")
-        return _file(pixels, format="JPEG", quality=self.jpeg, subsampling=0)
+        return _file(pixels, self.jpeg)
 
 
-def _file(pixels: np.ndarray, **options: Any) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, **options)
+def _file(pixels: np.ndarray, jpeg: int | None = None) -> bytes:
+    file, image = io.BytesIO(), Image.fromarray(pixels)
+    if jpeg is None:
+        image.save(file, format="PNG")
+    else:
+        image.save(file, format="JPEG", quality=jpeg, subsampling=0)
     return file.getvalue()
 
 
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
-    """The frames of a scene in order, and whether each keeps its original bytes.
-
-    Every image is decoded, so that none is packed that cannot be read. Raises as the scene does.
-    """
+    """The decodable frames in order, and whether each keeps its bytes. Raises as the scene."""
     for index in range(len(scene)):
         if isinstance(scene, EncodedScene) and not encoding.resized:
             yield _stored(scene, index, encoding)
@@ -76,7 +70,7 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
     if frame.lens is not None:
         pixels = undistorted(pixels, frame.intrinsics, frame.lens)
         mask = None if mask is None else undistorted(mask, frame.intrinsics, frame.lens)
-    mask_file = None if mask is None else _file(mask, format="PNG")
+    mask_file = None if mask is None else _file(mask)
     return replace(frame, data=encoding.image(pixels), lens=None, mask=mask_file), False
 
 
@@ -91,7 +85,7 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
         c2w=cameras.c2w.double().numpy(),
         intrinsics=(fx, fy, cx, cy),
         size=cameras.size,
-        mask=None if mask is None else _file(mask, format="PNG"),
+        mask=None if mask is None else _file(mask),
     )
 
 
@@ -112,11 +106,6 @@ def chunk_entry(key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int
     if held_out:
         entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)
     return entry
-
-
-def stored_bytes(entry: ChunkEntry) -> int:
-    """What an entry adds to the size of its chunk, but for the container's own bytes."""
-    return sum(data.nbytes for key in ("images", "masks") for data in entry.get(key, ()))
 
 
 def _bytes(data: bytes) -> Tensor:

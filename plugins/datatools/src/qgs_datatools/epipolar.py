@@ -14,9 +14,7 @@ from skimage.transform import FundamentalMatrixTransform
 Reading: TypeAlias = Callable[[np.ndarray], np.ndarray]
 """What a pose (4, 4) that was read may have been meant as."""
 
-MIN_MATCHES = 24
-"""Fewer matches than this say nothing about a pair of photos."""
-
+MIN_MATCHES = 24  # fewer say nothing about a pair of photos
 _RATIO = 0.8  # of descriptor distances (Lowe 2004)
 _INLIER_PIXELS = 1.5
 _TRIALS = 400
@@ -41,11 +39,7 @@ def detect(grey: np.ndarray) -> Features:
 
 
 def match(first: Features, second: Features, seed: int = 0) -> np.ndarray | None:
-    """Points (2, P, 2) that both photos show and that agree with one epipolar geometry.
-
-    Found from the photos alone: poses play no part, so that wrong ones cannot hide behind the
-    matches that they reject. None when fewer than MIN_MATCHES remain.
-    """
+    """Points (2, P, 2) of one epipolar geometry, found without any pose; None for too few."""
     if min(len(first.points), len(second.points)) < MIN_MATCHES:
         return None
     pairs = match_descriptors(
@@ -102,10 +96,7 @@ class Pair:
         return np.stack([b @ fundamental, a @ fundamental.T])
 
     def distance(self, reading: Reading = np.asarray) -> float:
-        """Median distance of matches to their lines, both photos' mean, if poses are meant so.
-
-        A fraction of the diagonal. Two cameras on one point have no epipolar lines: 0.
-        """
+        """Median distance of matches to their lines, of the diagonal; 0 without a baseline."""
         lines = self.lines(reading)
         length = np.linalg.norm(lines[..., :2], axis=-1)
         off = np.abs((_homogeneous(self.matches) * lines).sum(-1))

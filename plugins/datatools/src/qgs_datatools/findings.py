@@ -61,10 +61,7 @@ def spans(numbers: Iterable[int]) -> str:
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:
-    """One finding for all frames with the same fault, and for more than three with its remedy.
-
-    The reason that stays is the first frame's.
-    """
+    """One finding for all frames with the same fault; for more than three, the same remedy."""
     alike = _together(findings, attrgetter("reason", "fix", "severity"))
     kinds = Counter(finding.fix for finding in alike)
     few = [finding for finding in alike if kinds[finding.fix] <= _FEW]

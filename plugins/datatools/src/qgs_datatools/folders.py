@@ -21,10 +21,7 @@ _CONVENTIONS = {reader.name: _POSES[reader.poses] for reader in READERS}
 
 
 def photo_folders(root: UPath, wanted: Format, images: str | None) -> Iterator[Candidate | Finding]:
-    """The scenes in `root`, which may be one itself, or hold them in train and test.
-
-    wanted: the format of the listings to check. images: the folder of photos to read.
-    """
+    """The scenes of format `wanted` in `root`: itself, its folders, or those in train and test."""
     if formats_of(root):
         yield from _listings(root, folder_name(root), wanted, images)
         return

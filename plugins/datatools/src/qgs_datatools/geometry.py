@@ -12,20 +12,11 @@ from qgs_datatools.decoding import DecodedScene
 from qgs_datatools.epipolar import MIN_MATCHES, Features, Pair, detect, match
 from qgs_datatools.findings import Finding
 
-AS_READ = "as read"
-"""The reading of poses that changes nothing."""
-
-SIDE = 400
-"""Pixels on the longer side of the photos that are matched."""
-
-TOLERANCE = 0.005
-"""Largest median distance that good poses leave, as a fraction of the image's diagonal."""
-
-CLEARLY_BETTER = 3.0
-"""A reading replaces the present one when its distance is this many times smaller."""
-
+AS_READ = "as read"  # the reading of poses that changes nothing
+SIDE = 400  # pixels on the longer side of the photos that are matched
+TOLERANCE = 0.005  # largest median distance that good poses leave, of the image's diagonal
+CLEARLY_BETTER = 3.0  # a reading whose distance is this many times smaller replaces the present one
 TOO_FEW = f"too few matches, below {MIN_MATCHES} in every pair that was tried"
-
 _RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
 _STARTS = 5
 _GAPS = (8, 4, 2, 1)
@@ -116,12 +107,10 @@ class _Matcher:
 
     def pair(self, first: int, second: int) -> Pair | None:
         """None where too little is shared."""
-        for place in (first, second):
-            if place not in self._features:
-                picture, intrinsics = self.picture(self.frames[place])
-                height, width, _ = picture.shape
-                features = detect(picture @ _RGB_TO_GREY)
-                self._features[place] = features, intrinsics, (height, width)
+        for place in {first, second} - self._features.keys():
+            picture, intrinsics = self.picture(self.frames[place])
+            height, width, _ = picture.shape
+            self._features[place] = detect(picture @ _RGB_TO_GREY), intrinsics, (height, width)
         (one, k1, size), (two, k2, _) = self._features[first], self._features[second]
         matches = match(one, two)
         if matches is None:

@@ -39,11 +39,7 @@ def _is_index(file: UPath) -> bool:
 def index_findings(
     file: UPath, scenes: Mapping[str, Sequence[Held]], told: Container[str] = ()
 ) -> tuple[list[Finding], str | None]:
-    """What the index names and is not there, less scenes whose absence is `told` already.
-
-    Also the index in numbers, in words; None for a file that is no index. Raises FileNotFoundError
-    without a file.
-    """
+    """What the index names and is not there or `told`; the index in words, None if it is none."""
     try:
         index = read_index(str(file))
     except ValueError as error:

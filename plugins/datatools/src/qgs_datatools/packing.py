@@ -13,11 +13,11 @@ from typing import IO, Any, TypeAlias, get_args
 import torch
 from upath import UPath
 
-from qgs.contracts import Scene, SceneSource, Split
+from qgs.contracts import SceneSource, Split
 from qgs.data.chunk_files import INDEX, SUFFIX
 from qgs.data.paths import is_local
 from qgs.io.files import replacing
-from qgs_datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames, stored_bytes
+from qgs_datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames
 
 CHUNK_BYTES = 100 * 2**20
 JOURNAL = "packing.json"
@@ -26,15 +26,13 @@ _VERSION = 1
 Places: TypeAlias = Mapping[str, tuple[Split, int]]
 """Scenes by name: the split of the source that has each, and its index there."""
 
-Splits: TypeAlias = Mapping[Split, Places]
-"""What is packed into which split."""
+Splits: TypeAlias = Mapping[Split, Places]  # what is packed into which split
 
 
 def own_splits(source: SceneSource) -> Splits:
     """The source's own splits; scenes that are in both are packed once, for training."""
-    train = _places(source, "train")
-    test = {name: place for name, place in _places(source, "test").items() if name not in train}
-    return {"train": train, "test": test}
+    train, test = _places(source, "train"), _places(source, "test")
+    return {"train": train, "test": {name: test[name] for name in test if name not in train}}
 
 
 def splits_by_list(source: SceneSource, test_scenes: Collection[str]) -> Splits:
@@ -57,11 +55,10 @@ def splits_by_number(source: SceneSource, every: int) -> Splits:
 
 
 def _split_again(splits: Splits, test: Collection[str]) -> Splits:
-    places = {**splits["train"], **splits["test"]}
-    return {
-        "train": {name: place for name, place in places.items() if name not in test},
-        "test": {name: place for name, place in places.items() if name in test},
-    }
+    again: dict[Split, dict[str, tuple[Split, int]]] = {"train": {}, "test": {}}
+    for name, place in {**splits["train"], **splits["test"]}.items():
+        again["test" if name in test else "train"][name] = place
+    return again
 
 
 def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
@@ -81,11 +78,7 @@ def _some(names: list[str]) -> str:
 
 @dataclass
 class Journal:
-    """The state of a packing into `folder`.
-
-    settings: what decides the result; another packing must not go on with it. files: of each split
-    a scene's key to its chunk, for chunks that are complete.
-    """
+    """A packing. settings: what decides its result. files: a scene's key to its whole chunk."""
 
     folder: UPath
     settings: Mapping[str, Any]
@@ -195,7 +188,11 @@ def pack(
                 packed.resumed += 1
             else:
                 try:
-                    entry = _entry(name, source.scenes(split)[index], encoding, packed)
+                    scene = source.scenes(split)[index]
+                    frames = list(encoded_frames(scene, encoding))
+                    packed.frames += len(frames)
+                    packed.kept += sum(kept for _, kept in frames)
+                    entry = chunk_entry(name, [frame for frame, _ in frames], scene.held_out)
                 except (ValueError, OSError) as error:
                     if not leave_out_broken:
                         raise
@@ -226,18 +223,11 @@ def pack(
     return packed
 
 
-def _entry(name: str, scene: Scene, encoding: Encoding, packed: Packed) -> ChunkEntry:
-    frames = list(encoded_frames(scene, encoding))
-    packed.frames += len(frames)
-    packed.kept += sum(kept for _, kept in frames)
-    return chunk_entry(name, [frame for frame, _ in frames], scene.held_out)
-
-
 def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEntry]]:
     chunk: list[ChunkEntry] = []
     total = 0
     for entry in entries:
-        size = stored_bytes(entry)
+        size = sum(data.nbytes for key in ("images", "masks") for data in entry.get(key, ()))
         if chunk and total + size > limit:
             yield chunk
             chunk, total = [], 0

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -16,17 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
+from qgs.analysis.report import page_environment
 from qgs.drawing.figures import INK, figure_picture, figure_style, hex_color
 from qgs.drawing.images import Picture, png_uri
 from qgs_datatools.check import CheckReport, SceneReport
 from qgs_datatools.epipolar import Pair
 
-PICTURED = 12
-"""Scenes that get pictures, the worst first."""
-
-ROWS = 500
-"""Scenes in the table, and findings in the list, the worst first."""
-
+PICTURED = 12  # scenes that get pictures, the worst first
+ROWS = 500  # scenes in the table, and findings in the list, the worst first
 _DPI = 130
 _CAMERAS, _MATCHES = 120, 14  # drawn at most
 _DEPTH = 0.09  # of the cameras' extent: how far frusta reach
@@ -34,25 +29,9 @@ _RING = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 _GAP = 0.02  # between two photos, of a photo's width
 
 
-@dataclass(frozen=True)
-class _Pictured:
-    scene: SceneReport
-    cameras: Picture | None
-    pair: Pair | None
-    matches: Picture | None
-
-
 def check_html(report: CheckReport) -> str:
     """The whole page; it needs no other file and no network."""
-    packages = [("qgs_datatools", "template"), ("qgs.analysis", "template")]
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader(*package) for package in packages]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(png=png_uri)
+    environment = page_environment("qgs_datatools", png=png_uri)
     scenes = sorted(report.scenes, key=_badness, reverse=True)
     return environment.get_template("check.html").render(
         report=report,
@@ -68,21 +47,17 @@ def _badness(scene: SceneReport) -> tuple[int, int, float]:
     return scene.errors, len(scene.findings), judged.fraction if judged else 0.0
 
 
-def _pictured(scene: SceneReport) -> _Pictured:
+def _pictured(scene: SceneReport) -> dict[str, Any]:
     frusta = frusta_figure(scene)
     cameras = None if frusta is None else figure_picture(frusta, dpi=_DPI)
-    if scene.geometry is None or not scene.geometry.pairs:
-        return _Pictured(scene, cameras, None, None)
-    worst = scene.geometry.pairs[0]
-    matches = figure_picture(pair_figure(worst, scene.geometry.photos), dpi=_DPI)
-    return _Pictured(scene, cameras, worst, matches)
+    worst = scene.geometry.pairs[0] if scene.geometry and scene.geometry.pairs else None
+    figure = pair_figure(worst, scene.geometry.photos) if scene.geometry and worst else None
+    matches = None if figure is None else figure_picture(figure, dpi=_DPI)
+    return {"scene": scene, "cameras": cameras, "pair": worst, "matches": matches}
 
 
 def frusta_figure(scene: SceneReport) -> Figure | None:
-    """The cameras that have sound poses, at most 120 of them; None where there is none.
-
-    The figure's vertical axis is the mean of the cameras' up axes.
-    """
+    """At most 120 cameras with sound poses, their mean up axis upwards; None without any."""
     if not len(scene.c2w):
         return None
     kept = np.unique(np.linspace(0, len(scene.c2w) - 1, _CAMERAS).round().astype(int))
@@ -156,10 +131,7 @@ def _frame(axes: Any, points: np.ndarray) -> None:
 
 
 def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
-    """Both photos, in each the matches as dots and the line on which the poses want them.
-
-    A dot off its line of the same colour is what a wrong pose looks like.
-    """
+    """Both photos with matches as dots, and the lines on which the poses want them."""
     chosen = _spread(pair.matches[0], _MATCHES)
     points, lines = pair.matches[:, chosen], pair.lines()[:, chosen]
     height, width = pair.size

@@ -51,13 +51,11 @@ def table(rng: Random, m: Materials) -> Piece:
     for x in [rng.uniform(-0.38, 0.38) for _ in range(rng.randrange(1, 4))]:
         piece += _on_top(rng, m, x * w, rng.uniform(-0.3, 0.3) * d, h)
     seat, frame = m.fabric(), m.timber()
-    for side in (0.0, np.pi):
+    for sign, turn in ((1, 0.0), (-1, np.pi)):
         for x in (-w / 4, w / 4):
             if rng.random() < 0.75:
-                chair = _chair(seat, frame)
-                away = d / 2 + rng.uniform(0.0, 0.2)
-                sign = 1 if side == 0.0 else -1
-                piece += [part.moved(sign * x, sign * away, side) for part in chair]
+                away = sign * (d / 2 + rng.uniform(0.0, 0.2))
+                piece += [part.moved(sign * x, away, turn) for part in _chair(seat, frame)]
     return piece
 
 
@@ -66,8 +64,7 @@ def _chair(seat: int, frame: int) -> Piece:
         box(0, 0, 0.42, (0.42, 0.42, 0.05), seat),
         *_legs(0.42, 0.42, 0.42, 0.04, frame),
         box(0, 0.19, 0.62, (0.42, 0.03, 0.3), seat),
-        box(-0.18, 0.19, 0.47, (0.03, 0.03, 0.4), frame),
-        box(0.18, 0.19, 0.47, (0.03, 0.03, 0.4), frame),
+        *[box(x, 0.19, 0.47, (0.03, 0.03, 0.4), frame) for x in (-0.18, 0.18)],
     ]
 
 
@@ -95,8 +92,7 @@ def sofa(rng: Random, m: Materials) -> Piece:
     piece = [
         box(0, 0, 0.1, (w, d, 0.32), cloth),
         box(0, d / 2 - 0.1, 0.42, (w, 0.2, 0.42), cloth),
-        box(-w / 2 + 0.09, 0, 0.42, (0.18, d, 0.18), cloth),
-        box(w / 2 - 0.09, 0, 0.42, (0.18, d, 0.18), cloth),
+        *[box(x, 0, 0.42, (0.18, d, 0.18), cloth) for x in (0.09 - w / 2, w / 2 - 0.09)],
         *_legs(w, d, 0.1, 0.06, feet),
     ]
     for x in [rng.uniform(-0.32, 0.32) for _ in range(rng.randrange(1, 4))]:
@@ -111,8 +107,7 @@ def shelf(rng: Random, m: Materials) -> Piece:
     levels, step = rng.randrange(3, 6), 0.38
     h, wood = levels * step, m.timber()
     piece = [
-        box(-w / 2, 0, 0, (0.04, d, h), wood),
-        box(w / 2, 0, 0, (0.04, d, h), wood),
+        *[box(x, 0, 0, (0.04, d, h), wood) for x in (-w / 2, w / 2)],
         box(0, d / 2 - 0.01, 0, (w, 0.02, h), wood),
     ]
     piece += [box(0, 0, min(i * step, h - 0.03), (w, d, 0.03), wood) for i in range(levels + 1)]

@@ -43,13 +43,9 @@ def camera_path(
     )
     if rng.random() < 0.5:
         eyes, target = eyes[::-1], target[::-1]
-    turn = _turn(side * math.pi / 2)
+    cos, sin = math.cos(side * math.pi / 2), math.sin(side * math.pi / 2)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return _look_at(eyes @ turn.T, target @ turn.T)
-
-
-def _turn(angle: float) -> np.ndarray:
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _look_at(eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -57,10 +53,6 @@ def _look_at(eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    c2w = np.zeros((len(eyes), 4, 4))
-    c2w[:, :3, 0] = right
-    c2w[:, :3, 1] = np.cross(forward, right)
-    c2w[:, :3, 2] = forward
-    c2w[:, :3, 3] = eyes
-    c2w[:, 3, 3] = 1.0
+    c2w = np.tile(np.eye(4), (len(eyes), 1, 1))
+    c2w[:, :3] = np.stack([right, np.cross(forward, right), forward, eyes], -1)
     return c2w

@@ -64,17 +64,12 @@ class Furnisher:
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
             return False
         for x0, y0, x1, y1 in self._taken:
-            if (
-                low[0] < x1 + _GAP
-                and high[0] > x0 - _GAP
-                and low[1] < y1 + _GAP
-                and high[1] > y0 - _GAP
-            ):
+            beside_x = low[0] >= x1 + _GAP or high[0] <= x0 - _GAP
+            if not (beside_x or low[1] >= y1 + _GAP or high[1] <= y0 - _GAP):
                 return False
         for x, y, z in self.eyes:
-            dx = max(low[0] - x, x - high[0], 0.0)
-            dy = max(low[1] - y, y - high[1], 0.0)
-            dz = max(low[2] - z, z - high[2], 0.0)
+            apart = zip(low, (x, y, z), high, strict=True)
+            dx, dy, dz = (max(start - eye, eye - end, 0.0) for start, eye, end in apart)
             if dx * dx + dy * dy + dz * dz <= CLEARANCE**2:
                 return False
         return True

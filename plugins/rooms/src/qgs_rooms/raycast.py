@@ -144,10 +144,7 @@ def ray_basis(c2w, intrinsics):
 
 @njit(**INNER)
 def trace(t, code, top, samples, shapes, size, bounds, c2w, rays):
-    """Write t and code (R, C) float32 of a band of rays whose first pixel row is `top`.
-
-    Sample (i, j) is at v = top + (i + 0.5) / samples, u = (j + 0.5) / samples.
-    """
+    """Write t and code (R, C) float32 of rays from pixel row `top` on, at pixel sub-centres."""
     rows, columns = t.shape
     steps = np.empty(columns, np.float32)
     for j in range(columns):

@@ -201,11 +201,7 @@ def _light(lights, floor, size, code, x, y, z, normal):
 
 @njit(forceinline=True, **INNER)
 def _gather(t, code, i, j, own, samples, step, top, o, rays, points):
-    """Write where those rays of the pixel that begins at ray (i, j) hit that meet surface `own`.
-
-    Row 0 of `points` gets the mean, the next rows the points themselves, whose number is returned.
-    The rays are marked as taken.
-    """
+    """Write where rays of the pixel at (i, j) hit surface `own`, the mean in row 0; count them."""
     n = 0
     x = y = z = 0.0
     for a in range(samples):
@@ -225,10 +221,7 @@ def _gather(t, code, i, j, own, samples, step, top, o, rays, points):
 
 @njit(forceinline=True, **INNER)
 def _mixed(shapes, size, textures, row, code, points, n, footprint):
-    """Mean weights of a texture's second and third colour over rows 1 to n of `points`.
-
-    A smooth texture is looked up in row 0, their mean, alone.
-    """
+    """Mean weights of a texture's second and third colour; a smooth one is looked up in row 0."""
     kind, period, seed = int(textures[row, 0]), textures[row, 1], int(textures[row, 2])
     first, last = (0, 1) if smooth(kind) else (1, n + 1)
     second = third = 0.0

@@ -63,8 +63,10 @@ class RoomsConfig(SceneSource.Config):
 class RoomScene(Scene):
     """One room and the cameras on its path. World: metres, z up, the floor at 0."""
 
-    def __init__(self, config: RoomsConfig, split: Split, index: int, cache: ImageCache) -> None:
-        self.name = f"{split}/{index:06d}"
+    def __init__(
+        self, name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache
+    ) -> None:
+        self.name = name
         self._config, self._cache = config, cache
         rng = np.random.default_rng([config.seed, 0 if split == "train" else 1, index])
         self._plan_seed = int(rng.integers(1 << 62))
@@ -87,7 +89,6 @@ class RoomScene(Scene):
     @cached_property
     def room(self) -> Room:
         """The furnished room."""
-
         return furnish(Random(self._plan_seed), self.size, self._c2w[:, :3, 3])
 
     @cached_property
@@ -123,10 +124,6 @@ class RoomScene(Scene):
         return torch.from_numpy(cast_depths(self.room, *cameras, self._config.image_size))[:, None]
 
 
-def _room(name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache) -> RoomScene:
-    return RoomScene(config, split, index, cache)
-
-
 class RoomsSource(LazySource):
     """Endless procedural rooms; room i of a split is a function of (seed, split, i) alone."""
 
@@ -140,7 +137,7 @@ class RoomsSource(LazySource):
         self.splits = {
             split: LazyScenes(
                 {f"{split}/{index:06d}": index for index in range(count)},
-                partial(_room, config=config, split=split, cache=cache),
+                partial(RoomScene, config=config, split=split, cache=cache),
             )
             for split, count in counts.items()
         }

@@ -1,7 +1,9 @@
-"""What trackers are told."""
+"""What trackers are told, and what a person reads while a model trains."""
 
 from __future__ import annotations
 
+import io
+import re
 import sys
 import types
 from pathlib import Path
@@ -9,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from training_runs import Tiny
+from rich.console import Console
+from training_runs import Tiny, tensorboard_events
 
 from qgs.contracts.component import MissingExtraError
-from qgs.engine import tracking as trackers
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.tracking import Trackers
+from qgs.engine.tracking import Trackers, TrainingProgress
 
 
 def picture() -> np.ndarray:
@@ -22,7 +24,7 @@ def picture() -> np.ndarray:
 
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trackers, "find_spec", lambda name: None)
+    monkeypatch.setattr("qgs.engine.tracking.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r'pip install "query-gaussians\[wandb\]"'):
         Trackers(("wandb",))
     Trackers(()).log({"loss": 1.0}, 1)
@@ -30,15 +32,13 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
 def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     tracking = Trackers(("tensorboard",))
     tracking.open(tmp_path, tiny("locus"))
     for step in (1, 2):
         tracking.log({"loss": 1 / step, "psnr": 20.0 + step}, step)
     tracking.picture("evaluation", picture(), 2)
     tracking.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    events = tensorboard_events(tmp_path)
     found = [(event.step, event.value) for event in events.Scalars("loss")]
     assert found == [(1, 1.0), (2, 0.5)]
     (image,) = events.Images("evaluation")
@@ -49,15 +49,13 @@ def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Pat
 
 def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     for first, value in ((1, 1.0), (3, 2.0)):
         tracking = Trackers(("tensorboard",))
         tracking.open(tmp_path, tiny("locus"), step=first - 1)
         for step in range(first, 5):
             tracking.log({"loss": value}, step)
         tracking.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("loss")
+    events = tensorboard_events(tmp_path).Scalars("loss")
     assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
 
 
@@ -87,7 +85,7 @@ def test_wandb_continues_one_run(
     make_accelerator("cpu")
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
-    monkeypatch.setattr(trackers, "find_spec", lambda name: object())
+    monkeypatch.setattr("qgs.engine.tracking.find_spec", lambda name: object())
     for _ in range(2):
         tracking = Trackers(("wandb",))
         tracking.open(tmp_path / "run", tiny("locus"))
@@ -105,3 +103,40 @@ def test_wandb_continues_one_run(
     ((images,), step) = wandb.told[3][1][0].values(), wandb.told[3][1][1]
     assert np.array_equal(images[0], picture())
     assert step == 3
+
+
+def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:
+    """The lines for (step, images, seconds, used), each shown."""
+    monkeypatch.setattr("qgs.engine.tracking._LOG_SECONDS", 0.0)
+    told = io.StringIO()
+    console = Console(width=200, file=told)
+    with TrainingProgress(console) as bar:
+        for step, images, seconds, used in steps:
+            assert bar.update(step, 0.1, 20.0, images, seconds, used)
+    return [line for line in told.getvalue().splitlines() if line]
+
+
+def left(line: str) -> str:
+    found = re.search(r"(\S+) left", line)
+    assert found
+    return found[1]
+
+
+def test_the_first_step_has_no_speed_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = shown(monkeypatch, (1, 8, 0.0, 0.01))
+    assert left(line) == "?"
+    assert "0 images/s" in line
+
+
+def test_time_left_is_what_the_rest_takes_at_this_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    *_, line = shown(monkeypatch, (1, 8, 0.0, 0.01), (26, 208, 100.0, 0.26))
+    assert left(line) == "0:04:56", "0.74 of the budget, 100 s for each 0.25"
+    assert "2 images/s" in line
+
+
+def test_a_resumed_run_counts_from_where_it_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow_before = 10_000.0
+    first, second = (501, 4008, slow_before, 0.501), (601, 4808, slow_before + 10, 0.601)
+    *_, line = shown(monkeypatch, first, second)
+    assert left(line) == "0:00:40"
+    assert "80 images/s" in line

@@ -1,0 +1,35 @@
+"""Scenes made of numbers, and a source of them, for tests of data."""
+
+import torch
+
+from qgs.contracts import Scene, SceneSource, SceneSourceConfig
+from qgs.types import Cameras
+
+
+class Line(Scene):
+    """Cameras along a line; frame f is an image of the value f / 100, brighter to the right."""
+
+    def __init__(self, count: int, held_out=(), step: float = 0.5, name: str = "") -> None:
+        self.name = name or f"line{count}"
+        self.held_out, self.count, self.step = held_out, count, step
+
+    @property
+    def cameras(self) -> Cameras:
+        c2w = torch.eye(4).repeat(self.count, 1, 1)
+        c2w[:, 0, 3] = self.step * torch.arange(self.count) + 3
+        return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
+
+    def images(self, frames):
+        value = torch.tensor(list(frames)).float() / 100
+        return value[:, None, None, None] + torch.arange(8) / 1000 + torch.zeros(3, 8, 1)
+
+
+class Lines(SceneSource):
+    name = "lines"
+
+    def __init__(self, *scenes: Scene) -> None:
+        super().__init__(SceneSourceConfig(image_size=(8, 8)))
+        self._scenes = scenes
+
+    def scenes(self, split):
+        return self._scenes
