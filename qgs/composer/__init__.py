@@ -27,8 +27,7 @@ def compose(
 ) -> QueryGaussianModel:
     """The model that a recipe describes, with its initial parameters.
 
-    recipe: path of a YAML file, or a mapping of the same form. overrides: such as
-        "model.queries.count=128". device: where to put it; "meta" allocates nothing.
+    recipe, overrides: as `resolve` takes them. device: where to put it; "meta" allocates nothing.
     The same recipe gives the same parameters, and the global random state stays as it was.
     Raises RecipeError, a ValueError, with every problem of the recipe.
     """

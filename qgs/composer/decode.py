@@ -141,10 +141,7 @@ def decode_config(
 
 
 def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[str, str]:
-    """Reason and fix: pydantic's message, or a better one where we know more than pydantic.
-
-    given: the offending value. config: the class that refused it.
-    """
+    """Reason and fix: pydantic's message, or a better one where we know more than pydantic."""
     kind, context = error["type"], error.get("ctx", {})
     cause = context.get("error")
     option = str(error["loc"][-1]) if error["loc"] else ""
@@ -172,10 +169,7 @@ def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[
 
 
 def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[str]:
-    """Options of the (nested) config that has no option `loc[-1]`.
-
-    A step of `loc` may be the tag of a union of configs, which chooses among its members.
-    """
+    """Options of the (nested) config that lacks `loc[-1]`; a step may be the tag of a union."""
     models: set[type[BaseModel]] = {config}
     for step in loc[:-1]:
         fields = [(name, field, m) for m in models for name, field in m.model_fields.items()]

@@ -107,10 +107,9 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
 
 
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, int | None]]:
-    """Every component's turn in a training step, and the layer that is being decoded.
+    """Every component's turn in a training step, and the layer that is decoded, else None.
 
-    The layer is None while the decoder runs. A decoded layer has a branch of its own: what its
-    head writes is not there for the decoder.
+    A decoded layer has a branch of its own: what its head writes is not there for the decoder.
     """
     decoded, chosen = {depth}, parts["model", "supervision"]
     if chosen is not None:
@@ -130,10 +129,7 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, 
 def _unmet(
     missing: Fields, reader: Chosen, fixes: Mapping[str, Chosen | None], after: Sequence[Chosen]
 ) -> tuple[str, str]:
-    """Reason and fix where nothing before `reader` provides what it needs.
-
-    fixes: changes that would help, and the component that each would change or replace.
-    """
+    """Reason and fix where nothing before `reader` provides what it needs; fixes: see `_fixes`."""
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
     reason = f"`{reader.type}` needs {named}, which nothing before it provides"
     for other in {other.path: other for other in fixes.values() if other}.values():

@@ -16,8 +16,8 @@ from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, Slot, slot_at
 class Place:
     """A place and what is written there.
 
-    path: the place, decoder layers numbered. source: where a user would look for it: the decoder's
-    template, a layer's override, or a swap. node: None where nothing is written.
+    path: the place, decoder layers numbered. source: where a user finds it: the template, a layer's
+    override, or a swap. node: None where nothing is written.
     """
 
     path: KeyPath
@@ -96,12 +96,11 @@ def apply_swaps(
             reason = f"the pattern `{pattern}` matches no place"
             problems.add(origin, name, reason, _near_pattern(pattern, swappable))
         for path in hits:
-            conflict = _conflict(result[path])
-            if conflict:
+            if conflict := _conflict(result[path]):
                 problems.add(origin, name, *conflict)
                 break
-            swap = ("swap", pattern)
-            result[path] = replace(places[path], source=swap, node=node, origin=origin)
+            source = ("swap", pattern)
+            result[path] = replace(places[path], source=source, node=node, origin=origin)
     return result
 
 
@@ -131,8 +130,7 @@ def _near_pattern(pattern: str, swappable: Iterable[KeyPath]) -> str:
         if "layers" in parts:
             places.append(".".join((*parts[:2], "*", *parts[3:])))
         places.append(".".join(parts))
-    near = nearest(pattern.removeprefix("model."), places)
-    if near:
+    if near := nearest(pattern.removeprefix("model."), places):
         return f"did you mean `{near}`?"
     starred = dict.fromkeys(name for name in places if "*" in name or "layers" not in name)
     return f"places: {', '.join(starred)}"

@@ -78,7 +78,7 @@ def resolve(
     """Read, merge and check a recipe.
 
     recipe: path of a YAML file, or a mapping of the same form, whose `extends` is relative to the
-        working directory. overrides: `a.b=value`, laid over it in order.
+        working directory. overrides: such as "model.queries.count=128", laid over it in order.
     plugins: what it may name besides the installed plugins, such as one under test.
     Raises RecipeError with every problem that was found.
     """

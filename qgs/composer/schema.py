@@ -18,8 +18,7 @@ _NULL = {"type": "null"}
 def recipe_schema(registry: Registry) -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of recipes that use the plugins of `registry`.
 
-    Nothing is required: an overlay may leave everything to what it extends. A component without a
-    `type` may have the options of any component of its slot.
+    Nothing is required, as in overlays; without a `type` the options of all its slot may stand.
     """
     layer = {name: _component(name) for name in LAYER_SLOTS}
     layers = {

@@ -58,7 +58,7 @@ class Stateful(Protocol):
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state file: the recipe of its run, and the states of parts by name."""
+    """A state file: the recipe of its run, and the states of its parts."""
 
     recipe: Recipe
     parts: Mapping[str, State]
@@ -67,10 +67,7 @@ class SavedState:
 def write_state(
     path: str | os.PathLike[str], recipe: Mapping[str, Any], parts: Mapping[str, State]
 ) -> None:
-    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree.
-
-    Raises OSError when the disk is full.
-    """
+    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, dict[str, Any]] = {}
     for part, state in parts.items():
@@ -88,10 +85,7 @@ def write_state(
 
 
 def read_state(path: str | os.PathLike[str]) -> SavedState:
-    """What `write_state` wrote.
-
-    Raises FileNotFoundError, CheckpointError, and the composer's error when a plugin is missing.
-    """
+    """What `write_state` wrote; raises FileNotFoundError, CheckpointError, RecipeError."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no training state at {path}")
     with opened_tensors(path) as file:
@@ -114,37 +108,28 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
 class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
-    parts: everything that continues the run, by name; "weights", and "ema" if there is one, are
-        also what checkpoints are written from.
-    Each file appears whole or not at all, and the state is complete by itself. It comes last: what
-    is in it has reached the other files. All processes must call each method together.
+    parts: everything that continues the run, by name; checkpoints hold "weights" and "ema".
+    Each file appears whole or not at all; the state, complete by itself, comes last. All processes
+    must call each method together.
     """
 
     def __init__(
         self, accelerator: Accelerator, folder: RunFolder, model: QueryGaussianModel
     ) -> None:
-        self.folder = folder
-        self.model = model
+        self._accelerator, self.folder, self.model = accelerator, folder, model
         self.parts: dict[str, Stateful] = {"weights": Weights(model)}
-        self._accelerator = accelerator
 
-    def save(self, step: int) -> None:
-        """Save the run after `step` optimiser steps."""
-        parts = self._states()
+    def save(self, step: int, state_only: bool = False) -> None:
+        """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
+        parts = {name: part.state() for name, part in self.parts.items()}
         if self._accelerator.is_main_process:
-            if not self.folder.state.exists():
-                self._write_state(parts)  # a checkpoint alone is a run that cannot be continued
-            extra = {"step": str(step)}
-            save(self.model, self.folder.checkpoint, extra=extra, weights=parts["weights"])
-            if "ema" in parts:
-                save(self.model, self.folder.checkpoint_ema, extra=extra, weights=parts["ema"])
-            self._write_state(parts)
-        self._accelerator.wait_for_everyone()
-
-    def save_state(self) -> None:
-        """Save what continues the run, and leave the checkpoint."""
-        parts = self._states()
-        if self._accelerator.is_main_process:
+            if not state_only:
+                if not self.folder.state.exists():
+                    self._write_state(parts)  # a checkpoint alone cannot be continued
+                extra = {"step": str(step)}
+                save(self.model, self.folder.checkpoint, extra=extra, weights=parts["weights"])
+                if "ema" in parts:
+                    save(self.model, self.folder.checkpoint_ema, extra=extra, weights=parts["ema"])
             self._write_state(parts)
         self._accelerator.wait_for_everyone()
 
@@ -164,10 +149,7 @@ class Saver:
         return copy.to(self._accelerator.device)
 
     def restore(self, saved: SavedState) -> None:
-        """Bring every part back to where `saved` was taken.
-
-        Raises CheckpointError, and what parts raise.
-        """
+        """Bring every part back to where `saved` was taken; raises CheckpointError."""
         missing = [name for name in self.parts if name not in saved.parts]
         if missing:
             raise CheckpointError(
@@ -176,9 +158,6 @@ class Saver:
             )
         for name, part in self.parts.items():
             part.load_state(saved.parts[name])
-
-    def _states(self) -> dict[str, State]:
-        return {name: part.state() for name, part in self.parts.items()}
 
     def _write_state(self, parts: Mapping[str, State]) -> None:
         self.folder.flush(to_disk=True)
@@ -296,24 +275,23 @@ watch, where data lies and what is reported, not what is learnt. `training.batch
 `training.accumulate` may change too, as long as a step sees as many samples over all processes.
 """
 
-_COUNTED = ("training.batch_size", "training.accumulate")
-
 
 class OtherRunError(ValueError):
     """A run cannot be continued with this recipe, these processes or this data."""
 
 
 def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
-    """The state from which the run in `folder` continues with `recipe`; None to start it.
+    """The state from which the run in `folder` continues; None to start it, again if it was killed.
 
-    A run that was killed before it first saved starts again. Raises OtherRunError unless `recipe`
-    equals the run's outside of FREE, CheckpointError when the state cannot be read.
+    Raises OtherRunError unless `recipe` equals the run's outside of FREE, CheckpointError when the
+    state cannot be read.
     """
     if folder.is_new:
         return None
     saved = read_state(folder.state) if folder.state.is_file() else None
     ours, theirs = flat(recipe.tree), flat((saved.recipe if saved else resolve(folder.recipe)).tree)
-    may_change = tuple(f"{key}." for key in (*FREE, *_COUNTED))
+    counted = ("training.batch_size", "training.accumulate")
+    may_change = tuple(f"{key}." for key in (*FREE, *counted))
     differing = [
         f"{key}: {ours.get(key, 'absent')} here, {theirs.get(key, 'absent')} in the run"
         for key in dict.fromkeys([*ours, *theirs])
@@ -332,8 +310,7 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
 def refuse_other_data(saved: State, now: State, folder: RunFolder) -> None:
     """Raise OtherRunError unless steps see the same data in number and order as before.
 
-    saved, now: "step_size", samples of an optimiser step over all processes, and "scenes", see
-    `qgs.data.stream.scenes_fingerprint`.
+    saved, now: "step_size", samples of a step over all processes; "scenes", `scenes_fingerprint`.
     """
     if saved["step_size"] != now["step_size"]:
         raise OtherRunError(
@@ -352,15 +329,14 @@ _QUERIES = "queries."
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
-    """Give `model`, freshly built from `recipe`, the weights that `recipe.init_from` names.
+    """Give `model`, freshly built from `recipe`, the weights that `recipe.init_from` names, if any.
 
-    `init_from` is a checkpoint or the folder of a run, relative to the working directory; without
-    it the model stays as it is. Queries grow or shrink by their own rule (`Queries.resized`) with
-    random numbers of the recipe's seed; everything else must have the same names and shapes.
+    `init_from` is a checkpoint or the folder of a run, relative to the working directory. Queries
+    grow or shrink by their own rule (`Queries.resized`) with random numbers of the recipe's seed;
+    everything else must have the same names and shapes.
 
     Returns what was done, line by line, with the options that make the same weights predict other
-    Gaussians than where they were learned. Raises FileNotFoundError, and CheckpointError with every
-    difference and with the options that would fit.
+    Gaussians. Raises FileNotFoundError, CheckpointError with every difference and what would fit.
     """
     if recipe.init_from is None:
         return []

@@ -28,10 +28,7 @@ NCCL would end such runs. A process that died is noticed by the launcher, which 
 
 
 def make_accelerator(device: str) -> Accelerator:
-    """The processes that `accelerate launch` or `torchrun` started, or this one alone.
-
-    device: "cpu" or "cuda". Autocast is the trainer's own, so no mixed precision is asked for.
-    """
+    """The processes that a launcher started, or this one alone; autocast is the trainer's own."""
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
     return Accelerator(cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[group])
 
@@ -45,8 +42,7 @@ def wants_shards(accelerator: Accelerator) -> bool:
 def shard(model: QueryGaussianModel) -> None:
     """Lay the parameters of `model` in shards over all processes (FSDP2), in place.
 
-    Each decoder layer gathers its weights when it runs; the rest is gathered for the whole pass.
-    Parameters without a dimension to cut stay whole on every process, see `average_gradients`.
+    Each decoder layer gathers its own when it runs. Scalars stay whole, see `average_gradients`.
     """
     scalars = {parameter for parameter in model.parameters() if parameter.ndim == 0}
     for layer in model.decoder:
@@ -110,11 +106,9 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
-    """ "cpu" or "cuda" for one of DEVICES.
+    """ "cpu" or "cuda" for one of DEVICES; raises ValueError for others, or for "cuda" without one.
 
-    "auto" takes CUDA when there is such a device and gsplat, the renderer for it, is installed;
-    where only gsplat is missing, `say` is told. Raises ValueError for another name, or for "cuda"
-    without such a device.
+    "auto" takes CUDA where there is one and gsplat is installed; `say` is told of a missing gsplat.
     """
     if wanted not in DEVICES:
         raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
@@ -154,9 +148,8 @@ class StopRequest:
 def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
     """Turn the first SIGINT or SIGTERM inside the block into a request, and say so unless `quiet`.
 
-    Launchers (torchrun, Slurm) send their signals more than once, so that later ones are ignored;
-    only a second SIGINT, PAUSE seconds or more after the first, raises KeyboardInterrupt.
-    Outside the main thread, where Python delivers no signals, requests never come.
+    Launchers repeat their signals, so later ones are ignored; only a second SIGINT, PAUSE seconds
+    or more after the first, raises KeyboardInterrupt. Outside the main thread none ever comes.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
@@ -172,11 +165,9 @@ def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
             gives_up_at = min(gives_up_at, time.monotonic() + PAUSE)
         if not request:
             request.signal = signal.Signals(number)
-            message = (
-                f"\n{request.signal.name}: finishing the step, saving; Ctrl-C again to give up\n"
-            )
+            told = f"{request.signal.name}: finishing the step, saving; Ctrl-C again to give up"
             if not quiet:  # not by print, which must not be entered twice
-                os.write(2, message.encode())
+                os.write(2, f"\n{told}\n".encode())
 
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -17,9 +17,8 @@ from qgs.io.files import is_leftover, read_records, write_text
 class RunFolder:
     """The files of a run, whether they exist yet or not.
 
-    recipe: resolved, as YAML. checkpoint: the latest good weights, for users. checkpoint_ema: their
-    moving average, where a recipe asks for it. state: everything that continues the run.
-    evaluation: the folder where `qgs eval` writes.
+    checkpoint: the latest good weights; checkpoint_ema: their moving average, where a recipe asks
+    for it; state: everything that continues the run; evaluation: where `qgs eval` writes.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -39,10 +38,7 @@ class RunFolder:
         return not self.path.is_dir() or all(map(is_leftover, self.path.iterdir()))
 
     def refuse_other(self, resume: bool) -> None:
-        """Raise FileExistsError unless the path is new or, with `resume`, holds a run of its own.
-
-        A run whose state was not saved yet is one to be started again.
-        """
+        """Raise FileExistsError unless the path is new or, with `resume`, holds a run."""
         if self.path.is_file():
             raise FileExistsError(f"{self.path} is a file; choose another folder for this run")
         if self.is_new or (resume and self.state.is_file()):
@@ -69,7 +65,17 @@ class RunFolder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         if self._lock is None:
-            self._lock = _locked(self.path)
+            self._lock = os.open(self.path, os.O_RDONLY)
+            try:  # the system takes the lock off a dead process
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                self.close()
+                raise FileExistsError(
+                    f"another process is training in {self.path}; wait for its end, or choose "
+                    "another folder"
+                ) from None
+            except OSError:
+                self.close()  # this file system knows no locks
         for leftover in filter(is_leftover, self.path.iterdir()):
             leftover.unlink()
 
@@ -91,10 +97,7 @@ class RunFolder:
                 os.fsync(self._history.fileno())
 
     def history(self) -> list[dict[str, float]]:
-        """All records so far, one per optimiser step.
-
-        A step that was left out is `skipped`, and tells only those of its numbers that are finite.
-        """
+        """All records so far, one per optimiser step; of one left out, finite numbers."""
         self.flush()
         return read_records(self._history_file)
 
@@ -114,32 +117,10 @@ class RunFolder:
 
 
 def checkpoint_of(path: str | Path) -> Path:
-    """The checkpoint file that `path`, a run folder or the file itself, stands for.
-
-    Raises FileNotFoundError.
-    """
+    """The checkpoint of `path`, a run folder or the file itself; raises FileNotFoundError."""
     file = RunFolder(path).checkpoint if Path(path).is_dir() else Path(path)
     if not file.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {file}; give a run folder of `qgs train` or a .safetensors file"
         )
     return file
-
-
-def _locked(folder: Path) -> int | None:
-    """A descriptor of `folder` that keeps others out; the system takes the lock off a dead process.
-
-    None where the file system knows no locks. Raises FileExistsError.
-    """
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(number)
-        if isinstance(error, BlockingIOError):
-            raise FileExistsError(
-                f"another process is training in {folder}; wait for its end, or choose another "
-                "folder"
-            ) from None
-        return None
-    return number

@@ -76,9 +76,8 @@ class Guard:
     """Stops a run that is dead or not finite, and sees that good weights are kept.
 
     All processes must call each of its methods together; `step` counts finished optimiser steps.
-    A step that is not finite leaves RUN/incidents/step-N with batch.safetensors (of another process
-    than the main one batch-RANK.safetensors, where it found something), weights.safetensors, which
-    `qgs.load` reads, and report.json.
+    A step that is not finite leaves RUN/incidents/step-N with batch.safetensors (and another
+    process's batch-RANK.safetensors), weights.safetensors, for `qgs.load`, and report.json.
 
     incidents: steps that were not finite. skipped: how many of them came last, without a good one.
     """
@@ -91,10 +90,7 @@ class Guard:
         config: TrainingConfig,
         repeat: Callable[[Sequence[Batch]], Any],
     ) -> None:
-        """objective: as it was before `Accelerator.prepare` wrapped it.
-
-        repeat: computes the gradients of batches again.
-        """
+        """objective: not wrapped by accelerate. repeat: computes the gradients of batches again."""
         self.detector = CollapseDetector(config.collapse_window)
         self.good = GoodWeights(objective.model, keep=accelerator.is_main_process)
         self.incidents = self.skipped = 0
@@ -120,8 +116,7 @@ class Guard:
     def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
         """Look into the step after `step`, which is not finite; return to go on without it.
 
-        Raises NonFiniteError, the run then being saved as it was before that step, and
-        CollapseError when the model is already lost.
+        Raises NonFiniteError, the run saved as before that step, or CollapseError.
         """
         found, in_data = self.look_into(step + 1, batches, symptom)
         if self._skips and self.skipped <= MAX_SKIPPED:
@@ -145,9 +140,8 @@ class Guard:
         raise NonFiniteError(f"step {step + 1} is not finite{first}.\n{second}")
 
     def look_into(self, step: int, batches: Sequence[Batch], symptom: str) -> tuple[str, bool]:
-        """Find the first bad tensor of a step and save what it takes to see it again.
+        """Repeat a step to find its first bad tensor; save what it takes to see it again.
 
-        symptom: what the step showed. Gradients are those of the repeated step afterwards.
         Returns what was found, in words, and whether it came with the images and cameras of a
         batch, and so from nothing that the model did.
         """
@@ -189,8 +183,8 @@ class Guard:
     def save_to_go_on(self, step: int) -> None:
         """Save the run as one that may go on; a dead model's checkpoint is the last good one."""
         if self.detector.dead_after(step):
-            self._save_good()
-            self._saver.save_state()
+            self._saver.save_checkpoint(self.good.step, self.good.tensors)
+            self._saver.save(step, state_only=True)
         else:
             self.save(step)
 
@@ -205,15 +199,11 @@ class Guard:
         self.save_to_go_on(step)
 
     def _refuse_broken_weights(self, step: int) -> None:
-        problem = broken_tensors(self._saver.model)
-        if problem:
+        if problem := broken_tensors(self._saver.model):
             self._collapse(step, problem, NONFINITE_CAUSES)
 
-    def _save_good(self) -> None:
-        self._saver.save_checkpoint(self.good.step, self.good.tensors)
-
     def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
-        self._save_good()
+        self._saver.save_checkpoint(self.good.step, self.good.tensors)
         raise CollapseError(
             f"training collapsed at step {step}: {problem}. The weights of step {self.good.step} "
             f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
@@ -258,7 +248,13 @@ class CollapseDetector:
 
     def observe(self, numbers: Mapping[str, float]) -> None:
         """Take note of a step: "alpha" and "deviation" of its renderings, "gradient" (norm)."""
-        self.symptom = self._symptom_of(numbers["alpha"], numbers["deviation"], numbers["gradient"])
+        self.symptom = ""
+        if numbers["alpha"] < EMPTY_ALPHA:
+            self.symptom = f"the renderings are empty (mean alpha {numbers['alpha']:.1e})"
+        elif numbers["gradient"] < NO_GRADIENT:
+            self.symptom = f"the gradient has vanished (norm {numbers['gradient']:.1e})"
+        elif self._has_drawn and numbers["deviation"] < FLAT:
+            self.symptom = "the renderings equal the background"
         self.dead_steps = self.dead_steps + 1 if self.symptom else 0
         self._has_drawn |= numbers["deviation"] > 8 * FLAT
 
@@ -280,28 +276,18 @@ class CollapseDetector:
         self.dead_steps, self.symptom = state["dead"], state["symptom"]
         self._has_drawn = state["has_drawn"]
 
-    def _symptom_of(self, alpha: float, deviation: float, gradient: float) -> str:
-        if alpha < EMPTY_ALPHA:
-            return f"the renderings are empty (mean alpha {alpha:.1e})"
-        if gradient < NO_GRADIENT:
-            return f"the gradient has vanished (norm {gradient:.1e})"
-        if self._has_drawn and deviation < FLAT:
-            return "the renderings equal the background"
-        return ""
-
 
 class GoodWeights:
     """Copies in host memory of the weights at the last two times that the model was healthy.
 
     A collapse is noticed late, and the newer copy may already be on its way down; the older one,
-    `step` and `tensors`, is at least a window away.
+    `tensors` after `step` optimiser steps, is at least a window away.
 
     keep: whether this process holds the copies; one of several suffices.
     """
 
     def __init__(self, model: nn.Module, keep: bool = True) -> None:
-        self._weights = Weights(model)
-        self._keep = keep
+        self._weights, self._keep = Weights(model), keep
         self._copies: list[tuple[int, dict[str, Tensor]]] = []
         self.refresh(0)
 
@@ -310,16 +296,7 @@ class GoodWeights:
         present = self._weights.state()
         copy = {n: t.to("cpu", copy=True) for n, t in present.items()} if self._keep else {}
         self._copies = [*self._copies, (step, copy)][-2:]
-
-    @property
-    def step(self) -> int:
-        """Optimiser steps behind `tensors`."""
-        return self._copies[0][0]
-
-    @property
-    def tensors(self) -> Mapping[str, Tensor]:
-        """Weights as `qgs.io.checkpoint.save` takes them."""
-        return self._copies[0][1]
+        self.step, self.tensors = self._copies[0]
 
     def state(self) -> dict[str, Any]:
         """See `qgs.engine.checkpoint.Stateful`."""
@@ -330,9 +307,10 @@ class GoodWeights:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """See `qgs.engine.checkpoint.Stateful`."""
         self._copies = [
-            (step, {name: state[f"{i}/{name}"] for name in self._copies[0][1]})
+            (step, {name: state[f"{i}/{name}"] for name in self.tensors})
             for i, step in enumerate(state["steps"])
         ]
+        self.step, self.tensors = self._copies[0]
 
 
 def broken_tensors(model: nn.Module) -> str:
@@ -342,19 +320,13 @@ def broken_tensors(model: nn.Module) -> str:
 
 
 def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
-    """What is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is.
-
-    numbers: of the step; "gradient" is the norm of the gradients that parameters of `module` have.
-    """
+    """What is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is."""
     terms = {name: n for name, n in numbers.items() if name not in ("gradient", "psnr")}
     bad = [f"loss term {name} is {n}" for name, n in terms.items() if not math.isfinite(n)]
     if bad or math.isfinite(numbers["gradient"]):
         return ", ".join(bad)
-    names = [
-        name
-        for name, parameter in module.named_parameters()
-        if parameter.grad is not None and not torch.isfinite(parameter.grad).all()
-    ]
+    gradients = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
+    names = [name for name, gradient in gradients.items() if not torch.isfinite(gradient).all()]
     origin = f", from {_first_names(names)}" if names else ""
     return f"the gradient norm is {numbers['gradient']}{origin}"
 
@@ -391,11 +363,7 @@ class Finding(NamedTuple):
 
 
 class Watch:
-    """Notes the first tensor that is not finite, in the order in which a step computes.
-
-    Weights, images and cameras, outputs of modules; then layer by layer the prediction, renderings,
-    loss terms and gradients of the Gaussians; then gradients of modules and parameters, backwards.
-    """
+    """Notes the first tensor that is not finite, in the order in which a step computes."""
 
     def __init__(self) -> None:
         self.first: Finding | None = None
@@ -405,10 +373,7 @@ class Watch:
     def see(self, name: str, value: Any) -> None:
         """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
         for path, tensor in named_tensors(value, name):
-            if self.first:
-                return
-            bad = nonfinite_values(tensor)
-            if bad:
+            if not self.first and (bad := nonfinite_values(tensor)):
                 self.first = Finding(path, bad, max(self._batch, 0))
 
     @contextmanager
@@ -440,9 +405,8 @@ class Watch:
     def _see_output(self, name: str, module: nn.Module, arguments: Any, output: Any) -> None:
         self._calls[name] += 1
         call = f" (call {self._calls[name]})" if self._calls[name] > 1 else ""
-        what = f"output{call} of {name}"
-        self.see(what, output)
-        for path, tensor in named_tensors(output, f"gradient of the {what}"):
+        self.see(f"output{call} of {name}", output)
+        for path, tensor in named_tensors(output, f"gradient of the output{call} of {name}"):
             if tensor.requires_grad:
                 tensor.register_hook(partial(self.see, path))
 

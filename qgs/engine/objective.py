@@ -42,8 +42,8 @@ class Objective(nn.Module):
     The forward pass takes the losses' gradients with respect to the Gaussians too, one layer and
     `render_views` target views at a time (0: all views), and frees each part's graph before it
     makes the next; the backward pass leads their sums into the network. Memory thus grows neither
-    with the supervised layers nor with the target views, and no gradient depends on `render_views`.
-    Where a loss needs all renderings at once, only the renderer's graphs are made in parts.
+    with layers nor with views. Where a loss needs all renderings at once, only the renderer's
+    graphs are made in parts.
 
     hook: called with the name and the value (tensors, or a nest of them) of what is computed.
     """
@@ -87,7 +87,12 @@ class Objective(nn.Module):
             self.hook(f"gradient of layer {number}", layer.gradients)
             total = total + layer.total()
             _add(layer.terms, terms)
-        return Outcome(total, terms, _signs_of_all(signs))
+        mean = {
+            name: torch.stack([share * found[name] for share, found in signs]).sum()
+            for name in ("psnr", "alpha")
+        }
+        deviation = torch.stack([found["deviation"] for _, found in signs]).amax()
+        return Outcome(total, terms, {**mean, "deviation": deviation})
 
     def _parts(self, targets: Views) -> list[Views]:
         """The target views as the losses take them."""
@@ -135,9 +140,6 @@ class Objective(nn.Module):
 
 class DetachedLayer:
     """A copy of what a layer predicts, cut off the network, and the gradients of its losses.
-
-    A loss frees its graph as soon as it is added, so memory does not grow with their number;
-    `total` then leads the sums into the network, which needs one backward pass for all of them.
 
     gradients: the sums so far, by name, without those of tensors that no loss reads. terms: the
     sums of the losses' terms, detached.
@@ -193,15 +195,6 @@ def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Ten
     """
     deviation = (rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return alpha.mean(), deviation.amax()
-
-
-def _signs_of_all(parts: list[tuple[float, dict[str, Tensor]]]) -> dict[str, Tensor]:
-    """The signs of all views from those of their parts, each with its share of the views."""
-    means = {
-        name: torch.stack([share * signs[name] for share, signs in parts]).sum()
-        for name in ("psnr", "alpha")
-    }
-    return means | {"deviation": torch.stack([s["deviation"] for _, s in parts]).amax()}
 
 
 def _slices(cameras: Cameras, step: int) -> list[slice]:

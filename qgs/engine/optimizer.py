@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from typing import Any
@@ -36,8 +36,7 @@ def make_optimizer(module: nn.Module, optimizer: Optimizer) -> torch.optim.Optim
 def rate_factors(module: nn.Module, parts: Mapping[str, float]) -> dict[str, float]:
     """Factor of the learning rate for every parameter of `module`, by name; 1 where none is given.
 
-    parts: see `OptimizerConfig`; parameters go by their names in the model (`encoder.norm.weight`),
-    those of losses start with `losses.`, a shared one goes by its first name. Raises ValueError.
+    parts: see `OptimizerConfig`; a shared parameter goes by its first name. Raises ValueError.
     """
     factors = {name: 1.0 for name, _ in module.named_parameters()}
     for pattern, factor in parts.items():
@@ -48,21 +47,16 @@ def rate_factors(module: nn.Module, parts: Mapping[str, float]) -> dict[str, flo
             if len(wanted) <= len(steps) and all(map(fnmatchcase, steps, wanted)):
                 factors[name], matched = factor, True
         if not matched:
+            parts = [name.removeprefix("model.").split(".") for name in factors]
+            starred = [["*" if step.isdigit() else step for step in part] for part in parts]
+            known = {".".join(part[: len(wanted)]) for part in parts + starred}
+            near = nearest(".".join(wanted), known)
+            outermost = ", ".join(dict.fromkeys(part[0] for part in parts))
             raise ValueError(
                 f"optimizer.parts: the pattern `{pattern}` matches no parameter of the model; "
-                + _existing_parts(wanted, factors)
+                + (f"did you mean `{near}`?" if near else f"its parts: {outermost}")
             )
     return factors
-
-
-def _existing_parts(wanted: list[str], names: Iterable[str]) -> str:
-    """The part that a pattern, in segments, was probably meant to name; else the outermost ones."""
-    parts = [name.removeprefix("model.").split(".") for name in names]
-    starred = [["*" if step.isdigit() else step for step in part] for part in parts]
-    near = nearest(".".join(wanted), {".".join(part[: len(wanted)]) for part in parts + starred})
-    return (
-        f"did you mean `{near}`?" if near else f"its parts: {', '.join({p[0]: 0 for p in parts})}"
-    )
 
 
 def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[ParameterGroup]:
@@ -75,39 +69,32 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
     groups: dict[Any, ParameterGroup] = {}
     components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
     for name, parameter in module.named_parameters():
-        if parameter.requires_grad:
-            factor, decays = factors[name], _decays(name, parameter, components)
-            key = (not decays, isinstance(parameter, DTensor), factor)
-            empty = ParameterGroup(params=[], decays=decays, factor=factor)
-            groups.setdefault(key, empty)["params"].append(parameter)
+        if not parameter.requires_grad:
+            continue
+        owners = [prefix for prefix in components if name.startswith(f"{prefix}.") or not prefix]
+        factor, decays = factors[name], parameter.ndim != 1
+        if owners:
+            innermost = max(owners, key=len)
+            inner_name = name.removeprefix(innermost).removeprefix(".")
+            decays = components[innermost].decays(inner_name, parameter)
+        key = (not decays, isinstance(parameter, DTensor), factor)
+        empty = ParameterGroup(params=[], decays=decays, factor=factor)
+        groups.setdefault(key, empty)["params"].append(parameter)
     return [groups[key] for key in sorted(groups)]
-
-
-def _decays(name: str, parameter: nn.Parameter, components: Mapping[str, ModelComponent]) -> bool:
-    owners = [prefix for prefix in components if name.startswith(f"{prefix}.") or not prefix]
-    if not owners:
-        return parameter.ndim != 1
-    innermost = max(owners, key=len)
-    inner_name = name.removeprefix(innermost).removeprefix(".")
-    return components[innermost].decays(inner_name, parameter)
 
 
 class MovingAverage:
     """float32 copies of the weights of `model`, which `update` moves towards the present ones.
 
-    After each optimiser step: average = decay * average + (1 - decay) * weights, from the initial
-    weights on. Buffers and integers are taken as they are.
+    average = decay * average + (1 - decay) * weights; buffers are taken as they are.
     """
 
     def __init__(self, model: nn.Module, decay: float) -> None:
-        self._model = model
-        self._decay = decay
-        self._averages = {
-            name: tensor.detach().clone().float()
-            if isinstance(tensor, nn.Parameter)
-            else tensor.detach().clone()
-            for name, tensor in unique_tensors(model).items()
-        }
+        self._model, self._decay = model, decay
+        self._averages: dict[str, Tensor] = {}
+        for name, tensor in unique_tensors(model).items():
+            copy = tensor.detach().clone()
+            self._averages[name] = copy.float() if isinstance(tensor, nn.Parameter) else copy
 
     @torch.no_grad()
     def update(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -99,8 +98,17 @@ class PeriodicEvaluation:
             with self._average.applied():
                 records.append(self._record("ema", step))
         picture = self._picture()
-        if self._accelerator.is_main_process:
-            self._tell(records, picture, step)
+        if not self._accelerator.is_main_process:
+            return
+        place = self._folder / "evaluations.jsonl"
+        # Records of this step and later ones, from before a resume, go.
+        kept = [record for record in read_records(place) if record["step"] < step]
+        write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
+        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
+        for record in records:
+            group, scores = f"evaluation/{record['weights']}", record["scores"]
+            self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
+        self._trackers.picture("evaluation", picture, step)
 
     def _between_scenes(self, done: int, wanted: int) -> None:
         """Raise _StoppedError when a stop was asked for, of any process where all take part."""
@@ -118,14 +126,6 @@ class PeriodicEvaluation:
             **{name: summary[name] for name in _COUNTS},
             "scores": {n: score for n, score in evaluation.means().items() if score is not None},
         }
-
-    def _tell(self, records: Sequence[Mapping[str, Any]], picture: Picture, step: int) -> None:
-        _append(self._folder / "evaluations.jsonl", records)
-        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
-        for record in records:
-            group, scores = f"evaluation/{record['weights']}", record["scores"]
-            self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
-        self._trackers.picture("evaluation", picture, step)
 
     @torch.no_grad()
     def _picture(self) -> Picture:
@@ -153,10 +153,3 @@ def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
     photos = [rgb_picture(image) for image in (*sample.inputs.images[0], target.images[0, 0])]
     depth = depth_picture(rendering.depth[0, 0], *depth_range(rendering.depth))
     return side_by_side([*photos, rgb_picture(rendering.rgb[0, 0]), depth], _GAP)
-
-
-def _append(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Add records of one step; those of that step and later ones, from before a resume, go."""
-    step = records[0]["step"]
-    kept = [record for record in read_records(path) if record["step"] < step]
-    write_text(path, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))

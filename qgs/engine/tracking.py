@@ -45,7 +45,10 @@ class Trackers:
         options = flat(recipe.tree).items()
         plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in options}
         for name in self._names:
-            tracker = _tensorboard(run, step) if name == "tensorboard" else _wandb(run)
+            if name == "tensorboard":
+                tracker = TensorBoardTracker(name, logging_dir=run, purge_step=step + 1)
+            else:
+                tracker = _wandb(run)
             tracker.start()
             tracker.store_init_configuration(plain)
             self._open.append(tracker)
@@ -68,10 +71,6 @@ class Trackers:
         for tracker in self._open:
             tracker.finish()
         self._open = []
-
-
-def _tensorboard(run: Path, step: int) -> TensorBoardTracker:
-    return TensorBoardTracker("tensorboard", logging_dir=run, purge_step=step + 1)
 
 
 def _wandb(run: Path) -> WandBTracker:
@@ -111,8 +110,8 @@ class TrainingProgress:
     ) -> bool:
         """Show a step, unless the last one was shown a moment ago; returns whether it did.
 
-        images, seconds: of the whole run so far. used: fraction of the budget. Speed and time left
-        are those of this session, which began with the first step that this is told.
+        images, seconds: of the whole run so far; what is shown is of this session. used: fraction
+        of the budget.
         """
         if self._start is None:
             self._start = images, seconds, used

@@ -7,8 +7,9 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from accelerate import Accelerator
@@ -16,7 +17,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.composer import Recipe
-from qgs.contracts import Optimizer, TrainingConfig
+from qgs.contracts import TrainingConfig
 from qgs.data.sampling import Batch
 from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
 from qgs.engine.checkpoint import (
@@ -54,9 +55,8 @@ from qgs.model import QueryGaussianModel
 class TrainingResult:
     """What a run left: the trained model, its folder, optimiser steps, seconds on the clock.
 
-    stopped_by: name of the signal that ended it early, else None; SIGTERM where another process got
-    the signal. main: whether this is the one process, of several, that writes files. resumed_at:
-    the step from which a run was continued, None for one that began here.
+    stopped_by: name of the signal that ended it early, else None. main: whether this process writes
+    the files. resumed_at: the step from which a run was continued, None for one that began here.
     """
 
     model: QueryGaussianModel
@@ -80,11 +80,11 @@ def train(
 
     Writes recipe.yaml, history.jsonl (one record per optimiser step), checkpoint.safetensors (the
     model) and state.safetensors (what continues the run): on schedule, at the end, and after SIGINT
-    or SIGTERM, which finish the step and return. A start that fails, for want of data for instance,
-    leaves no folder. Of several processes the main one writes; all of them must see `run`.
+    or SIGTERM, which finish the step and return. A start that fails leaves no folder. Of several
+    processes the main one writes; all of them must see `run`.
 
-    resume: continue the run in `run` from its state, as if it had never been interrupted, or start
-    it where there is none yet. A run whose budget is used is left as it is.
+    resume: continue the run in `run` as if it had never been interrupted, or start it where there
+    is none yet. A run whose budget is used is left as it is.
 
     Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
     as `choose_device`, `make_optimizer` and the optimiser, OtherRunError for another recipe or data
@@ -114,8 +114,6 @@ class Trainer:
 
     step, samples, seconds: optimiser steps, samples over all processes, and time spent so far, in
         all sessions. A session's clock starts after its first step, in which kernels compile.
-    resumed_at: the step from which this session continues the run, None if it begins it.
-    notes: what is to be said of the initial weights.
     """
 
     def __init__(
@@ -142,9 +140,15 @@ class Trainer:
         self.notes = [] if saved else initialise(self.model, recipe)
         objective = Objective(self.model, recipe.build_losses(), config.render_views)
         objective.to(self.accelerator.device)
-        self.objective, self.torch_optimizer = prepared(self.accelerator, objective, self.optimizer)
+        if wants_shards(self.accelerator):  # before the optimiser, whose moments lie in shards too
+            shard(self.model)
+        prepared: Any = objective, make_optimizer(objective, self.optimizer)
+        if not wants_shards(self.accelerator):
+            prepared = self.accelerator.prepare(*prepared)
+        self.objective, self.torch_optimizer = prepared
         self.average = MovingAverage(self.model, config.ema) if config.ema else None
         self.saver = Saver(self.accelerator, self.folder, self.model)
+        self._gradients = partial(compute_gradients, self.accelerator, self.objective, config)
         self.guard = Guard(self.accelerator, objective, self.saver, config, self._gradients)
         self.evaluations = PeriodicEvaluation(
             self.accelerator, recipe, self.model, self.average, self.folder.path, self.trackers
@@ -236,7 +240,12 @@ class Trainer:
             if asked_to_stop or evaluates:
                 stopped_by = self._stopped_by(stop)
             if no_data and self.used < 1 and not stopped_by:
-                self._end_without_data()
+                self.guard.save_to_go_on(self.step)
+                error = self.feed.error or SampleError(
+                    "another process of this training has no next batch; its own message tells why"
+                )
+                error.add_note(f"The run is saved at step {self.step}; continue with --resume")
+                raise error
         stopped_by = stopped_by or self._stopped_by(stop)
         self.guard.finish(self.step, stopped=stopped_by is not None)
         if self.average and not stopped_by and self.evaluations.latest != self.step:
@@ -264,26 +273,17 @@ class Trainer:
         """Stop reading ahead, close the history and leave the folder to others."""
         self._resources.close()
 
-    def _gradients(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
-        return compute_gradients(self.accelerator, self.objective, self.config, batches)
-
     def _means(
         self, measured: Mapping[str, Tensor], stop: StopRequest
     ) -> tuple[dict[str, float], bool, bool]:
-        """The numbers of a step, means over processes; the only synchronisation of a step.
-
-        Also whether any process was asked to stop, and whether any has no next batch.
-        """
+        """Means of a step's numbers over processes; whether any must stop, or has no next batch."""
         flags = torch.tensor([bool(stop), bool(self.feed.error)]).to(self.accelerator.device)
         values = torch.stack([value.float() for value in (*measured.values(), *flags)])
         *numbers, asked_to_stop, no_data = mean(self.accelerator, values).tolist()
         return dict(zip(measured, numbers, strict=True)), asked_to_stop > 0, no_data > 0
 
     def _open_folder(self) -> None:
-        """Make the folder, once, write the recipe, and drop records of steps that were lost.
-
-        Raises FileExistsError.
-        """
+        """Make the folder, once, write the recipe, and drop records of steps that were lost."""
         if self._folder_is_open:
             return
         self._folder_is_open = True
@@ -329,15 +329,6 @@ class Trainer:
         name = stop.signal.name if stop.signal else "SIGTERM"
         return name if float(asked) else None
 
-    def _end_without_data(self) -> NoReturn:
-        """Save the run and raise what kept this process, or another one, from its next batch."""
-        self.guard.save_to_go_on(self.step)
-        error = self.feed.error or SampleError(
-            "another process of this training has no next batch; its own message tells why"
-        )
-        error.add_note(f"The run is saved at step {self.step}; continue with --resume")
-        raise error
-
     def _result(self, stopped_by: str | None) -> TrainingResult:
         return TrainingResult(
             self.saver.whole_model().eval(),
@@ -350,30 +341,12 @@ class Trainer:
         )
 
 
-def prepared(
-    accelerator: Accelerator, objective: Objective, optimizer: Optimizer
-) -> tuple[nn.Module, torch.optim.Optimizer]:
-    """`objective`, wrapped where processes must exchange gradients, and torch's optimiser of it.
-
-    Under `accelerate launch --use_fsdp` the model's parameters are laid in shards, in place and
-    before the optimiser is made, so that its moments lie in shards too; else several processes run
-    DistributedDataParallel.
-    """
-    if wants_shards(accelerator):
-        shard(objective.model)
-        return objective, make_optimizer(objective, optimizer)
-    return accelerator.prepare(objective, make_optimizer(objective, optimizer))
-
-
 def compute_gradients(
-    accelerator: Accelerator,
-    objective: nn.Module,
-    config: TrainingConfig,
-    batches: Sequence[Batch],
+    accelerator: Accelerator, objective: nn.Module, config: TrainingConfig, batches: Sequence[Batch]
 ) -> dict[str, Tensor]:
     """Leave the gradients of the mean loss of `batches`, clipped; what was measured, 0-d.
 
-    objective: as `prepared` gives it. Only the last batch exchanges gradients between processes.
+    objective: as accelerate wraps it. Only the last batch exchanges gradients between processes.
     "gradient" is the norm before clipping, over all processes; the rest is of this one.
     """
     device, sums = accelerator.device, dict[str, Tensor]()

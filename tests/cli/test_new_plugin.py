@@ -69,13 +69,12 @@ def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize("name", ["a", "wide", "far-sighted", "far_sighted", "view2d"])
+WORDS = ["no", "on", "yes", "off", "n", "inf", "nan", "e3", "none"]
+"""What other readers of YAML take for values."""
+
+
+@pytest.mark.parametrize("name", ["a", "wide", "far-sighted", "far_sighted", "view2d", *WORDS])
 def test_names_that_are_taken_as_they_are(name: str) -> None:
-    check_name(name)
-
-
-@pytest.mark.parametrize("name", ["no", "on", "yes", "off", "n", "inf", "nan", "e3", "none"])
-def test_words_that_other_readers_of_yaml_take_for_values(name: str) -> None:
     check_name(name)
     (text,) = [text for path, text in rendered(name) if path.name == "recipe.yaml"]
     assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
@@ -143,6 +142,11 @@ def test_nothing_is_overwritten(kind: str, tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_told_by_the_users_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "file/wide"])
+    assert isinstance(result.exception, OSError)
+    assert str(result.exception).startswith("cannot write file/wide: ")
+
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied", "./.qgs-wide.4m63mcr7")
 
@@ -150,13 +154,6 @@ def test_a_place_that_cannot_be_written_is_told_by_the_users_name(
     result = CliRunner().invoke(app, ["new-plugin", "wide"])
     told = "cannot write qgs-wide: Permission denied; choose another folder with `--out FOLDER`"
     assert str(result.exception) == told
-
-
-def test_a_file_in_the_way_of_the_folder_is_told(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "file/wide"])
-    assert isinstance(result.exception, OSError)
-    assert str(result.exception).startswith("cannot write file/wide: ")
 
 
 def test_home_is_expanded_and_blanks_are_quoted(
@@ -189,14 +186,12 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list((tmp_path / "a").iterdir()) == []
 
 
-def test_a_folder_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(FileExistsError), new_folder(tmp_path / "new"):
-        (tmp_path / "new").mkdir()
-    assert list(tmp_path.iterdir()) == [tmp_path / "new"]
-
-
-def test_a_new_folder_has_the_usual_permissions(tmp_path: Path) -> None:
-    (tmp_path / "usual").mkdir()
+def test_a_folder_that_appears_meanwhile_is_kept_and_a_new_one_has_the_usual_permissions(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(FileExistsError), new_folder(tmp_path / "usual"):
+        (tmp_path / "usual").mkdir()
+    assert list(tmp_path.iterdir()) == [tmp_path / "usual"]
     with new_folder(tmp_path / "new"):
         pass
     modes = {os.stat(tmp_path / name).st_mode for name in ("usual", "new")}

@@ -77,14 +77,11 @@ def test_eval_gives_the_same_numbers_and_shows_all_methods(run: Path) -> None:
         assert word in result.output
 
 
-def test_eval_of_other_data(run: Path, tmp_path: Path) -> None:
+def test_eval_of_other_settings_keeps_the_first_results(run: Path, tmp_path: Path) -> None:
     checkpoint = run / "checkpoint.safetensors"
     result = qgs("eval", checkpoint, "--set", "evaluation.scenes=1", "--out", tmp_path / "new")
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "new" / "summary.json").read_text())["scenes"] == 1
-
-
-def test_eval_of_other_settings_keeps_the_first_results(run: Path) -> None:
     before = (run / "evaluation" / "summary.json").read_bytes()
     for name in ("evaluation-2", "evaluation-3"):
         result = qgs("eval", run, "--set", "evaluation.scenes=1", "--device", "cpu")

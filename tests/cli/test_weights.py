@@ -111,20 +111,15 @@ def test_half_precision_on_demand(run: Callable[..., str], tmp_path: Path) -> No
     assert "converted to float32: 109 of 109 are float16" in told
 
 
-def test_auto_takes_overrides(run: Callable[..., str], locus: Path, tmp_path: Path) -> None:
-    out = tmp_path / "c.safetensors"
-    told = run(
-        "import", locus, "--recipe", "auto", "--out", out, "--set", "model.head.scale_cap=0.1"
-    )
-    assert "model.head.scale_cap: 0.1 (LocusGS: 0.075)" in told
-    recipe = qgs.load(out).recipe
-    assert recipe is not None
-    assert recipe["model"]["head"]["scale_cap"] == 0.1
-
-
-def test_the_checkpoint_is_never_taken_for_its_recipe(
+def test_auto_takes_overrides_and_no_checkpoint_for_its_recipe(
     run: Callable[..., str], locus: Path, tmp_path: Path
 ) -> None:
     told = run("import", locus, "--recipe", "auto", "--out", tmp_path / "c.yaml", code=2)
     assert "name it .safetensors" in told
     assert sorted(tmp_path.iterdir()) == [locus]
+    out, option = tmp_path / "c.safetensors", "model.head.scale_cap=0.1"
+    told = run("import", locus, "--recipe", "auto", "--out", out, "--set", option)
+    assert "model.head.scale_cap: 0.1 (LocusGS: 0.075)" in told
+    recipe = qgs.load(out).recipe
+    assert recipe is not None
+    assert recipe["model"]["head"]["scale_cap"] == 0.1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from refusals import refused
 
 from qgs.composer import RecipeError, resolve
 from qgs.composer.sections import SETTINGS
@@ -33,9 +34,7 @@ def test_missing_base_suggests_neither_its_reader_nor_something_else(write):
 
 def test_missing_base_of_a_mapping(write):
     write("recipe: 1\n", "base.yaml")
-    with pytest.raises(RecipeError) as caught:
-        resolve({"recipe": 1, "extends": "bases.yaml"})
-    (problem,) = caught.value.problems
+    problem = refused({"recipe": 1, "extends": "bases.yaml"})
     assert problem.option == "extends"
     assert "did you mean `base.yaml`" in problem.fix
     assert "working directory" in problem.fix
@@ -45,9 +44,7 @@ def test_cycle_is_named_with_its_whole_chain(write):
     write("recipe: 1\nextends: b.yaml\n", "a.yaml")
     write("recipe: 1\nextends: c.yaml\n", "b.yaml")
     write("recipe: 1\nextends: a.yaml\n", "c.yaml")
-    with pytest.raises(RecipeError) as caught:
-        resolve("a.yaml")
-    (problem,) = caught.value.problems
+    problem = refused("a.yaml")
     assert (problem.file, problem.line, problem.option) == ("c.yaml", 2, "extends")
     assert "a.yaml -> b.yaml -> c.yaml -> a.yaml" in problem.reason
     assert "remove" in problem.fix
@@ -65,9 +62,7 @@ def test_an_unmet_requirement_names_the_line_of_the_overlay_that_caused_it(write
         "base.yaml",
     )
     overlay = write("recipe: 1\nextends: base.yaml\nmodel: {queries: {type: qgs/latent}}\n")
-    with pytest.raises(RecipeError) as caught:
-        resolve(overlay)
-    (problem,) = caught.value.problems
+    problem = refused(overlay)
     assert (problem.file, problem.line) == ("base.yaml", 5)
     assert problem.reason.endswith("; model.queries is `qgs/latent` (recipe.yaml:3)")
     assert problem.fix == "use `spatial/placed` in the slot `queries`"
@@ -78,9 +73,7 @@ def test_keys_that_moved_are_told_where_they_went(path, write):
     section, key = path.split(".")
     if key in SETTINGS[section,].model_fields:
         pytest.skip("it has not moved yet")
-    with pytest.raises(RecipeError) as caught:
-        resolve(write(f"recipe: 1\n{section}: {{{key}: 1}}\n"))
-    (problem,) = caught.value.problems
+    problem = refused(write(f"recipe: 1\n{section}: {{{key}: 1}}\n"))
     assert (problem.line, problem.option) == (2, path)
     assert problem.fix == f"write `{MOVED[path]}`"
 
@@ -88,9 +81,7 @@ def test_keys_that_moved_are_told_where_they_went(path, write):
 def test_mistake_in_an_extended_file_is_found_there(write):
     write("recipe: 1\nmodel:\n  queries: {count: 0}\n", "base.yaml")
     recipe = write("recipe: 1\nextends: base.yaml\nmodel:\n  queries: {std: 0.5}\n")
-    with pytest.raises(RecipeError) as caught:
-        resolve(recipe)
-    (problem,) = caught.value.problems
+    problem = refused(recipe)
     assert (problem.file, problem.line) == ("base.yaml", 3)
 
 
@@ -105,8 +96,6 @@ def test_mistake_in_an_extended_file_is_found_there(write):
     ],
 )
 def test_broken_override(override, path, reason, write):
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\n"), ["seed=1", override])
-    (problem,) = caught.value.problems
+    problem = refused(write("recipe: 1\n"), ["seed=1", override])
     assert (problem.file, problem.option) == ("--set #2", path)
     assert reason in problem.reason

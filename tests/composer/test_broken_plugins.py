@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusals import refused
 from typer.testing import CliRunner
 
 from qgs.cli import app
-from qgs.composer import RecipeError
 from qgs.composer.recipe import resolve
 from qgs.composer.registry import load_sound_plugins
 
@@ -57,9 +57,7 @@ plugin = Plugin("chain", 1, (Reader, Refine, Late, Start))
 )
 def test_what_reads_a_field_is_no_provider_of_it(decoder, too_late, write, install):
     install("qgs-chain", "chain", CHAIN)
-    with pytest.raises(RecipeError) as caught:
-        resolve(write(f"recipe: 1\nplugins: [chain]\nmodel: {{decoder: {decoder}}}\n"))
-    (problem,) = caught.value.problems
+    problem = refused(write(f"recipe: 1\nplugins: [chain]\nmodel: {{decoder: {decoder}}}\n"))
     assert "needs place" in problem.reason
     assert ("too late" in problem.reason) is too_late
     assert problem.fix.startswith("use `chain/start` in the slot `queries`")
@@ -132,9 +130,7 @@ BROKEN_PLUGINS = {
 def test_broken_plugin_is_reported_by_distribution(name, write, install):
     source, reason = BROKEN_PLUGINS[name]
     install("qgs-bad", "bad", IMPORTS + source, version="0.7")
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [bad]\nmodel: {queries: {type: bad/any}}\n"))
-    (problem,) = caught.value.problems
+    problem = refused(write("recipe: 1\nplugins: [bad]\nmodel: {queries: {type: bad/any}}\n"))
     assert (problem.file, problem.line, problem.option) == ("recipe.yaml", 2, "plugins.0")
     assert "qgs-bad 0.7" in problem.reason
     assert reason in problem.reason
@@ -166,9 +162,7 @@ def test_fix_of_a_plugin_that_cannot_be_imported(source, fix, write, install):
     install("qgs-odd", "odd", source)
     if not source:
         Path(sys.path[0], "_test_qgs_odd.py").unlink()
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [odd]\n"))
-    (problem,) = caught.value.problems
+    problem = refused(write("recipe: 1\nplugins: [odd]\n"))
     assert problem.fix.startswith(fix)
 
 
@@ -176,9 +170,7 @@ def test_two_distributions_with_one_plugin_name(write, install):
     source = "from qgs.contracts import Plugin\nplugin = Plugin('twin', 1, ())"
     install("first-twin", "twin", source)
     install("second-twin", "twin", source)
-    with pytest.raises(RecipeError) as caught:
-        resolve(write("recipe: 1\nplugins: [twin]\n"))
-    (problem,) = caught.value.problems
+    problem = refused(write("recipe: 1\nplugins: [twin]\n"))
     assert "first-twin 1.2, second-twin 1.2" in problem.reason
     assert "uninstall" in problem.fix
 

@@ -117,7 +117,6 @@ BROKEN = {
         3, "", "no valid YAML", "brackets",
     ),
     "empty file": ("", 1, "", "the file is empty", "recipe: 1"),
-    "only a comment": ("# nothing yet\n", 1, "", "the file is empty", "recipe: 1"),
     "a list at the top": ("- recipe: 1\n", 1, "", "this is a list", "key: value"),
     "a list where a mapping belongs": (
         "recipe: 1\nmodel:\n  decoder:\n    - depth: 3\n",

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import refused
 
 from qgs.composer import PluginError, RecipeError, compose
 from qgs.composer.build import build
@@ -187,14 +188,11 @@ def test_the_tracebacks_of_several_plugins_are_all_shown(write, install):
     assert "_test_qgs_second.py" in shown
 
 
-def test_what_a_loss_raises_when_built_is_reported_with_its_distribution(write, faulty):
-    recipe = resolve(write(HEAD + "losses: {x: {type: faulty/exploding}}\n"))
+def test_a_failing_loss_is_reported_with_its_distribution_and_missing_data_as_it_is(write, faulty):
+    text = "losses: {x: {type: faulty/exploding}}\ndata: {type: faulty/closed}\n"
+    recipe = resolve(write(HEAD + text))
     with pytest.raises(RecipeError, match=r"losses\.x\n.*qgs-faulty 0\.3"):
         recipe.build_losses()
-
-
-def test_data_that_cannot_be_opened_is_told_as_it_is(write, faulty):
-    recipe = resolve(write(HEAD + "data: {type: faulty/closed}\n"))
     with pytest.raises(FileNotFoundError, match="photos/ is not there"):
         recipe.build_data()
 
@@ -267,9 +265,7 @@ def test_a_plugin_in_memory_is_reported_without_a_distribution():
             raise KeyError("oops")
 
     recipe = {"recipe": 1, "plugins": ["mine"], "model": {"queries": {"type": "mine/silent"}}}
-    with pytest.raises(RecipeError) as caught:
-        resolve(recipe, plugins=[Plugin("mine", 1, (Silent,))])
-    (problem,) = caught.value.problems
+    problem = refused(recipe, plugins=[Plugin("mine", 1, (Silent,))])
     assert problem.reason.startswith("the plugin `mine` fails: `provides` of `mine/silent` raises")
     place = rf"mend {re.escape(__file__)}:\d+, or choose another component"
     assert re.fullmatch(place, problem.fix)

@@ -71,17 +71,14 @@ def test_components_and_their_test_are_short() -> None:
 def test_the_pages_test_makes_the_checks_of_the_command(folder: Path, package: ModuleType) -> None:
     test = runpy.run_path(str(folder / "tests/test_components.py"))["test_contract"]
     (mark,) = test.pytestmark
-    checked = {(bound.check.name, bound.run.case.config) for (bound,) in _arguments(mark)}
+    arguments = [tuple(getattr(value, "values", (value,))) for value in mark.args[1]]
+    checked = {(bound.check.name, bound.run.case.config) for (bound,) in arguments}
     expected = {
         (check.name, case.config)
         for case in cases_of(InstalledPlugin(package.plugin))
         for check in checks_for(case)
     }
     assert checked == expected
-
-
-def _arguments(mark: pytest.Mark) -> list[tuple]:
-    return [tuple(getattr(value, "values", (value,))) for value in mark.args[1]]
 
 
 @pytest.mark.parametrize("number", range(6))
@@ -106,7 +103,7 @@ def test_the_field_starts_changes_and_places(package: ModuleType) -> None:
     assert not means[..., :2].any()
 
 
-def test_a_field_that_nothing_starts_is_refused_as_the_page_says(
+def test_what_the_page_says_is_refused(
     folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
@@ -114,6 +111,8 @@ def test_a_field_that_nothing_starts_is_refused_as_the_page_says(
     needed = r"`sightline/deepen` needs sightline\.log_depth .*\n  fix: use `sightline/deep`"
     with pytest.raises(RecipeError, match=needed):
         resolve("depth.yaml", ["model.queries.type=qgs/latent"], plugins=[package.plugin])
+    with pytest.raises(RecipeError, match="far must be more than near, 9\n  fix: set it farther"):
+        resolve("frustum.yaml", ["model.centers.near=9"], plugins=[package.plugin])
 
 
 def test_the_second_component_computes_its_formula(package: ModuleType) -> None:
@@ -134,11 +133,3 @@ def test_the_recipes_work(
     assert recipe.tree["model"]["decoder"]["cross_attention"]["type"] == "sightline/abstaining"
     model = recipe.build_model("meta")
     assert isinstance(model.centers, package.FrustumCenters)
-
-
-def test_an_option_that_does_not_fit_is_told_as_the_page_says(
-    folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    with pytest.raises(RecipeError, match="far must be more than near, 9\n  fix: set it farther"):
-        resolve("frustum.yaml", ["model.centers.near=9"], plugins=[package.plugin])

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import PurePosixPath
+from pkgutil import resolve_name
 from posixpath import normpath
 
 import pytest
@@ -61,16 +62,10 @@ def test_what_a_page_documents_exists_and_is_documented_once(name: str) -> None:
 
 
 def exists(name: str) -> bool:
-    parts = name.split(".")
-    for split in range(len(parts), 0, -1):
-        try:
-            thing = import_module(".".join(parts[:split]))
-        except ModuleNotFoundError:
-            continue
-        for part in parts[split:]:
-            thing = getattr(thing, part, None)
-        return thing is not None
-    return False
+    try:
+        return resolve_name(name) is not None
+    except (ImportError, AttributeError):
+        return False
 
 
 def test_pages_are_in_the_navigation() -> None:
@@ -102,10 +97,8 @@ def test_every_check_is_listed_with_its_contract() -> None:
 
 def test_the_site_is_built_without_a_warning(tmp_path) -> None:
     for package in ("mkdocs", "material", "mkdocstrings"):
-        pytest.importorskip(
-            package,
-            reason=f'{package} is not installed: `pip install "query-gaussians[docs]"`',
-        )
+        reason = f'{package} is not installed: `pip install "query-gaussians[docs]"`'
+        pytest.importorskip(package, reason=reason)
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,0 +1,18 @@
+"""What a recipe that is refused is refused for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from qgs.composer import RecipeError, RecipeProblem, resolve
+
+
+def refused(recipe: Any, *arguments: Any, by: Callable = resolve, **options: Any) -> RecipeProblem:
+    """The one problem of a recipe that `by`, called with these arguments, refuses."""
+    with pytest.raises(RecipeError) as caught:
+        by(recipe, *arguments, **options)
+    (problem,) = caught.value.problems
+    return problem
