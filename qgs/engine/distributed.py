@@ -1,5 +1,7 @@
 """Devices and processes of a run, and asking it to stop."""
 
+from __future__ import annotations
+
 import os
 import signal
 import threading
