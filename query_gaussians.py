@@ -3,8 +3,6 @@
 PyPI's distribution `qgs`, a climate model, installs a top-level package of the same name.
 """
 
-from __future__ import annotations
-
 import sys
 
 

@@ -5,8 +5,6 @@ but qgs and its plugins are lent through a folder of links, so that qgs can only
 wheel. Whether the wheels require what they import cannot be seen there: test_dependencies.py.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Published weights to import: those of the golden files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from safetensors import safe_open

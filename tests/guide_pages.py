@@ -1,7 +1,5 @@
 """The guide's pages as text."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

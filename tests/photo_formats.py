@@ -3,8 +3,6 @@
 The writers share no code with the readers: they follow the descriptions of the formats.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

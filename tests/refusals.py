@@ -1,7 +1,5 @@
 """What a recipe that is refused is refused for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A plugin with a data source of its own, `tapes/tape`, as a stranger would write it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What tools/environment.sh does to a folder in its way, and how tools/test runs pytest."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The climate model `qgs` of PyPI in the place of ours, or beside it."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

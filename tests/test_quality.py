@@ -1,7 +1,5 @@
 """House rules that a machine can check: layers, style, types, file length, no machine's paths."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

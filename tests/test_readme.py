@@ -1,7 +1,5 @@
 """What the README shows is what the repository holds."""
 
-from __future__ import annotations
-
 import re
 from importlib.metadata import entry_points
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the shipped recipes promise of each other, of the papers' models and of the documents."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What starting up may import. Seconds are measured by tools/bench_startup.py."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

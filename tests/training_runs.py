@@ -1,7 +1,5 @@
 """Runs of tiny models, for the tests of training."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing

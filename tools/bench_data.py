@@ -14,8 +14,6 @@ Exit code 1 when the workers load less than five times what training consumes, o
 more than 5 % after the first fifth of the samples.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

@@ -6,8 +6,6 @@ Prints medians, and medians of the ratios to LocusGS round by round, without and
 pass.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import time

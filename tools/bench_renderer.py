@@ -7,8 +7,6 @@ renders fewer cameras, one after the other as always, and its time is multiplied
 is the growth of the peak resident size over a process that has rendered a small scene before.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

@@ -5,8 +5,6 @@ Usage: python tools/bench_startup.py [REPETITIONS]
 Unset PYTHONDONTWRITEBYTECODE, or every start compiles qgs anew.
 """
 
-from __future__ import annotations
-
 import statistics
 import subprocess
 import sys

@@ -8,8 +8,6 @@ plugin, of that name is missing; it may load `model.safetensors`, whose recipe n
 `python tools/guide_errors.py` brings the page up to date; a test tells when it is not.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 A page has `<!-- from the code: NAME -->` on a line of its own where the part NAME belongs.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Collection

@@ -3,8 +3,6 @@
 `python tools/guide_reference.py` prints it; building the guide puts it on the site.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Iterator, Mapping

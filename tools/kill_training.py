@@ -7,8 +7,6 @@ the end its weights must equal, to the bit, those of the same run without a kill
 and ends with 1 if anything is lost.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

@@ -7,8 +7,6 @@ Writes random weights of the recipe's model under their published names (LocusGS
 memory of that process, mapped file pages included. Exit code 1 above 2.5 times the file.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

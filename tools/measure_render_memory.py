@@ -8,8 +8,6 @@ has allocated. "step" leaves out what the process holds before the step: librari
 and the batch.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

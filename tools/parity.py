@@ -9,8 +9,6 @@ atol 5e-5, has no counterpart here, or cannot be computed. Options of the file t
 are listed below its table.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reconstruction of one scene: which frames, a camera path, scores, and the files written."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Collection, Mapping, Sequence

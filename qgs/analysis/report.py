@@ -1,7 +1,5 @@
 """report.html: what was trained and how it compares, in one self-contained page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

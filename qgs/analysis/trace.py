@@ -5,8 +5,6 @@ with qgs.trace(model, layers=[1, 4], queries=[3, 17]) as trace:
 trace.layers[4].cross_attention.weights         # (B, h, Q, M)
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field

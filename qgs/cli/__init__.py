@@ -1,7 +1,5 @@
 """The `qgs` command; heavy imports wait until one of its commands runs."""
 
-from __future__ import annotations
-
 import os
 import sys
 

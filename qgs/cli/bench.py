@@ -1,7 +1,5 @@
 """`qgs bench`: size, latency and memory of models, as tables and as a JSON report."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

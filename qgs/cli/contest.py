@@ -1,7 +1,5 @@
 """Training and judging several recipes under one budget, and the report of it."""
 
-from __future__ import annotations
-
 import os
 import platform
 import signal

@@ -1,7 +1,5 @@
 """`qgs demo`: train recipes side by side, compare them on unseen views, write a report."""
 
-from __future__ import annotations
-
 from itertools import chain, count
 from pathlib import Path
 from typing import Annotated

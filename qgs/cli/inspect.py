@@ -1,7 +1,5 @@
 """`qgs list`, `qgs compose`, `qgs diff`, `qgs schema`: looking at recipes and components."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """What `qgs list` shows: installed components, and every option with its meaning."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

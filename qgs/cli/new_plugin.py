@@ -1,7 +1,5 @@
 """`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import unicodedata

@@ -1,7 +1,5 @@
 """Commands that other distributions offer: listed by metadata, imported when they are called."""
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tables of `qgs compose` and `qgs diff`: parameters of recipes, and where two differ."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from rich.markup import escape

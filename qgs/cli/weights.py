@@ -1,7 +1,5 @@
 """`qgs import` and `qgs export`: published weights in and out."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated

@@ -3,8 +3,6 @@
 `compose` makes the model, `resolve` says everything about a recipe before anything is allocated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

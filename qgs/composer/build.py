@@ -1,7 +1,5 @@
 """From chosen components to a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any

@@ -1,7 +1,5 @@
 """From what is written at a place to a component class and its Config."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What is wrong with a recipe: every problem with its place, its reason and a fix."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """A recipe file with everything it extends, and `--set` overrides laid over it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from functools import reduce

@@ -1,7 +1,5 @@
 """requires and provides, followed in the order in which a forward pass runs."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Literal, TypeAlias, get_args, get_origin

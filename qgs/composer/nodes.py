@@ -1,7 +1,5 @@
 """A recipe as mappings and lists that know where each key and item was written."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,11 +33,11 @@ class MapNode(dict[str, Any]):
         """Keys and values, and where each key was written."""
         return [(key, value, self.origins[key]) for key, value in self.items()]
 
-    def without(self, *names: str) -> MapNode:
+    def without(self, *names: str) -> "MapNode":
         """A copy that lacks `names`."""
         return MapNode(self.origin, (entry for entry in self.entries() if entry[0] not in names))
 
-    def child(self, *path: str) -> MapNode:
+    def child(self, *path: str) -> "MapNode":
         """The mapping at `path`, an empty one where there is none."""
         found = self
         for key in path:

@@ -1,7 +1,5 @@
 """The places of a recipe that hold components: defaults, decoder layers, swaps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase

@@ -1,7 +1,5 @@
 """Resolving a recipe: everything that can be said about it before a tensor is allocated."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

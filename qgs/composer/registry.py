@@ -1,7 +1,5 @@
 """Installed components: found by metadata, imported only when a recipe names their plugin."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

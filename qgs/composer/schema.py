@@ -1,7 +1,5 @@
 """The JSON Schema of a recipe, so that editors complete it, check it and show what options mean."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

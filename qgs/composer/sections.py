@@ -1,7 +1,5 @@
 """The parts of a recipe that are no components: its sections, their settings, its plugins."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """The places of a recipe that hold components, and what stands there by default."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

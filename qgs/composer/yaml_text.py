@@ -1,7 +1,5 @@
 """YAML text to nodes, as YAML 1.2 reads scalars, and values to YAML text."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -12,8 +12,6 @@ of every image, `masks`, a list of V uint8 tensors with the bytes of PNG files, 
 has none, and `held_out`, the frames that training is not to see.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

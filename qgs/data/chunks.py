@@ -1,7 +1,5 @@
 """`qgs/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """`qgs/dl3dv`: DL3DV's scenes, from archives or folders."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """Which views an evaluation compares: drawn by seed, or named by an index file."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Image, mask and depth files to pixels of the wanted size, and the intrinsics that follow them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Lenses that bend rays, and photos without their distortion."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias

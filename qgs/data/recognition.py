@@ -1,7 +1,5 @@
 """Which source opens a path, and opening it for a trained model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from upath import UPath

@@ -5,8 +5,6 @@ Everything here is a pure function of its arguments and of the random generator 
 Images are moved by NumPy, on one thread: torch's would wait for cores that training holds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias

@@ -1,7 +1,5 @@
 """What sources of scenes share: lists opened on demand, stored photos, a cache, warnings."""
 
-from __future__ import annotations
-
 import logging
 from abc import abstractmethod
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """Endless training batches by number: order of scenes, samples, processes that decode."""
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """Labelled figures: comparison grids with a depth scale, training curves; colours of all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tensors to pictures (H, W, 3) uint8, of RGB, depth and other sizes; PNG and GIF files."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from io import BytesIO

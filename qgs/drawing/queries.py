@@ -1,7 +1,5 @@
 """Queries drawn onto photos: their supports, what they attend to, their Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What a run saves and continues from; starting from the weights of another one."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Two evaluations, scene by scene: mean differences, their uncertainty, wins and losses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

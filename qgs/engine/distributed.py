@@ -1,7 +1,5 @@
 """Devices and processes of a run, and asking it to stop."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

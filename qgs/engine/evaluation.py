@@ -1,7 +1,5 @@
 """Judging a model on the test views of a recipe, beside two baselines that need none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress

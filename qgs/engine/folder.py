@@ -1,7 +1,5 @@
 """The folder of one training run; nothing in it is ever overwritten by another run."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -1,7 +1,5 @@
 """What ends a run by itself: a model that died, and steps that are not finite."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -1,7 +1,5 @@
 """What a training step minimises: every supervised layer rendered and compared with photos."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """What the optimiser moves and how fast, part by part; and the moving average of the weights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -47,11 +45,11 @@ def rate_factors(module: nn.Module, parts: Mapping[str, float]) -> dict[str, flo
             if len(wanted) <= len(steps) and all(map(fnmatchcase, steps, wanted)):
                 factors[name], matched = factor, True
         if not matched:
-            parts = [name.removeprefix("model.").split(".") for name in factors]
-            starred = [["*" if step.isdigit() else step for step in part] for part in parts]
-            known = {".".join(part[: len(wanted)]) for part in parts + starred}
+            paths = [name.removeprefix("model.").split(".") for name in factors]
+            starred = [["*" if step.isdigit() else step for step in path] for path in paths]
+            known = {".".join(path[: len(wanted)]) for path in paths + starred}
             near = nearest(".".join(wanted), known)
-            outermost = ", ".join(dict.fromkeys(part[0] for part in parts))
+            outermost = ", ".join(dict.fromkeys(path[0] for path in paths))
             raise ValueError(
                 f"optimizer.parts: the pattern `{pattern}` matches no parameter of the model; "
                 + (f"did you mean `{near}`?" if near else f"its parts: {outermost}")

@@ -1,7 +1,5 @@
 """Evaluations and pictures while a model trains."""
 
-from __future__ import annotations
-
 import json
 import logging
 from itertools import islice

@@ -1,7 +1,5 @@
 """Evaluation protocols: exactly what decides the numbers, named and hashed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

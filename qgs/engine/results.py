@@ -1,7 +1,5 @@
 """Scores of an evaluation: by scene, their means, files and tables."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

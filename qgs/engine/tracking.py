@@ -1,7 +1,5 @@
 """What is told while a model trains: on the terminal, and to experiment trackers."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -97,7 +95,7 @@ class TrainingProgress:
         self._start: tuple[int, float, float] | None = None
         self._interval = _REFRESH_SECONDS if console.is_terminal else _LOG_SECONDS
 
-    def __enter__(self) -> TrainingProgress:
+    def __enter__(self) -> "TrainingProgress":
         if self._console.is_terminal:
             self._bar.start()
         return self

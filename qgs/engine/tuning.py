@@ -1,7 +1,5 @@
 """Test-time token tuning: the queries of one scene, fitted to its input views (TokenGS release)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Scores that a model must beat: copying an input view, painting the mean colour."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

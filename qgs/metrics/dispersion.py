@@ -1,7 +1,5 @@
 """What is measured on Gaussians alone: how far those of one token scatter."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """PSNR and SSIM as papers report them (LocusGS evaluation)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import ClassVar, Literal, TypeAlias
 

@@ -4,8 +4,6 @@ The `lpips` package supplies the learned weights of the layers. Its own network 
 takes VGG-16 from torchvision, whose wheels work with CUDA builds of torch only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from importlib.util import find_spec

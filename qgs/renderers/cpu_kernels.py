@@ -15,8 +15,6 @@ The backward pass repeats the forward one, so both skip and stop alike. With v_i
 transmittance T_i and the rest S_i = sum_{j>i} w_j v_j, dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

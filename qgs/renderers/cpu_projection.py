@@ -8,8 +8,6 @@ With C the rotation and p the position of c2w, F = R S the factor of the covaria
 the camera sees C^T (m - p) and the factor C^T F.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from qgs.renderers.cpu_kernels import kernel

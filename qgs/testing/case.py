@@ -1,7 +1,5 @@
 """A component with options and sizes, as the checks see it, and what a check raises."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -152,6 +150,6 @@ class Case:
                 parameter += NOISE * torch.randn(parameter.shape, generator=generator).to(parameter)
         return module
 
-    def with_dims(self, **sizes: int) -> Case:
+    def with_dims(self, **sizes: int) -> "Case":
         """The same component in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes), state_dict=None)

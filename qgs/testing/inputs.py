@@ -1,7 +1,5 @@
 """Inputs for a component of each slot: small, deterministic, in front of the cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the checks do with modules: seeds, modes, and everything that a module keeps."""
 
-from __future__ import annotations
-
 import inspect
 from collections import deque
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """The contract suite on all components of an installed plugin."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """All checks by name, and the slots that each applies to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from inspect import cleandoc

@@ -1,7 +1,5 @@
 """Run the checks of a case and report how they went, alone or as pytest tests."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Inputs and outputs of components as trees of tensors with dotted names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

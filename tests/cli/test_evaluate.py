@@ -1,7 +1,5 @@
 """`qgs eval` as a user types it: indices, tuning, batches, comparisons."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

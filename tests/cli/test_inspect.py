@@ -1,7 +1,5 @@
 """`qgs list`, `compose`, `diff`, `schema`, and what the command does with mistakes."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """`qgs new-plugin`: what it writes, and what it refuses."""
 
-from __future__ import annotations
-
 import ast
 import math
 import os

@@ -1,7 +1,5 @@
 """Commands of other distributions: listed without an import, and told apart when they fail."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from importlib.metadata import entry_points

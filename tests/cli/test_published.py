@@ -1,7 +1,5 @@
 """The published recipes name data, an index and a base run that the user brings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`qgs train` and `qgs eval` as a user types them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

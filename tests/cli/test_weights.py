@@ -1,7 +1,5 @@
 """`qgs import` and `qgs export`: what is told, and exit code 2 for wrong files."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from io import BytesIO

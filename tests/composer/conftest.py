@@ -1,7 +1,5 @@
 """Plugins for tests: fake distributions in a folder on sys.path."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

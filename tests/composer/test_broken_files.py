@@ -1,7 +1,5 @@
 """Mistakes in what a recipe extends, in overrides and in mappings."""
 
-from __future__ import annotations
-
 import pytest
 from refusals import refused
 

@@ -1,7 +1,5 @@
 """Plugins that are broken, and components that cannot stand together."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every mistake gets one message with file, line, path, reason and fix."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,8 +1,6 @@
 """Code of plugins that fails or does not do what it says: its author is shown the line, its user
 the release."""
 
-from __future__ import annotations
-
 import re
 import sys
 import traceback

@@ -1,7 +1,5 @@
 """Merging, swapping, provenance, and what a resolved recipe is."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The JSON Schema agrees with the composer, and the committed copy with the code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Components that cannot be built or called, or only with certain sizes or strides."""
 
-from __future__ import annotations
-
 import torch
 from contract_mutants.fields import PLACE
 from contract_mutants.mutant import mutant

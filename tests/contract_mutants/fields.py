@@ -1,7 +1,5 @@
 """Components that read, write or need other fields than they declare."""
 
-from __future__ import annotations
-
 from contract_mutants.mutant import mutant
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Components whose gradients stop or are wrong, or that are not finite for extreme inputs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

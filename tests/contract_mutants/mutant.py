@@ -1,7 +1,5 @@
 """Register components that break the contract, each with the check that must catch it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

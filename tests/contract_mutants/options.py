@@ -1,7 +1,5 @@
 """Components whose options are lost, lax or changed."""
 
-from __future__ import annotations
-
 from contract_mutants.mutant import mutant
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 

@@ -1,7 +1,5 @@
 """Components whose parameters are drawn, kept, saved or used wrongly."""
 
-from __future__ import annotations
-
 import torch
 from contract_mutants.mutant import mutant
 from torch import nn

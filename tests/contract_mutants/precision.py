@@ -1,7 +1,5 @@
 """Components that take geometry through half precision, or lose digits otherwise."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from contract_mutants.fields import PLACE, Steps

@@ -1,7 +1,5 @@
 """Renderers with a wrong background, alpha, depth or gradient."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Heads, queries, supervisions, losses, data, encoders and attention that break their contracts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

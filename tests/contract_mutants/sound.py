@@ -1,7 +1,5 @@
 """Components that keep the contract in ways that a check could take for a fault."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 

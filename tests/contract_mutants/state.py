@@ -1,7 +1,5 @@
 """Components that change their inputs or themselves, or draw random numbers where they must not."""
 
-from __future__ import annotations
-
 import random
 from typing import Any, ClassVar
 

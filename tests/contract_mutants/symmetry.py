@@ -1,7 +1,5 @@
 """Components that mix scenes, or that know the order of queries or views or the world frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Evaluation indices: what is read, what is refused, which samples they name."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training batches: one stream, whoever decodes it and however many share it."""
 
-from __future__ import annotations
-
 import multiprocessing
 import threading
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Recipes that train in a blink."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One of several training processes; started by test_distributed.py."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Generator
 from pathlib import Path

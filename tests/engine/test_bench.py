@@ -1,7 +1,5 @@
 """Measuring: samples in turn, workloads from recipes, memory of a process of its own."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

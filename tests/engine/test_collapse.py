@@ -1,7 +1,5 @@
 """Runs that die are noticed, said so, and leave good weights."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the demo shows, on a shorter budget: minutes of training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

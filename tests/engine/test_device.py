@@ -1,7 +1,5 @@
 """Which device `auto` takes, with and without CUDA and gsplat."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

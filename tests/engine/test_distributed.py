@@ -1,7 +1,5 @@
 """Two processes on one machine train the model that one would train."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Errors between two steps lose nothing: the run is saved, and says how to go on."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import resource

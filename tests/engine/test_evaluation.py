@@ -1,7 +1,5 @@
 """Evaluation: the same twice, equal to the metrics it is made of, and nothing left out unsaid."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Paired comparisons of results."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`init_from`: queries grow and shrink by the published rule, all else is taken as it is."""
 
-from __future__ import annotations
-
 from io import StringIO
 from pathlib import Path
 

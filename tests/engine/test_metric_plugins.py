@@ -1,7 +1,5 @@
 """A metric that a plugin adds is shown wherever the built-in ones are."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Steps that are not finite: which tensor was first, and what is saved."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

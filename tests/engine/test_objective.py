@@ -1,7 +1,5 @@
 """The objective: the weighted sum of its losses, with all target views at once or few at a time."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

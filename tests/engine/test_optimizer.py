@@ -1,7 +1,5 @@
 """Which parameters decay, learn slower or stay; an optimiser of a plugin; the moving average."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Evaluations while a model trains."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from unittest.mock import Mock
 

@@ -1,7 +1,5 @@
 """Protocols: their hash follows what decides the numbers, and nothing else."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run that was interrupted or killed, and continued, is the run that was not."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

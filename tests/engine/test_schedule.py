@@ -1,7 +1,5 @@
 """The schedule against torch's, and under a time budget."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What trackers are told, and what a person reads while a model trains."""
 
-from __future__ import annotations
-
 import io
 import re
 import sys

@@ -1,7 +1,5 @@
 """Whole runs of tiny models on procedural rooms."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Whole runs with the options of `training` that change what happens around a step."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable, Sequence

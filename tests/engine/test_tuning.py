@@ -1,7 +1,5 @@
 """Token tuning: the input views are met better, the weights stay as they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeAlias
 

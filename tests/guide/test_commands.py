@@ -1,7 +1,5 @@
 """Every command that the guide and the template of a plugin show is one that there is."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import tomllib

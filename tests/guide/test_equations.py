@@ -1,7 +1,5 @@
 """The page of equations: rows lead to code that has their options, constants are the defaults."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pkgutil import resolve_name

@@ -1,7 +1,5 @@
 """The guide says what the code does: its recipes, code, messages, references and tables."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The slow tests in tests/outside type every command of the page in a fresh environment.
 """
 
-from __future__ import annotations
-
 import runpy
 import sys
 from collections.abc import Iterator

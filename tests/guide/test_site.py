@@ -1,7 +1,5 @@
 """Every reference of the guide leads somewhere, and the site is built where its tools are."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Copying the nearest input view, and the mean colour."""
 
-from __future__ import annotations
-
 import math
 
 import torch

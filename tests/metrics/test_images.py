@@ -1,7 +1,5 @@
 """PSNR and SSIM against scikit-image."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity

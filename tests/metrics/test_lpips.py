@@ -1,7 +1,5 @@
 """LPIPS: the published arithmetic, and why it may be unavailable."""
 
-from __future__ import annotations
-
 import sys
 from importlib.util import find_spec
 from pathlib import Path

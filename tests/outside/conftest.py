@@ -1,7 +1,5 @@
 """One fresh environment for all tests that need one: making it takes most of the time."""
 
-from __future__ import annotations
-
 import pytest
 from fresh_environment import FreshEnvironment, make_fresh_environment
 

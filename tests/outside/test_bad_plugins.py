@@ -1,7 +1,5 @@
 """Bad plugins, really installed: told by distribution, and nobody else is harmed."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

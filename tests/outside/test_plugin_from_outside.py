@@ -1,7 +1,5 @@
 """A plugin written outside this repository, beside the wheels of qgs and LocusGS."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

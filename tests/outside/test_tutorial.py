@@ -1,7 +1,5 @@
 """The guide's tutorial, every file and every command of it, as a new user would type them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

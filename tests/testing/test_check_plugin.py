@@ -1,7 +1,5 @@
 """The contract suite on a whole plugin: its report, its examples, its exemptions."""
 
-from __future__ import annotations
-
 import pytest
 from contract_mutants.basics import RaisesWhenCalled
 from contract_mutants.state import CountsItsCalls

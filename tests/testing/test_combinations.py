@@ -1,7 +1,5 @@
 """Every combination of components runs, forward and backward, or is refused when composed."""
 
-from __future__ import annotations
-
 import random
 from itertools import combinations, product
 from typing import Any

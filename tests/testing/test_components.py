@@ -1,7 +1,5 @@
 """Every component of the framework and of LocusGS keeps its contract, and the names of weights."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

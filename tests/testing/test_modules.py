@@ -1,7 +1,5 @@
 """What a module keeps beside its state dict is compared."""
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import count
 from types import SimpleNamespace

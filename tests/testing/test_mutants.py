@@ -1,7 +1,5 @@
 """Every check catches the components that are broken in the way it is for, and no sound one."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 

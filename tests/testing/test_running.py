@@ -1,7 +1,5 @@
 """How checks are run and reported: causes, places of errors, expected failures, arguments."""
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from importlib import import_module

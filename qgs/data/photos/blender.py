@@ -1,7 +1,5 @@
 """Blender (NeRF's synthetic scenes): `transforms_train.json`, `_val` and `_test`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from upath import UPath

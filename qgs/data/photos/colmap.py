@@ -4,8 +4,6 @@ Points, which are most of a model, are not read, and models may lie on any file 
 pycolmap's own readers do not offer; pycolmap says what the parameters of a camera model mean.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterator, Sequence

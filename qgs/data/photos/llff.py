@@ -1,7 +1,5 @@
 """LLFF: `poses_bounds.npy` beside a folder of photos (Mildenhall et al., 2019)."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """nerfstudio: `transforms.json`, whose schema Blender's and DL3DV's files share."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """What a reader of photos is and gives: frames with poses, intrinsics, lenses and files."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence

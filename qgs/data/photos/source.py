@@ -1,7 +1,5 @@
 """`qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial

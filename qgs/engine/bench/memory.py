@@ -1,7 +1,5 @@
 """Peak memory of one operation, in a process that does nothing else: this module, run by itself."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Measuring recipes: memory first, in processes of their own, then seconds, all in turn."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

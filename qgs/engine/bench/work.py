@@ -1,7 +1,5 @@
 """What is measured: inputs of a size, and operations ready to be called again and again."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

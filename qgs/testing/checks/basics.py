@@ -1,7 +1,5 @@
 """A component can be built and called: with any sizes and strides, and compiled."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias

@@ -1,7 +1,5 @@
 """Fields of the state: what a component reads and writes is what it declares, and recipes obey."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, ClassVar
 

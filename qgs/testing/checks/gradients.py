@@ -1,7 +1,5 @@
 """Gradients reach what is read, are right, and stay finite, as outputs do, for extreme inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Any
 

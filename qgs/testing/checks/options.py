@@ -1,7 +1,5 @@
 """Options: what a user writes is what the component gets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from pydantic import BaseModel

@@ -1,7 +1,5 @@
 """Parameters: how they are drawn, where they are kept, saved and moved, and that they learn."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager

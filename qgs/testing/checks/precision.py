@@ -1,7 +1,5 @@
 """Geometry keeps float32 under autocast, learned layers stay close, float64 stays float64."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -5,8 +5,6 @@ far above `alpha_min`, none blocks what is behind it, and none changes its place
 depths.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any

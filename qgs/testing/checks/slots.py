@@ -1,7 +1,5 @@
 """What components of one slot alone promise; for renderers, see `rendering`."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

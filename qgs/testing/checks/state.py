@@ -1,7 +1,5 @@
 """A forward pass changes nothing and repeats: inputs, parameters, memory, random state."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

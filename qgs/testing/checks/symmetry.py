@@ -1,7 +1,5 @@
 """Scenes are independent, queries and views have no order, the world frame is arbitrary."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Poses and intrinsics of a scene: each by itself, and poses against each other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

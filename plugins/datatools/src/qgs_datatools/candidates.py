@@ -1,7 +1,5 @@
 """What a check looks at: scenes, and their photos as they are listed, before anything is judged."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

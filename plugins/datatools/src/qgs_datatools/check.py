@@ -1,7 +1,5 @@
 """All scenes of a data set, whatever its format, and its evaluation indices."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

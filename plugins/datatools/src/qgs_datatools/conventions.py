@@ -1,7 +1,5 @@
 """How a format writes poses, and what other ways of writing them look like when it is read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

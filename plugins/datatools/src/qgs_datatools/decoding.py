@@ -1,7 +1,5 @@
 """Whether photos can be decoded, and have the size that their listing says."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import re

@@ -1,7 +1,5 @@
 """A scene as the entry of a chunk: images keep their bytes where they can."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

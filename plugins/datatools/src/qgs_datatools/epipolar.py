@@ -1,7 +1,5 @@
 """Points that two photos share, and how far they are from the epipolar lines of two poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias

@@ -1,7 +1,5 @@
 """What a check finds: faults with scene, frames and remedy, one line each."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

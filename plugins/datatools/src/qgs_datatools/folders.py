@@ -1,7 +1,5 @@
 """Scenes in folders of photos, and DL3DV's, as candidates for a check."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Whether a scene's poses agree with its photos, judged on a few pairs of neighbours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice

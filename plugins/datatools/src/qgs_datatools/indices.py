@@ -1,7 +1,5 @@
 """Evaluation indices, compared with the scenes that a data set holds."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass

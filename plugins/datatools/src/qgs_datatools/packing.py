@@ -1,7 +1,5 @@
 """Any source of scenes turned into chunks, which training reads fast."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """check.html: what `qgs data check` found, with pictures of cameras and of the worst pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Data sources of installed plugins: which of them reads a path, and its scenes to check."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache, partial
 from typing import get_args

@@ -1,7 +1,5 @@
 """`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar
 
 import torch

@@ -1,7 +1,5 @@
 """LocusGS as a special case: its weights with an ellipsoid of three equal radii."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """`ellipsoid/ray_biased`: queries attend more to rays that pass through their ellipsoid."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from qgs_locus.cross_attention import RayBiasedCrossAttention

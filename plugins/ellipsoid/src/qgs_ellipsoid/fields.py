@@ -1,7 +1,5 @@
 """The shape of an anchor as state fields: a rotation and three raw radii beside its centre."""
 
-from __future__ import annotations
-
 from qgs_locus.fields import RadiusOptions, radius_field, support_radius
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """`ellipsoid/gaussian_head`, `ellipsoid/axis_scaled`: Gaussians relative to their anchor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import ClassVar
 

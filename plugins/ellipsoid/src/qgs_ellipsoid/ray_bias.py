@@ -12,8 +12,6 @@ LocusGS's isotropic bias takes 10. Both products run in float64, block by block,
 Axes: F = 20 features of the numerator, E = 6 of the denominator.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """`ellipsoid/refine`: updates centres, rotations and radii of anchors after each decoder layer."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from qgs_locus.refinement import AnchorRefinement

@@ -1,7 +1,5 @@
 """Rotations as quaternions, w x y z."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -1,7 +1,5 @@
 """`locus/anchored`: every query has a 3D anchor, a centre with a support radius."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated, ClassVar, Literal
 

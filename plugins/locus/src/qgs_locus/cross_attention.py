@@ -1,7 +1,5 @@
 """`locus/ray_biased`: queries attend more to rays that pass near their anchor."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """`locus/anchor_offset`, `locus/radius_scaled`: means around the query's anchor."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """The state fields of an anchor, and how its radius follows from the raw radius."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -7,8 +7,6 @@ product runs in float64, block by block: in float32, an anchor three units away 
 bandwidth is off by more than the released code's own rounding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

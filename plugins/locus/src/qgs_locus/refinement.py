@@ -1,7 +1,5 @@
 """`locus/refine`: updates the centres and radii of anchors after each decoder layer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar, Literal
 

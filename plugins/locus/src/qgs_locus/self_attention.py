@@ -1,7 +1,5 @@
 """`locus/anchor_aware`: self-attention with an embedding of the anchors' centres."""
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """`locus/anchor_visibility`: moves anchors that no target view sees towards the nearest one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The weights of LocusGS: published names, and the recipe that fits a state dict."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from qgs.components.weights import BACKBONE_RENAMES, DECODER, READ_OPTIONS, backbone

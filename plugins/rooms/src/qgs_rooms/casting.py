@@ -1,7 +1,5 @@
 """Images and depth maps of a room, in bands of rows, each one compiled call."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 

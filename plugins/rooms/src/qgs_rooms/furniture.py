@@ -1,7 +1,5 @@
 """Pieces of furniture, each a list of shapes about the origin whose back is towards +y."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from random import Random
 

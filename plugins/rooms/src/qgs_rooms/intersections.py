@@ -3,8 +3,6 @@
 All numbers are float32, constants too: a wider one would widen the loops that LLVM vectorises.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

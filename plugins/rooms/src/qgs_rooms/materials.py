@@ -1,7 +1,5 @@
 """Materials of a room: textures whose colours go together."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 from random import Random

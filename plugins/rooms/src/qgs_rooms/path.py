@@ -1,7 +1,5 @@
 """Cameras that move through a room: a smooth sway while looking across it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The plan of a room: walls, openings, furniture and lights, drawn from a seed."""
 
-from __future__ import annotations
-
 import math
 from random import Random
 

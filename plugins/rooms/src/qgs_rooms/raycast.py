@@ -1,7 +1,5 @@
 """Which surface each ray of an image meets first: shapes by the screen rows that they cover."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Colours of what rays meet: light, the shadows on the floor, textures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

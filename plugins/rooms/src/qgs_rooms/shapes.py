@@ -4,8 +4,6 @@ World frame: metres, x and y along the walls, z up, the floor at z = 0, the room
 z axis. A shape is upright; it may be turned about z.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,7 +28,7 @@ class Shape(NamedTuple):
     turn: float
     texture: int
 
-    def moved(self, x: float, y: float, turn: float) -> Shape:
+    def moved(self, x: float, y: float, turn: float) -> "Shape":
         """The shape turned by `turn` radians about the origin, then moved by (x, y)."""
         cos, sin = math.cos(turn), math.sin(turn)
         cx, cy, cz = self.center

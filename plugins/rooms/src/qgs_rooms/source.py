@@ -3,8 +3,6 @@
 Kernels are imported when the first room is drawn: numba takes longer to load than a recipe does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import cached_property, partial
@@ -51,7 +49,7 @@ class RoomsConfig(SceneSource.Config):
     """Megabytes of images kept in memory; 0 keeps none."""
 
     @model_validator(mode="after")
-    def _fov_is_a_range(self) -> RoomsConfig:
+    def _fov_is_a_range(self) -> "RoomsConfig":
         low, high = self.fov
         if not 5 <= low <= high <= 150:
             raise ValueError(

@@ -1,7 +1,5 @@
 """Patterns of textures, looked up at a point of a surface; and how kernels are compiled."""
 
-from __future__ import annotations
-
 import math
 
 from numba import njit
