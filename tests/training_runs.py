@@ -14,10 +14,10 @@ from rich.console import Console
 from qgs.composer import Recipe
 from qgs.data.sampling import Batch
 from qgs.data.stream import SampleStream
-from qgs.engine import RunFolder, TrainingResult, train
 from qgs.engine.distributed import StopRequest
+from qgs.engine.folder import RunFolder
 from qgs.engine.tracking import TrainingProgress
-from qgs.engine.training import Trainer
+from qgs.engine.training import Trainer, TrainingResult, train
 
 QUIET = Console(quiet=True)
 Tiny: TypeAlias = Callable[..., Recipe]

@@ -20,8 +20,9 @@ from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe, resolve
-from qgs.engine import RunFolder, train
 from qgs.engine.checkpoint import read_state
+from qgs.engine.folder import RunFolder
+from qgs.engine.training import train
 from qgs.io.files import is_leftover
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"

@@ -17,7 +17,9 @@ from qgs.analysis.report import Baseline, Contender, Report
 from qgs.composer import Recipe, resolve
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
-from qgs.engine import Evaluation, RunFolder, evaluate, train
+from qgs.engine.evaluation import Evaluation, evaluate
+from qgs.engine.folder import RunFolder
+from qgs.engine.training import train
 from qgs.io.ply import write_ply
 
 SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")

@@ -33,7 +33,7 @@ def demo(
 
     from qgs.analysis.report import report_html
     from qgs.cli import contest
-    from qgs.engine import TrainingError
+    from qgs.engine.guard import TrainingError
     from qgs.io.files import write_text
 
     console = Console()

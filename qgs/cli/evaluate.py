@@ -131,7 +131,7 @@ def evaluate_into(
     batch: int = 1,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
-    from qgs import engine
+    from qgs.engine.evaluation import evaluate as judge
 
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("judging scenes", total=None)
@@ -139,7 +139,7 @@ def evaluate_into(
         def observe(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        evaluation = engine.evaluate(model, recipe, step, batch, observe)
+        evaluation = judge(model, recipe, step, batch, observe)
     evaluation.write(folder)
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)

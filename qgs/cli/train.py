@@ -33,17 +33,18 @@ def train(
     the same command goes on from there, or from the last save if the process was killed, as if it
     had never been interrupted.
     """
-    from qgs import engine
     from qgs.composer import resolve
+    from qgs.engine.guard import TrainingError
     from qgs.engine.protocol import index_of
+    from qgs.engine.training import train as train_model
 
     use_threads(threads)
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
     index_of(resolved)  # an index that is not there is told now, not after the training
     try:
-        result = engine.train(resolved, out, console=console, device=device, resume=resume)
-    except engine.TrainingError as error:
+        result = train_model(resolved, out, console=console, device=device, resume=resume)
+    except TrainingError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
     run, finished = result.folder, result.resumed_at == result.steps

@@ -97,7 +97,7 @@ class EvaluationPlan:
     the others `evaluation.samples` samples, inputs drawn as in training with `evaluation.seed`,
     targets the other frames of the span.
 
-    wanted, null, unlisted: as in `qgs.engine.Evaluation`. Raises ValueError without test scenes.
+    wanted, null, unlisted: see `qgs.engine.results.Evaluation`. Raises ValueError without scenes.
     """
 
     def __init__(

@@ -170,12 +170,10 @@ class Weights:
         self._module = module
 
     def state(self) -> dict[str, Tensor]:
-        """See `Stateful`."""
         return {name: whole(tensor) for name, tensor in unique_tensors(self._module).items()}
 
     @torch.no_grad()
     def load_state(self, state: State) -> None:
-        """See `Stateful`."""
         for name, tensor in unique_tensors(self._module).items():
             tensor.copy_(placed_like(state[name], tensor))
 
@@ -188,7 +186,6 @@ class OptimizerState:
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        """See `Stateful`."""
         return {
             f"{name}/{key}": whole(value) if isinstance(value, Tensor) else value
             for name, parameter in self._parameters.items()
@@ -196,7 +193,6 @@ class OptimizerState:
         }
 
     def load_state(self, state: State) -> None:
-        """See `Stateful`."""
         self._optimizer.state.clear()
         for path, value in state.items():
             name, key = path.rsplit("/", 1)
@@ -220,7 +216,6 @@ class RandomStates:
         self._accelerator = accelerator
 
     def state(self) -> dict[str, Any]:
-        """See `Stateful`."""
         version, words, gauss = random.getstate()
         own = {
             "python": [version, list(words), gauss],

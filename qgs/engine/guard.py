@@ -21,6 +21,7 @@ from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
+from qgs.io.differences import listed
 from qgs.io.files import replacing_entries
 from qgs.types import named_tensors
 
@@ -97,12 +98,10 @@ class Guard:
         saver.parts |= {"guard": self, "good": self.good}
 
     def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
         detector = self.detector.state()
         return {"incidents": self.incidents, "skipped": self.skipped, "detector": detector}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`."""
         self.incidents, self.skipped = state["incidents"], state["skipped"]
         self.detector.load_state(state["detector"])
 
@@ -266,11 +265,9 @@ class CollapseDetector:
         return self.dead_steps >= min(self.window, steps)
 
     def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
         return {"dead": self.dead_steps, "symptom": self.symptom, "has_drawn": self._has_drawn}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`."""
         self.dead_steps, self.symptom = state["dead"], state["symptom"]
         self._has_drawn = state["has_drawn"]
 
@@ -297,13 +294,11 @@ class GoodWeights:
         self.step, self.tensors = self._copies[0]
 
     def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
         copies = enumerate(tensors for _, tensors in self._copies)
         tensors = {f"{i}/{name}": t for i, copy in copies for name, t in copy.items()}
         return {"steps": [step for step, _ in self._copies], **tensors}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """See `qgs.engine.checkpoint.Stateful`."""
         self._copies = [
             (step, {name: state[f"{i}/{name}"] for name in self.tensors})
             for i, step in enumerate(state["steps"])
@@ -314,7 +309,7 @@ class GoodWeights:
 def broken_tensors(model: nn.Module) -> str:
     """Which tensors of `model` hold NaN or infinity; "" if none does."""
     names = [n for n, t in unique_tensors(model).items() if not whole(torch.isfinite(t).all())]
-    return f"weights are not finite: {_first_names(names)}" if names else ""
+    return f"weights are not finite: {listed(names)}" if names else ""
 
 
 def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
@@ -325,12 +320,8 @@ def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
         return ", ".join(bad)
     gradients = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
     names = [name for name, gradient in gradients.items() if not torch.isfinite(gradient).all()]
-    origin = f", from {_first_names(names)}" if names else ""
+    origin = f", from {listed(names)}" if names else ""
     return f"the gradient norm is {numbers['gradient']}{origin}"
-
-
-def _first_names(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _in_words(found: Sequence[Mapping[str, Any]]) -> str:

@@ -8,7 +8,7 @@ import qgs
 from qgs.cli import app
 from qgs.cli.contest import resolve_fairly
 from qgs.cli.demo import default_recipes, new_folder
-from qgs.engine import CollapseError
+from qgs.engine.guard import CollapseError
 from qgs.io.ply import read_ply
 
 RECIPE = {

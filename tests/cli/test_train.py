@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from qgs import cli, engine
+from qgs import cli
 from qgs.cli import app
 from qgs.contracts.component import MissingExtraError
+from qgs.engine import training
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
 SMALL = (
@@ -94,12 +95,12 @@ def test_eval_of_other_settings_keeps_the_first_results(run: Path, tmp_path: Pat
 
 
 def test_a_signal_ends_with_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = engine.train
+    real = training.train
 
-    def stopped(*args: Any, **options: Any) -> engine.TrainingResult:
+    def stopped(*args: Any, **options: Any) -> training.TrainingResult:
         return replace(real(*args, **options), stopped_by="SIGTERM")
 
-    monkeypatch.setattr(engine, "train", stopped)
+    monkeypatch.setattr(training, "train", stopped)
     result = train(tmp_path / "run")
     assert result.exit_code == 128 + 15
     assert "stopped early by SIGTERM" in result.output

@@ -10,7 +10,8 @@ import torch
 from qgs.composer import resolve
 from qgs.data.sampling import Batch
 from qgs.data.stream import Share, training_batches
-from qgs.engine import train, training
+from qgs.engine import training
+from qgs.engine.training import train
 
 
 def spoiled(*arguments: Any, share: Share, **options: Any) -> Generator[Batch, None, None]:

@@ -11,11 +11,12 @@ import qgs
 from qgs.composer import Recipe
 from qgs.contracts import TrainingConfig
 from qgs.data.evaluation import evaluation_samples
-from qgs.engine import CollapseError, RunFolder
 from qgs.engine.distributed import StopRequest
+from qgs.engine.folder import RunFolder
 from qgs.engine.guard import (
     EMPTY_ALPHA,
     CollapseDetector,
+    CollapseError,
     GoodWeights,
     broken_tensors,
     not_finite,

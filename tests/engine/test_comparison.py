@@ -6,7 +6,8 @@ import pytest
 from rich.console import Console
 
 from qgs.composer import resolve
-from qgs.engine import evaluate, train
+from qgs.engine.evaluation import evaluate
+from qgs.engine.training import train
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
 SECONDS = 60

@@ -14,10 +14,11 @@ from training_runs import QUIET, Tiny, change_batches, losses, run, run_calling,
 
 from qgs.data.sampling import Batch
 from qgs.data.stream import WorkerError
-from qgs.engine import NonFiniteError, periodic
+from qgs.engine import periodic
 from qgs.engine.checkpoint import read_state
 from qgs.engine.distributed import StopRequest, signal
 from qgs.engine.folder import RunFolder as Folder
+from qgs.engine.guard import NonFiniteError
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 

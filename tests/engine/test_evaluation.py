@@ -21,8 +21,8 @@ from qgs.composer import Recipe
 from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.sampling import Sample
-from qgs.engine import evaluate
 from qgs.engine.comparison import compare
+from qgs.engine.evaluation import evaluate
 from qgs.engine.results import METHODS, Evaluation, read_results
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.metrics.dispersion import token_dispersion

@@ -13,8 +13,8 @@ from training_runs import Tiny, same
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Queries
-from qgs.engine import train
 from qgs.engine.checkpoint import initialise
+from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointError, save
 from qgs.io.published import exact_names_of
 from qgs.io.transfer import import_weights

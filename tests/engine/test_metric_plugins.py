@@ -26,9 +26,9 @@ from qgs.contracts import (
 )
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
-from qgs.engine import Evaluation, evaluate
 from qgs.engine.comparison import compare
 from qgs.engine.distributed import make_accelerator
+from qgs.engine.evaluation import Evaluation, evaluate
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.protocol import protocol_of
 from qgs.engine.results import read_results

@@ -21,9 +21,9 @@ from accelerate import Accelerator
 from training_runs import QUIET, Tiny, run, run_calling, same, weights
 
 from qgs.composer import Recipe
-from qgs.engine import RunFolder
 from qgs.engine.checkpoint import OtherRunError, RandomStates, read_state, write_state
 from qgs.engine.distributed import StopRequest
+from qgs.engine.folder import RunFolder
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointError, load_extra

@@ -13,10 +13,9 @@ from training_runs import Tiny, run_anywhere
 import qgs
 from qgs.composer import resolve
 from qgs.data.stream import training_batches
-from qgs.engine import RunFolder
 from qgs.engine import distributed as interrupt
 from qgs.engine.distributed import stop_requests
-from qgs.engine.folder import checkpoint_of
+from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.io.checkpoint import load_extra
 
 

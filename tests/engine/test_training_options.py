@@ -23,10 +23,9 @@ from qgs.cli.contest import curves_of
 from qgs.composer import Recipe
 from qgs.contracts.component import MissingExtraError
 from qgs.data.sampling import Batch
-from qgs.engine import NonFiniteError
 from qgs.engine import tracking as trackers
 from qgs.engine.checkpoint import read_state
-from qgs.engine.guard import MAX_SKIPPED
+from qgs.engine.guard import MAX_SKIPPED, NonFiniteError
 
 
 @pytest.fixture
