@@ -41,7 +41,7 @@ from qgs.data.scenes import EncodedFrame, EncodedScene
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.objective import Objective
-from qgs.engine.optimizer import make_optimizer
+from qgs.engine.parameters import make_optimizer
 from qgs.engine.training import compute_gradients
 
 TINY = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"

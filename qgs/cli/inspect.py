@@ -34,7 +34,7 @@ def compose(
 
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
-    from qgs.cli.tables import parameter_table
+    from qgs.cli.recipe_tables import parameter_table
     from qgs.composer import resolve
     from qgs.composer.recipe import annotated
 
@@ -54,7 +54,7 @@ def diff(
     ] = None,
 ) -> None:
     """Which slots and options of two recipes differ, and what that costs in parameters."""
-    from qgs.cli.tables import difference_tables
+    from qgs.cli.recipe_tables import difference_tables
     from qgs.composer import resolve
 
     resolved = resolve(first, set_a or ()), resolve(second, set_b or ())

@@ -24,7 +24,7 @@ from qgs.drawing.images import (
 from qgs.engine.checkpoint import RandomStates
 from qgs.engine.distributed import StopRequest, mean, sharded
 from qgs.engine.evaluation import evaluate
-from qgs.engine.optimizer import MovingAverage
+from qgs.engine.parameters import MovingAverage
 from qgs.engine.protocol import index_of
 from qgs.engine.tracking import Trackers
 from qgs.io.files import read_records, write_text

@@ -43,7 +43,7 @@ from qgs.engine.distributed import (
 from qgs.engine.folder import RunFolder
 from qgs.engine.guard import Guard, not_finite
 from qgs.engine.objective import Objective, Outcome
-from qgs.engine.optimizer import MovingAverage, make_optimizer
+from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.model import QueryGaussianModel

@@ -11,7 +11,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from qgs.cli import app, main
-from qgs.cli.tables import difference_tables
+from qgs.cli.recipe_tables import difference_tables
 from qgs.composer import resolve
 
 SMALL = """recipe: 1

@@ -10,7 +10,7 @@ from training_runs import Tiny, run, same, weights
 
 from qgs.composer import resolve
 from qgs.engine.checkpoint import read_state
-from qgs.engine.optimizer import MovingAverage, make_optimizer, parameter_groups, rate_factors
+from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups, rate_factors
 from qgs.io.checkpoint import unique_tensors
 
 

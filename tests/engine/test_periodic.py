@@ -14,7 +14,7 @@ from qgs.data.evaluation import evaluation_samples
 from qgs.drawing.images import rgb_picture
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.evaluation import evaluate
-from qgs.engine.optimizer import MovingAverage
+from qgs.engine.parameters import MovingAverage
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers
 

@@ -11,7 +11,7 @@ from torch import nn
 from qgs.composer import Recipe
 from qgs.contracts import SceneSourceConfig
 from qgs.engine.objective import Objective
-from qgs.engine.optimizer import make_optimizer
+from qgs.engine.parameters import make_optimizer
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
 

@@ -1,4 +1,4 @@
-"""What the optimiser moves and how fast, part by part; and the moving average of the weights."""
+"""Parameter groups, learning-rate factors of parts of the model, averaged weights."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
