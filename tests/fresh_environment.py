@@ -1,4 +1,4 @@
-"""A fresh virtual environment with qgs and query-gaussians-locus from their wheels.
+"""A fresh virtual environment with qgs, LocusGS and the rooms from their wheels.
 
 Installing torch again for every test would take minutes. All packages of the present environment
 but qgs and its plugins are lent through a folder of links, so that qgs can only come from its
@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-KEPT_BACK = re.compile(r"_*(editable_+)?_*qgs.*|.*\.pth|pip|pip-.*|__pycache__")
+KEPT_BACK = re.compile(
+    r"_*(editable_+)?_*(impl_)?(qgs|query_gaussians).*|.*\.pth|pip|pip-.*|__pycache__"
+)
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,11 @@ class FreshEnvironment:
 
 
 def make_fresh_environment(folder: Path) -> FreshEnvironment:
-    """Build the wheels of qgs and query-gaussians-locus and install them into a new environment."""
+    """Build the wheels of qgs and two plugins and install them into a new environment."""
     wheels = folder / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
-    subprocess.run([*build, str(ROOT), str(ROOT / "plugins/locus")], check=True)
+    plugins = (str(ROOT / "plugins" / name) for name in ("locus", "rooms"))
+    subprocess.run([*build, str(ROOT), *plugins], check=True)
     venv.create(folder / "venv", with_pip=True)
     environment = FreshEnvironment(folder / "venv")
     environment.run("pip uninstall -q -y setuptools", folder)  # torch wants a newer one: the lent
