@@ -105,7 +105,7 @@ def test_a_recipe_that_uses_one_is_refused(
     recipe = f"recipe: 1\nextends: tiny/tokengs.yaml\nplugins: [{plugin}]\n"
     (workshop / f"{plugin}.yaml").write_text(recipe, encoding="utf-8")
     refused = fresh.run(f"! qgs compose {plugin}.yaml", workshop)
-    assert f"{plugin}.yaml:3: plugins.0" in refused
+    assert f"{plugin}.yaml:3: plugins.1" in refused
     assert f"{distribution} 0.7" in refused
     assert told in refused
     assert "Traceback" not in refused
