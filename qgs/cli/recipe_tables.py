@@ -1,11 +1,8 @@
 """Tables of `qgs compose` and `qgs diff`: parameters of recipes, and where two differ."""
 
-from typing import Any
-
 from rich.markup import escape
 from rich.table import Table
-from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
+from torch import nn
 
 from qgs.composer import Recipe
 from qgs.composer.slots import LAYER_SLOTS
@@ -56,19 +53,9 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
     return [slots, options, parameters]
 
 
-class _LargeWeightsUnwritten(TorchFunctionMode):
-    """Leaves large weights unwritten; on the meta device torch would import its compiler first."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func in (Tensor.uniform_, Tensor.normal_) and args[0].numel() > 2**14:
-            return args[0]
-        return func(*args, **(kwargs or {}))
-
-
 def parameter_counts(recipe: Recipe) -> dict[str, int]:
     """Component to its number of parameters, decoder layers summed by slot."""
-    with _LargeWeightsUnwritten():
-        model = recipe.build_model()
+    model = recipe.build_model("meta")
     sublayers = {
         f"decoder.{slot}": sum(_count(getattr(layer, slot)) for layer in model.decoder)
         for slot in LAYER_SLOTS
