@@ -47,7 +47,7 @@ def test_every_recipe_composes(file: str) -> None:
 @pytest.mark.parametrize("pair", PAIRS)
 def test_tokengs_and_locusgs_have_the_same_budget(pair: str) -> None:
     ours, theirs = (resolve(RECIPES / pair.format(name)) for name in ("tokengs", "locus"))
-    for section in ("data", "views", "training", "evaluation"):
+    for section in ("data", "views", "optimizer", "training", "evaluation", "metrics"):
         assert ours.tree.get(section) == theirs.tree.get(section)
     for section in ("width", "heads", "encoder", "renderer"):
         assert ours.tree["model"][section] == theirs.tree["model"][section]

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 import torch
 
 from qgs.composer import Recipe
+from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
 from qgs.data.sampling import Sample, stack_views
@@ -40,14 +40,15 @@ def evaluate(
     A scene that fails is named in the result with the reason, and the others go on. Leaves the
     model in the mode it was in. step: optimiser steps behind the weights. batch: scenes that pass
     through the model together; with tuned tokens each passes alone.
-    Raises what opening the data source or the index raises, and ValueError when no scene at all
-    could be judged, `batch` is less than 1, or two values of metrics have one name.
+    Raises what opening the data source or the index and `Measures` raise, and ValueError when no
+    scene at all could be judged or `batch` is less than 1.
     """
     if batch < 1:
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
     source, index = recipe.build_data(), index_of(recipe)
     plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index)
-    judge = _Judge(model, recipe, source)
+    measures = Measures(recipe)
+    judge = _Judge(model, recipe, source, measures)
     training = model.training
     model.eval()
     try:
@@ -60,42 +61,73 @@ def evaluate(
         raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
     return Evaluation(
         protocol=protocol_of(recipe, index, plan.wanted),
-        columns=judge.columns,
+        columns=measures.columns,
         scores=scores,
         wanted=plan.wanted,
         gaussians=model.queries.count * model.head.gaussians_per_query,
         missing=missing,
         null=plan.null,
         unlisted=plan.unlisted,
-        incomplete=judge.incomplete(scores),
+        incomplete=measures.incomplete(scores),
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
 
 
-class _Judge:
-    """Scores samples. columns: name of every value to how it is shown."""
+class Measures:
+    """The metrics of a recipe. columns: name of every value to how it is shown.
 
-    def __init__(self, model: QueryGaussianModel, recipe: Recipe, source: SceneSource) -> None:
-        self._model = model
-        self._source = source
-        self._device = next(model.parameters()).device
-        self._metrics = {n: m.to(self._device).eval() for n, m in recipe.build_metrics().items()}
-        self._tune = None
-        if steps := recipe.evaluation.tuning_steps:
-            rate, loss = recipe.evaluation.tuning_rate, tuning_loss(recipe)
-            self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate)
-        self._needed = {need for metric in self._metrics.values() for need in metric.needs}
+    Making one finds what is wrong with the metrics before anything is judged: raises ValueError
+    when two values have one name, PluginError for the code of a plugin that fails.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._chosen = {
+            path[1]: part for path, part in recipe.parts.items() if path[0] == "metrics"
+        }
+        self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
+        self.needed = {need for metric in self.metrics.values() for need in metric.needs}
         self._owners: dict[str, Metric] = {}
         self.columns: dict[str, Column] = {}
-        for label, metric in self._metrics.items():
-            for key, column in metric.columns().items():
+        for label, metric in self.metrics.items():
+            with self._named(label, "columns"):
+                columns = metric.columns()
+            for key, column in columns.items():
                 name = _name(label, key)
                 if name in self.columns:
                     raise ValueError(f"two values of the metrics are called {name}; rename one")
                 self.columns[name], self._owners[name] = column, metric
 
+    def __call__(self, method: str, given: MetricInput) -> dict[str, float]:
+        """A sample's values by METHOD_NAME, without those that lack what they need."""
+        values: dict[str, float] = {}
+        for label, metric in self.metrics.items():
+            if metric.unavailable or any(getattr(given, need) is None for need in metric.needs):
+                continue
+            with self._named(label, "forward"):
+                found = metric(given)
+                found = found if isinstance(found, Mapping) else {"": found}
+                if found.keys() != metric.columns().keys():
+                    raise ValueError(
+                        f"gives values for {[*found]}, but has columns for {[*metric.columns()]}"
+                    )
+                means = {key: float(value.double().mean()) for key, value in found.items()}
+            values |= {f"{method}_{_name(label, key)}": mean for key, mean in means.items()}
+        return values
+
+    @contextmanager
+    def _named(self, label: str, function: str) -> Iterator[None]:
+        """Name a plugin's metric and its distribution in what its code raises."""
+        try:
+            yield
+        except Exception as error:
+            chosen = self._parts["metrics", label]
+            if chosen.installed.plugin is BUILTIN:
+                raise
+            raise component_failure(chosen.type, function, error, chosen.installed) from error
+
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
+        """Why values are missing from `scores`, by name."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:
@@ -104,6 +136,24 @@ class _Judge:
                 needs = " and ".join(metric.needs).replace("_", " ")
                 found[name] = f"it needs {needs}, not known for {lacking} of {len(scores)} scenes"
         return found
+
+
+class _Judge:
+    """Scores samples."""
+
+    def __init__(
+        self, model: QueryGaussianModel, recipe: Recipe, source: SceneSource, measures: Measures
+    ) -> None:
+        self._model = model
+        self._source = source
+        self._device = next(model.parameters()).device
+        self._measures = measures
+        for metric in measures.metrics.values():
+            metric.to(self._device)
+        self._tune = None
+        if steps := recipe.evaluation.tuning_steps:
+            rate, loss = recipe.evaluation.tuning_rate, tuning_loss(recipe)
+            self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate)
 
     def judged(
         self, samples: Iterable[Sample | SceneFailure], batch: int
@@ -152,7 +202,7 @@ class _Judge:
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
         targets = sample.targets.to(self._device)
         rendering = self._model.render(gaussians, targets.cameras)
-        depth = true_depth(self._source, sample) if "true_depth" in self._needed else None
+        depth = true_depth(self._source, sample) if "true_depth" in self._measures.needed else None
         if depth is not None:
             depth = depth[None].to(self._device)
         count = self._model.head.gaussians_per_query
@@ -164,13 +214,8 @@ class _Judge:
             "mean_colour": MetricInput(mean_colour(inputs, targets.cameras), targets),
         }
         values: dict[str, float] = {}
-        for (method, shown), (label, metric) in product(given.items(), self._metrics.items()):
-            if metric.unavailable or any(getattr(shown, need) is None for need in metric.needs):
-                continue
-            found = metric(shown)
-            found = found if isinstance(found, Mapping) else {"": found}
-            for key in metric.columns():
-                values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
+        for method, shown in given.items():
+            values |= self._measures(method, shown)
         return {**values, "gaussians_used": float((gaussians.opacities > OPACITY_USED).sum())}
 
 

@@ -95,7 +95,6 @@ class Guard:
         self.incidents = self.skipped = 0
         self._accelerator, self._objective, self._repeat = accelerator, objective, repeat
         self._saver, self._skips = saver, config.on_nonfinite == "skip"
-        saver.parts |= {"guard": self, "good": self.good}
 
     def state(self) -> dict[str, Any]:
         detector = self.detector.state()

@@ -1,6 +1,6 @@
 """What a training step minimises: every supervised layer rendered and compared with photos."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,6 +54,9 @@ class Objective(nn.Module):
             raise ValueError("a recipe needs at least one loss to train; add one under `losses`")
         self.model = model
         self.losses = nn.ModuleDict(losses)
+        reads_none = {name: loss.renderings == "none" for name, loss in losses.items()}
+        self._of_images = [name for name, none in reads_none.items() if not none]
+        self._of_gaussians = [name for name, none in reads_none.items() if none]
         self.render_views = render_views
         self.hook: Callable[[str, Any], None] = lambda name, value: None
         self._owners: dict[str, str] = {}
@@ -77,11 +80,12 @@ class Objective(nn.Module):
                 rendering = self._render(layer.prediction.gaussians, part.cameras)
                 self.hook(f"rendering of layer {number}", rendering)
                 signs.append((views / count, self._signs(rendering, part)))
-                found = self._terms(layer.prediction, rendering, part, number)
+                found = self._terms(self._of_images, layer.prediction, rendering, part, number)
                 layer.add(found, weight * views / count)
-            no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
-            found = self._terms(layer.prediction, no_views, targets, number)
-            layer.add(found, weight * count / count)
+            if self._of_gaussians:
+                no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
+                found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, number)
+                layer.add(found, weight)
             self.hook(f"gradient of layer {number}", layer.gradients)
             total = total + layer.total()
             _add(layer.terms, terms)
@@ -110,14 +114,17 @@ class Objective(nn.Module):
         return Rendering(*(torch.cat(of_parts, 1) for of_parts in images))
 
     def _terms(
-        self, layer: LayerPrediction, rendering: Rendering, target: Views, number: int
+        self,
+        names: Sequence[str],
+        layer: LayerPrediction,
+        rendering: Rendering,
+        target: Views,
+        number: int,
     ) -> dict[str, Tensor]:
-        """The terms of the losses that want renderings, or of the others where it shows no view."""
+        """The terms of the losses `names`."""
         terms: dict[str, Tensor] = {}
-        for name, loss in self.losses.items():
-            if (loss.renderings == "none") != (rendering.rgb.shape[1] == 0):
-                continue
-            new = loss(layer, rendering, target)
+        for name in names:
+            new = self.losses[name](layer, rendering, target)
             repeated = sorted(term for term in new if self._owners.setdefault(term, name) != name)
             if repeated:
                 raise ValueError(

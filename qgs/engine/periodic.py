@@ -23,7 +23,7 @@ from qgs.drawing.images import (
 )
 from qgs.engine.checkpoint import RandomStates
 from qgs.engine.distributed import StopRequest, mean, sharded
-from qgs.engine.evaluation import evaluate
+from qgs.engine.evaluation import Measures, evaluate
 from qgs.engine.parameters import MovingAverage
 from qgs.engine.protocol import index_of
 from qgs.engine.tracking import Trackers
@@ -68,6 +68,7 @@ class PeriodicEvaluation:
         self._in_shards = bool(sharded(model))
         self._random = RandomStates(accelerator)
         self._stop = StopRequest()
+        Measures(recipe)  # a fault of a metric is raised now, not after the training
 
     def run(self, step: int, stop: StopRequest | None = None) -> None:
         """Evaluate after `step` optimiser steps. All processes must call this.

@@ -156,7 +156,9 @@ class Trainer:
             "step_size": config.batch_size * config.accumulate * processes,
             "scenes": scenes_fingerprint(source),
         }
-        self.saver.parts |= {
+        self.saver.parts |= {  # besides the weights
+            "guard": self.guard,
+            "good": self.guard.good,
             "counters": self,
             "moments": OptimizerState(objective, self.torch_optimizer),
             "schedule": self.optimizer,

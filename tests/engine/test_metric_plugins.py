@@ -14,7 +14,7 @@ from torch import Tensor
 
 from qgs.analysis.report import Contender
 from qgs.cli.contest import Entry, report_of, table_of
-from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer import PluginError, Recipe, RecipeError, resolve
 from qgs.contracts import (
     CONTRACT_VERSION,
     Column,
@@ -28,11 +28,12 @@ from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
 from qgs.engine.comparison import compare
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.evaluation import Evaluation, evaluate
+from qgs.engine.evaluation import Evaluation, Measures, evaluate
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.protocol import protocol_of
 from qgs.engine.results import read_results
 from qgs.engine.tracking import Trackers
+from qgs.engine.training import train
 
 
 class MeanAbsoluteError(Metric):
@@ -206,6 +207,26 @@ def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(
 def test_two_values_of_one_name_are_refused(mine: Callable[..., Recipe]) -> None:
     recipe = mine("metrics={mask_mean: {type: mine/mae}, mask: {type: mine/masked}}")
     with pytest.raises(ValueError, match="two values of the metrics are called mask_mean"):
+        Measures(recipe)
+
+
+def test_a_metric_that_cannot_be_shown_is_refused_before_training(
+    mine: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recipe = mine("metrics={mask: {type: mine/masked}}")
+    monkeypatch.setattr(Masked, "columns", lambda self: self.no)
+    with pytest.raises(PluginError, match="`columns` of `mine/masked` raises AttributeError"):
+        train(recipe, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_metric_that_fails_is_named(
+    mine: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = mine("metrics={mask: {type: mine/masked}}")
+    monkeypatch.setattr(Masked, "needs", ())
+    monkeypatch.setattr(Masked, "forward", lambda self, given: {"typo": torch.zeros(1)})
+    with pytest.raises(ValueError, match=r"`forward` of `mine/masked` raises.*\['typo'\]"):
         evaluate(recipe.build_model(), recipe)
 
 
