@@ -82,9 +82,7 @@ class Measures:
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        self._chosen = {
-            path[1]: part for path, part in recipe.parts.items() if path[0] == "metrics"
-        }
+        self._parts = recipe.parts
         self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
         self.needed = {need for metric in self.metrics.values() for need in metric.needs}
         self._owners: dict[str, Metric] = {}
