@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from query_gaussians import refuse_other_qgs
 
 if TYPE_CHECKING:
     from qgs.analysis.trace import trace
@@ -23,13 +24,13 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-if list(Path(__file__).parents[1].glob("qgs-[0-9]*-info")):
-    raise ImportError(
-        "PyPI's `qgs`, a climate model, is installed in the same folder as query-gaussians, and "
-        "both have a package called `qgs`: run `pip uninstall qgs`, then "
-        "`pip install --force-reinstall --no-deps query-gaussians`, and keep them in separate "
-        "environments"
-    )
+DISTRIBUTIONS = {
+    "qgs.plugins": {name: f"query-gaussians-{name}" for name in ("locus", "ellipsoid", "rooms")},
+    "qgs.commands": {"data": "query-gaussians-datatools"},
+}
+"""This repository's other distributions, by entry point; messages name those that are missing."""
+
+refuse_other_qgs(__file__)
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 """PyTorch's CPU allocator then asks for huge pages for large tensors, if qgs is imported before it

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+import qgs
 from qgs.cli.new_plugin import rendered
 
 ROOT = Path(__file__).parents[1]
@@ -118,7 +119,7 @@ def source(project: Path, *folders: Path) -> Source:
     files = {
         path.relative_to(folder.parent).as_posix(): path.read_text(encoding="utf-8")
         for folder in folders
-        for path in folder.rglob("*.py")
+        for path in ([folder] if folder.is_file() else folder.rglob("*.py"))
     }
     assert files, folders
     return Source(files, tomllib.loads(project.read_text(encoding="utf-8"))["project"])
@@ -138,7 +139,7 @@ def plugin(name: str) -> Source:
 
 
 SOURCES = {
-    "query-gaussians": source(ROOT / "pyproject.toml", ROOT / "qgs"),
+    "query-gaussians": source(ROOT / "pyproject.toml", ROOT / "qgs", ROOT / "query_gaussians.py"),
     **{f"query-gaussians-{name}": plugin(name) for name in PLUGINS},
     "a new plugin": template("src"),
 }
@@ -207,3 +208,12 @@ def test_the_tests_of_qgs_require_what_they_import() -> None:
     used -= ours | MADE_UP
     assert "pytest" in used
     assert used <= tests.required | tests.extras()
+
+
+def test_messages_name_the_distributions_of_this_repository() -> None:
+    offered: dict[str, dict[str, str]] = {}
+    for file in ROOT.glob("plugins/*/pyproject.toml"):
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        for group, entries in project["entry-points"].items():
+            offered.setdefault(group, {}).update(dict.fromkeys(entries, project["name"]))
+    assert offered == qgs.DISTRIBUTIONS

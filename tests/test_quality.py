@@ -13,6 +13,7 @@ SOURCES = ("qgs", "plugins", "tests", "tools")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 20_000, 200
+FORMER_NAME = re.compile(r"\bqgs-(locus|ellipsoid|rooms|datatools)\b|pip install (qgs)\b|\bqgs\[")
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
@@ -57,14 +58,22 @@ def test_files_are_short_and_the_core_is_small() -> None:
     assert sum(core) <= MAX_CORE_LINES
 
 
-def test_no_path_of_one_machine() -> None:
-    suffixes = {"", ".py", ".md", ".yaml", ".yml", ".toml", ".sh"}
+def lines_with(pattern: re.Pattern[str]) -> list[str]:
+    """FILE:LINE: TEXT of lines that match, in all texts of the repository."""
+    suffixes = {"", ".py", ".md", ".yaml", ".yml", ".toml", ".sh", ".jinja"}
     at_root = [path for path in sorted(ROOT.iterdir()) if path.is_file() and path.name != ".git"]
     assert ROOT / "README.md" in at_root
-    found = [
+    return [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
         for path in [*at_root, *files(TEXTS, suffixes)]
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
-        if MACHINE_PATH.search(line)
+        if pattern.search(line)
     ]
-    assert found == []
+
+
+def test_no_path_of_one_machine() -> None:
+    assert lines_with(MACHINE_PATH) == []
+
+
+def test_distributions_go_by_their_present_names() -> None:
+    assert lines_with(FORMER_NAME) == []

@@ -12,7 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.data.sampling import Sample
+from qgs.contracts import Scene, ViewsConfig
+from qgs.data.sampling import Sample, make_sample, own_world
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
     depth_picture,
@@ -25,8 +26,8 @@ from qgs.drawing.images import (
 )
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
-from qgs.metrics.baselines import mean_colour, nearest_input
-from qgs.metrics.images import psnr
+from qgs.metrics.baselines import BASELINES
+from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -37,8 +38,6 @@ OVERVIEW_COLUMNS = 8
 
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
-
-BASELINES = {"nearest input": nearest_input, "mean colour": mean_colour}
 
 
 def choose_frames(
@@ -78,6 +77,20 @@ def choose_frames(
     if twice:
         raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
     return tuple(frames), tuple(compare)
+
+
+def choose_sample(
+    scene: Scene,
+    views: ViewsConfig,
+    inputs: int | None,
+    frames: Sequence[int] | None,
+    compare: Sequence[int] | None,
+) -> tuple[Sample, tuple[Tensor, Tensor]]:
+    """The views of `scene` that `choose_frames` picks, and their world as of `own_world`."""
+    wanted, span = inputs or views.inputs, views.gap[1] + 1
+    picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
+    sample = make_sample(scene, *picked, views, mirror=False)
+    return sample, own_world(scene.cameras[list(picked[0])].c2w, views, scene.name)
 
 
 def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
@@ -219,7 +232,8 @@ def _write_views(reconstruction: Reconstruction, out: Path) -> None:
         write_png(side_by_side([rows["photo"][i], rows["render"][i]]), out / "views" / name)
         write_png(rows["depth"][i], out / "depth" / name)
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
-    titles = [f"frame {scores[i].frame}, {kinds[i]}\n{scores[i].psnr:.1f} dB" for i in shown]
+    quality = [f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}" for score in scores]
+    titles = [f"frame {scores[i].frame}, {kinds[i]}\n{quality[i]}" for i in shown]
     chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
     overview = figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
     write_png(overview, out / "overview.png")

@@ -32,7 +32,7 @@ from qgs.drawing.queries import (
     support_picture,
     token_picture,
 )
-from qgs.metrics.images import psnr
+from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
 
@@ -52,25 +52,18 @@ class Contender:
 
 
 @dataclass(frozen=True)
-class Baseline:
-    """What needs no model: its `Report.columns` on the same views."""
-
-    name: str
-    scores: Mapping[str, float | None]
-
-
-@dataclass(frozen=True)
 class Report:
     """A comparison of `contenders`, in order, by `columns`: each score and how it is shown.
 
-    samples: the unseen scenes to picture. depths: for each the true depth (T, 1, H, W) of its
-    targets in the model's units, where known. facts: what was run where.
+    baselines: by name, their scores on the same views. samples: the unseen scenes to picture.
+    depths: for each the true depth (T, 1, H, W) of its targets in the model's units, where known.
+    facts: what was run where.
     """
 
     columns: Mapping[str, Column]
     title: str
     contenders: Sequence[Contender]
-    baselines: Sequence[Baseline]
+    baselines: Mapping[str, Mapping[str, float | None]]
     samples: Sequence[Sample]
     depths: Sequence[Tensor | None]
     facts: Mapping[str, str]
@@ -151,7 +144,8 @@ def scene_columns(
     for contender in contenders:
         gaussians = contender.model(sample.inputs).gaussians
         rendering = contender.model.render(gaussians, shown.cameras)
-        quality = [f"{value:.1f} dB" for value in psnr(rendering.rgb[0], truth).tolist()]
+        scores = psnr(rendering.rgb[0], truth).tolist()
+        quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
         columns[contender.name] = _photos(rendering.rgb[0], quality)
         depths[f"{contender.name}, depth"] = rendering.depth[0]
     near, far = depth_range(torch.cat(list(depths.values())))

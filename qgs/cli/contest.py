@@ -13,7 +13,7 @@ import yaml
 from rich import box
 from rich.table import Table
 
-from qgs.analysis.report import Baseline, Contender, Report
+from qgs.analysis.report import Contender, Report
 from qgs.composer import Recipe, resolve
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
@@ -21,6 +21,7 @@ from qgs.engine.evaluation import Evaluation, evaluate
 from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
 from qgs.io.ply import write_ply
+from qgs.metrics.baselines import BASELINES
 
 SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
@@ -85,10 +86,9 @@ def curves_of(folder: RunFolder) -> Curves:
     return Curves(*([step[name] for step in steps] for name in names))
 
 
-def baselines(entry: Entry) -> list[Baseline]:
-    """What needs no model, on the views that `entry` was judged on."""
-    named = {"Nearest input": "nearest_input", "Mean colour": "mean_colour"}
-    return [Baseline(name, entry.evaluation.means(method)) for name, method in named.items()]
+def baselines(entry: Entry) -> dict[str, dict[str, float | None]]:
+    """Scores, by name, of what needs no model on the views that `entry` was judged on."""
+    return {n.replace("_", " ").capitalize(): entry.evaluation.means(n) for n in BASELINES}
 
 
 def table_of(entries: Sequence[Entry]) -> Table:
@@ -111,19 +111,18 @@ def table_of(entries: Sequence[Entry]) -> Table:
         sizes = (f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}")
         table.add_row(c.name, *cells, *sizes)
     table.add_section()
-    for b in baselines(entries[0]):
-        cells = [column.shown(b.scores[name]) for name, column in columns.items()]
-        table.add_row(b.name, *cells, *["–"] * 3, style="dim")
+    for baseline, scores in baselines(entries[0]).items():
+        cells = [column.shown(scores[name]) for name, column in columns.items()]
+        table.add_row(baseline, *cells, *["–"] * 3, style="dim")
     return table
 
 
 def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
-    """The comparison, pictured on the first three test scenes."""
+    """The comparison, pictured on the first PICTURED_SCENES test scenes."""
     recipe = entries[0].recipe
-    few = recipe.evaluation.model_copy(update={"scenes": 3, "samples": 1})
+    few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
     source = recipe.build_data()
-    samples = evaluation_samples(source, recipe.views, few)[:3]
-    names = [entry.contender.name for entry in entries]
+    samples = evaluation_samples(source, recipe.views, few)[:PICTURED_SCENES]
     height, width = recipe.tree["data"]["image_size"]
     plugins = {name: v for entry in entries for name, v in entry.recipe.plugin_versions.items()}
     software = {"torch": torch.__version__, **plugins}
@@ -132,7 +131,7 @@ def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
         device = torch.cuda.get_device_name()
     return Report(
         columns=entries[0].evaluation.columns,
-        title=" and ".join(names) + f", {seconds:g} seconds of training each",
+        title=f"{' and '.join(e.contender.name for e in entries)}, {seconds:g} seconds each",
         contenders=[entry.contender for entry in entries],
         baselines=baselines(entries[0]),
         samples=samples,

@@ -62,21 +62,7 @@ def evaluate(
     console = Console()
     if compare:
         idle = [*settings, *[f"--batch {batch}"] * (batch > 1), *["--strict"] * strict]
-        if idle:
-            raise ValueError(
-                f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
-                "evaluate each run with these settings first"
-            )
-        from qgs.engine.comparison import compare as compared
-        from qgs.engine.results import read_results
-
-        comparisons = compared([read_results(run) for run in runs], across_protocols)
-        comparisons.show(console)
-        if out:
-            comparisons.write(out)
-        end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
-        console.print(end, soft_wrap=True)
-        return
+        return _compare(runs, across_protocols, out, idle, console)
     if len(runs) > 1 or across_protocols:
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
@@ -107,6 +93,26 @@ def evaluate(
         console.print(hint, soft_wrap=True, markup=False)
     if strict and evaluation.missing:
         raise typer.Exit(1)
+
+
+def _compare(
+    runs: list[Path], across: bool, out: Path | None, idle: list[str], console: Console
+) -> None:
+    """Show the results in `runs` side by side. Raises ValueError for `idle` options."""
+    if idle:
+        raise ValueError(
+            f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
+            "evaluate each run with these settings first"
+        )
+    from qgs.engine.comparison import compare
+    from qgs.engine.results import read_results
+
+    comparisons = compare([read_results(run) for run in runs], across)
+    comparisons.show(console)
+    if out:
+        comparisons.write(out)
+    end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
+    console.print(end, soft_wrap=True)
 
 
 def evaluation_folder(checkpoint: Path, other: bool) -> Path:

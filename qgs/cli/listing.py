@@ -124,13 +124,12 @@ def _type(option: Schema) -> str:
 def _fields(component: type[Component]) -> Iterator[str]:
     """What it requires and provides with default options; nothing where that is nothing."""
     config = default_config(component)
-    declarations = {"requires": component.requires, "provides": component.provides}
-    for word, declare in declarations.items():
-        told = "depends on options"
+    for word, declare in (("requires", component.requires), ("provides", component.provides)):
+        text = "depends on options"
         if config is not None:
             try:
-                told = "; ".join(f"{name} ({spec})" for name, spec in declare(config).items())
+                text = "; ".join(f"{name} ({spec})" for name, spec in declare(config).items())
             except Exception as error:  # code of a plugin
-                told = f"fails: {type(error).__name__}: {error}"
-        if told:
-            yield escape(f"  {word}: {told}")
+                text = f"fails: {type(error).__name__}: {error}"
+        if text:
+            yield escape(f"  {word}: {text}")

@@ -28,9 +28,9 @@ def new_plugin(
     check_name(name)
     folder = (out or Path(distribution_of(name))).expanduser()
     write_plugin(name, folder)
-    next_steps = "pip install -e '.[test]'", "python -m pytest", "qgs compose recipe.yaml"
-    lines = [f"wrote {folder}; next:", f"cd {shlex.quote(str(folder))}", *next_steps]
-    typer.echo("\n  ".join(lines))
+    first = f"wrote {folder}; next, with query-gaussians-rooms installed for the recipe:"
+    steps = f"cd {shlex.quote(str(folder))}", "pip install -e '.[test]'", "python -m pytest"
+    typer.echo("\n  ".join([first, *steps, "qgs compose recipe.yaml"]))
 
 
 def distribution_of(name: str) -> str:

@@ -6,11 +6,10 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from qgs import DISTRIBUTIONS
+
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
-
-DISTRIBUTIONS = {"data": "query-gaussians-datatools"}
-"""Commands of this repository's own distributions, named when they are not installed."""
 
 
 class CommandGroup(TyperGroup):
@@ -29,10 +28,10 @@ class CommandGroup(TyperGroup):
         offers = [*entry_points(group=GROUP, name=cmd_name)]
         if offers:
             return OfferedCommand(cmd_name, offers)
-        if cmd_name in DISTRIBUTIONS:
+        if own_distribution := DISTRIBUTIONS[GROUP].get(cmd_name):
             raise ValueError(
-                f"the command `qgs {cmd_name}` belongs to {DISTRIBUTIONS[cmd_name]}, which is not "
-                f"installed: run `pip install {DISTRIBUTIONS[cmd_name]}`"
+                f"the command `qgs {cmd_name}` belongs to {own_distribution}, which is not "
+                f"installed: run `pip install {own_distribution}`"
             )
         return None
 
@@ -57,7 +56,7 @@ class OfferedCommand(TyperCommand):
             )
         try:
             app = entry.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ValueError(
                 f"{command} of {self.releases} cannot be imported from `{entry.value}`: "
                 f"{type(error).__name__}: {error}; update {self.releases}"

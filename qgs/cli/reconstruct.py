@@ -62,35 +62,28 @@ def reconstruct(
             f"{out} is not empty; choose another --out, or add --overwrite to replace the files "
             "of the same names"
         )
-    chosen = frame_list(frames, "--frames")
-    compared = frame_list(holdout, "--holdout")
+    chosen, compared = frame_list(frames, "--frames"), frame_list(holdout, "--holdout")
     pixels = parse_size(size)
 
     from rich.console import Console
 
-    from qgs.analysis.reconstruction import choose_frames, write_reconstruction
+    from qgs.analysis.reconstruction import choose_sample, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.composer.registry import load_sound_plugins
-    from qgs.data.sampling import make_sample, own_world
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.io.checkpoint import load, load_recipe
 
     console = Console()
-    file = checkpoint_of(checkpoint)
-    device = choose_device(device)
+    file, device = checkpoint_of(checkpoint), choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
     registry, broken = load_sound_plugins()
     for problem in broken:
         console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
     sources = registry.components("data")
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
-    wanted = inputs or recipe.views.inputs
-    span = recipe.views.gap[1] + 1
-    picked = choose_frames(len(scene), wanted, span, chosen, compared, held_out=scene.held_out)
-    sample = make_sample(scene, *picked, recipe.views, mirror=False)
+    sample, world = choose_sample(scene, recipe.views, inputs, chosen, compared)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    world = own_world(scene.cameras[list(picked[0])].c2w, recipe.views, scene.name)
     gaussians, record = tuned(model, recipe, sample, tune) if tune else (None, None)
     if record:
         console.print(
@@ -156,11 +149,10 @@ def tuned(
     """Gaussians of tokens tuned on the inputs of `sample`, and a record of the tuning."""
     from qgs.engine.tuning import tune, tuning_loss
 
-    loss, rate = tuning_loss(recipe), recipe.evaluation.tuning_rate
-    tuning = tune(model, sample.inputs, loss, steps, rate)
-    before, after = tuning.losses[0], tuning.losses[-1]
-    record = {"steps": steps, "rate": rate, "loss_before": before, "loss_after": after}
-    return tuning.prediction.gaussians, record
+    rate = recipe.evaluation.tuning_rate
+    tuning = tune(model, sample.inputs, tuning_loss(recipe), steps, rate)
+    losses = {"loss_before": tuning.losses[0], "loss_after": tuning.losses[-1]}
+    return tuning.prediction.gaussians, {"steps": steps, "rate": rate, **losses}
 
 
 def frame_list(text: str | None, option: str) -> list[int] | None:
@@ -179,19 +171,22 @@ def score_table(result: Reconstruction) -> Table:
     """PSNR of every rendered view and of the baselines, inputs first, and the means by kind."""
     from rich.table import Table
 
-    from qgs.analysis.reconstruction import BASELINES, KINDS
+    from qgs.analysis.reconstruction import KINDS
+    from qgs.metrics.baselines import BASELINES
+    from qgs.metrics.images import Psnr
 
     table = Table(title=f"{result.sample.scene}: {result.gaussians.count:,} Gaussians")
     table.add_column("view")
-    for column in ("frames", "PSNR", *BASELINES):
-        table.add_column(column, justify="right")
+    shown = Psnr.column.shown
+    for name in ("frames", Psnr.column.heading, *BASELINES):
+        table.add_column(name.replace("_", " "), justify="right")
     for kind in KINDS:
         scores = [score for score in result.scores if score.kind == kind]
         rows = [[score.psnr, *score.baselines.values()] for score in scores]
         for score, row in zip(scores, rows, strict=True):
-            table.add_row(kind, str(score.frame), *(f"{value:.2f}" for value in row))
+            table.add_row(kind, str(score.frame), *map(shown, row))
         if rows:
-            means = [f"{sum(column) / len(rows):.2f}" for column in zip(*rows, strict=True)]
+            means = [shown(sum(values) / len(rows)) for values in zip(*rows, strict=True)]
             table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")
             table.add_section()
     return table

@@ -1,4 +1,4 @@
-"""Installed components: found by metadata, imported only when a recipe names their plugin."""
+"""Installed components: found by metadata, imported when a recipe or a command asks for them."""
 
 import inspect
 import json
@@ -41,7 +41,7 @@ BUILTIN = Plugin(
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
     ),
 )
-DEVICES = ("cpu", "cuda", "mps")
+RENDERER_DEVICES = ("cpu", "cuda", "mps")
 """Types of the devices that a renderer can render on."""
 
 
@@ -74,7 +74,7 @@ class InstalledPlugin:
     def repair(self, place: str) -> str:
         """What its user can do about a fault. place: FILE:LINE of it."""
         own = self.editable or not self.distribution
-        return f"mend {place}" if own else f"update {self.released_as}"
+        return f"correct {place}" if own else f"update {self.released_as}"
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,10 @@ def load_plugin(name: str) -> InstalledPlugin:
     if name == "qgs":
         return builtin()
     available = available_plugins()
-    entries = available.get(name)
-    if not entries:
+    if not (entries := available.get(name)):
         installed = ", ".join(sorted(available)) or "none"
-        fix = f"install the one that does; installed plugins: {installed}"
+        wanted = qgs.DISTRIBUTIONS[ENTRY_POINT_GROUP].get(name, "the one that does")
+        fix = f"install {wanted}; installed plugins: {installed}"
         raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
@@ -155,8 +155,8 @@ def load_plugin(name: str) -> InstalledPlugin:
         package = entry.module.partition(".")[0]
         spec = find_spec(package)
         place = place_in(error, [package_of(spec.origin)] if spec and spec.origin else [])
-        told = f"{type(error).__name__}: {error}{f' (at {place})' if place else ''}"
-        reason = f"{named} cannot be imported from `{entry.value}`: {told}"
+        message = f"{type(error).__name__}: {error}{f' (at {place})' if place else ''}"
+        reason = f"{named} cannot be imported from `{entry.value}`: {message}"
         fix = installed.repair(place or f"`{entry.value}`")
         missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
         if missing == entry.module:
@@ -229,8 +229,8 @@ def component_fault(component: object) -> str:
         return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
     if issubclass(component, Renderer):
         given: object = component.devices
-        if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
-            return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
+        if not (isinstance(given, tuple) and given and set(given) <= set(RENDERER_DEVICES)):
+            return f"whose `devices` is {given!r}; give some of {RENDERER_DEVICES} as a tuple"
     config: object = component.Config
     if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
         return "whose Config is no ComponentConfig"

@@ -37,8 +37,8 @@ class Yaml12Loader(yaml.SafeLoader):
         """PyYAML's, refusing what would overflow the stack of whoever walks the tree."""
         self._nesting += 1
         if self._nesting > MAX_NESTING:
-            told = f"mappings and lists stand more than {MAX_NESTING} deep in each other"
-            raise SizeError(problem=told, problem_mark=self.peek_event().start_mark)
+            text = f"mappings and lists stand more than {MAX_NESTING} deep in each other"
+            raise SizeError(problem=text, problem_mark=self.peek_event().start_mark)
         node = super().compose_node(parent, index)
         self._nesting -= 1
         return node
@@ -148,8 +148,8 @@ class _Reader:
     def read(self, node: yaml.Node, path: KeyPath) -> Node:
         self.count += 1
         if self.count > MAX_VALUES:
-            told = f"there are more than {MAX_VALUES:,} values, those of aliases counted each time"
-            raise SizeError(problem=told, problem_mark=node.start_mark)
+            text = f"there are more than {MAX_VALUES:,} values, those of aliases counted each time"
+            raise SizeError(problem=text, problem_mark=node.start_mark)
         if any(node is parent for parent in self.open):
             return self.stop(node, path, "an alias stands inside its own anchor", "remove it")
         if node.tag not in _TAGS:

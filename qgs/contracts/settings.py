@@ -76,11 +76,11 @@ class EvaluationConfig(ComponentConfig):
     """What `qgs eval` runs: which views are judged, after how much tuning; see also `metrics`."""
 
     scenes: int = Field(default=32, ge=1)
-    """Test scenes that are judged, at most; without effect beside `index`."""
+    """Test scenes, and windows of one with held-out frames, at most; no effect beside `index`."""
     samples: int = Field(default=1, ge=1)
-    """View samples drawn from each scene; without effect beside `index`."""
+    """Samples drawn from a scene; no effect beside `index` and for scenes with held-out frames."""
     seed: int = Field(default=0, ge=0)
-    """Of the views that are drawn; without effect beside `index`."""
+    """Of the samples that are drawn; no effect where `samples` has none."""
     index: str | None = None
     """JSON file {scene: null | {"context": [frames], "target": [frames]}} of the views to judge
     (pixelSplat's format), relative to the working directory; null draws them."""

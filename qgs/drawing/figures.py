@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from qgs.drawing.images import DEPTH_MAP, NOTHING, Picture
+from qgs.metrics.images import Psnr
 
 Color = tuple[int, int, int]
 
@@ -29,7 +30,6 @@ CATEGORICAL: tuple[Color, ...] = (
 
 INK: Color = (32, 36, 42)
 MUTED: Color = (122, 128, 136)
-PAPER: Color = (255, 255, 255)
 COLUMN_INCHES = 1.9
 
 
@@ -128,7 +128,8 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
                 axis.plot(run.seconds, values, color=color, alpha=0.18, linewidth=0.7)
                 axis.plot(run.seconds, running_mean(values), color=color, label=name)
         loss_axis.set(title="Training loss", xlabel="seconds", yscale="log")
-        psnr_axis.set(title="PSNR of the training views, dB", xlabel="seconds")
+        title = f"{Psnr.column.heading} of the training views, {Psnr.column.unit}"
+        psnr_axis.set(title=title, xlabel="seconds")
         psnr_axis.legend(loc="lower right")
         loss_axis.yaxis.set_major_formatter("{x:g}")
         loss_axis.yaxis.set_minor_formatter("{x:g}")

@@ -33,7 +33,7 @@ from qgs.io.differences import differing_tensors, options_beside_weights, shapes
 from qgs.model import QueryGaussianModel
 
 FORMAT_VERSION = 1
-"""Raised when the layout of the file changes."""
+"""Raised when the format of the file changes."""
 
 _PARTS, _RECIPE = "qgs.state", "qgs.recipe"
 _FORMAT, _VERSION = "qgs.state_version", "qgs.version"

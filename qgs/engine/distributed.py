@@ -108,7 +108,7 @@ DEVICES = ("auto", "cpu", "cuda")
 def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
     """ "cpu" or "cuda" for one of DEVICES; raises ValueError for others, or for "cuda" without one.
 
-    "auto" takes CUDA where there is one and gsplat is installed; `say` is told of a missing gsplat.
+    "auto" takes CUDA where there is one and gsplat is installed; `say` is called if it is missing.
     """
     if wanted not in DEVICES:
         raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
@@ -165,9 +165,9 @@ def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
             gives_up_at = min(gives_up_at, time.monotonic() + PAUSE)
         if not request:
             request.signal = signal.Signals(number)
-            told = f"{request.signal.name}: finishing the step, saving; Ctrl-C again to give up"
+            message = f"{request.signal.name}: finishing the step, saving; Ctrl-C again to give up"
             if not quiet:  # not by print, which must not be entered twice
-                os.write(2, f"\n{told}\n".encode())
+                os.write(2, f"\n{message}\n".encode())
 
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
     try:

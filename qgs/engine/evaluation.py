@@ -16,7 +16,7 @@ from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
-from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
@@ -208,8 +208,7 @@ class _Judge:
             "model": MetricInput(
                 rendering.rgb, targets, gaussians, count, rendering.depth, true_depth=depth
             ),
-            "nearest_input": MetricInput(nearest_input(inputs, targets.cameras), targets),
-            "mean_colour": MetricInput(mean_colour(inputs, targets.cameras), targets),
+            **{n: MetricInput(f(inputs, targets.cameras), targets) for n, f in BASELINES.items()},
         }
         values: dict[str, float] = {}
         for method, shown in given.items():

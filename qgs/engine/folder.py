@@ -57,7 +57,7 @@ class RunFolder:
             )
 
     def take(self) -> None:
-        """Make the folder this process's own until `close`; remove what killed ones left half done.
+        """Lock the folder for this process until `close`; delete temporary files of killed ones.
 
         Raises FileExistsError while another process trains in it.
         """

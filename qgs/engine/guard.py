@@ -40,7 +40,7 @@ MAX_SKIPPED = 10
 """Steps in a row that may be skipped; after them training stops."""
 
 MAX_SAVED = 20
-"""Incidents of a run that are saved; later ones are told and counted."""
+"""Incidents of a run that are saved; later ones are logged and counted."""
 
 COLLAPSE_CAUSES = (
     "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
@@ -60,7 +60,7 @@ NONFINITE_CAUSES = (
 
 
 class TrainingError(RuntimeError):
-    """Training stopped by itself; the message tells why, what is kept and what to do."""
+    """Training stopped by itself; the message says why, what is kept and what to do."""
 
 
 class CollapseError(TrainingError):
@@ -329,17 +329,17 @@ def _in_words(found: Sequence[Mapping[str, Any]]) -> str:
         return "repeating the step gave finite numbers everywhere"
     sentences = []
     for report in found:
-        finding = Finding(**report["first"])
-        batch = report["batches"][finding.batch]
+        bad = BadTensor(**report["first"])
+        batch = report["batches"][bad.batch]
         samples = [
             f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
             for scene, inputs, targets in zip(*(batch[name] for name in _SHOWN), strict=True)
         ]
-        sentences.append(f"the first bad tensor is {finding}, with {', '.join(samples)}")
+        sentences.append(f"the first bad tensor is {bad}, with {', '.join(samples)}")
     return "; ".join(sentences)
 
 
-class Finding(NamedTuple):
+class BadTensor(NamedTuple):
     """A tensor with NaN or infinity. batch: which of the step's batches it came up in, from 0."""
 
     tensor: str
@@ -354,7 +354,7 @@ class Watch:
     """Notes the first tensor that is not finite, in the order in which a step computes."""
 
     def __init__(self) -> None:
-        self.first: Finding | None = None
+        self.first: BadTensor | None = None
         self._batch = -1
         self._calls: Counter[str] = Counter()
 
@@ -362,7 +362,7 @@ class Watch:
         """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
         for path, tensor in named_tensors(value, name):
             if not self.first and (bad := nonfinite_values(tensor)):
-                self.first = Finding(path, bad, max(self._batch, 0))
+                self.first = BadTensor(path, bad, max(self._batch, 0))
 
     @contextmanager
     def on(self, objective: Objective) -> Iterator[None]:

@@ -39,7 +39,7 @@ class Objective(nn.Module):
 
     The forward pass takes the losses' gradients with respect to the Gaussians too, one layer and
     `render_views` target views at a time (0: all views), and frees each part's graph before it
-    makes the next; the backward pass leads their sums into the network. Memory thus grows neither
+    makes the next; the backward pass starts from their sums. Memory thus grows neither
     with layers nor with views. Where a loss needs all renderings at once, only the renderer's
     graphs are made in parts.
 

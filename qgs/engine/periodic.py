@@ -73,8 +73,8 @@ class PeriodicEvaluation:
     def run(self, step: int, stop: StopRequest | None = None) -> None:
         """Evaluate after `step` optimiser steps. All processes must call this.
 
-        stop: given up between two scenes once this is asked for. An evaluation that fails is told
-        in a warning and ends no training.
+        stop: given up between two scenes once this is asked for. An evaluation that fails is
+        logged as a warning and ends no training.
         """
         self.latest = step
         self._stop = StopRequest() if stop is None else stop

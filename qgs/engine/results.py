@@ -19,9 +19,10 @@ from qgs.data.sampling import Frames
 from qgs.engine.protocol import Protocol
 from qgs.io.differences import listed
 from qgs.io.files import write_text
+from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
 
-METHODS = ("model", "nearest_input", "mean_colour")
+METHODS = ("model", *BASELINES)
 TUNING = ("tuning_loss_before", "tuning_loss_after")
 _FRAMES = ("scene", "input_frames", "target_frames")
 """Columns of scenes.csv before the values; `problem` stands behind them."""
@@ -132,7 +133,8 @@ class Evaluation:
         folder = Path(folder)
         write_text(folder / "scenes.csv", self._csv())
         write_text(folder / "summary.json", as_json(self.summary()))
-        write_text(folder / "table.md", self._markdown())
+        tables = [markdown_table(rows) for rows in (self._rows(), self._rows_over_scenes())]
+        write_text(folder / "table.md", "\n\n".join([*tables, bullets(self._notes())]) + "\n")
         write_text(folder / "protocol.json", self.protocol.canonical)
 
     def show(self, console: Console) -> None:
@@ -173,10 +175,6 @@ class Evaluation:
             unit = f", {column.unit}" if column.unit else ""
             rows.append([f"{column.heading}{unit}", *cells, self._of_wanted(found["scenes"])])
         return rows
-
-    def _markdown(self) -> str:
-        tables = [markdown_table(rows) for rows in (self._rows(), self._rows_over_scenes())]
-        return "\n\n".join([*tables, bullets(self._notes())]) + "\n"
 
     def _csv(self) -> str:
         judged = {score.scene: score for score in self.scores}

@@ -1,4 +1,4 @@
-"""What is told while a model trains: on the terminal, and to experiment trackers."""
+"""Progress of a training on the terminal, and logging to experiment trackers."""
 
 import time
 import uuid
@@ -16,6 +16,7 @@ from qgs.composer import Recipe
 from qgs.composer.recipe import flat
 from qgs.contracts.component import MissingExtraError
 from qgs.io.files import write_text
+from qgs.metrics.images import Psnr
 
 _REFRESH_SECONDS = 0.25
 _LOG_SECONDS = 15.0
@@ -39,14 +40,18 @@ class Trackers:
         self._open: list[GeneralTracker] = []
 
     def open(self, run: Path, recipe: Recipe, step: int = 0) -> None:
-        """Track into the folder `run` from step `step` + 1 on; tell the options of `recipe`."""
+        """Track into the folder `run` from step `step` + 1 on; log the options of `recipe`."""
         options = flat(recipe.tree).items()
         plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in options}
         for name in self._names:
             if name == "tensorboard":
                 tracker = TensorBoardTracker(name, logging_dir=run, purge_step=step + 1)
             else:
-                tracker = _wandb(run)
+                place = run / "wandb" / "id"
+                if not place.is_file():
+                    write_text(place, uuid.uuid4().hex)
+                own = {"name": run.resolve().name, "dir": str(run), "id": place.read_text()}
+                tracker = WandBTracker("qgs", **own, resume="allow")
             tracker.start()
             tracker.store_init_configuration(plain)
             self._open.append(tracker)
@@ -65,18 +70,10 @@ class Trackers:
                 tracker.log_images({name: [picture]}, step=step)
 
     def close(self) -> None:
-        """End tracking; what was told is on the disk then."""
+        """End tracking; what was logged is on the disk then."""
         for tracker in self._open:
             tracker.finish()
         self._open = []
-
-
-def _wandb(run: Path) -> WandBTracker:
-    place = run / "wandb" / "id"
-    if not place.is_file():
-        write_text(place, uuid.uuid4().hex)
-    options = {"name": run.resolve().name, "dir": str(run), "id": place.read_text()}
-    return WandBTracker("qgs", **options, resume="allow")
 
 
 class TrainingProgress:
@@ -121,7 +118,8 @@ class TrainingProgress:
         gained = used - self._start[2]
         rate = done / spent if spent else 0.0
         left = str(timedelta(seconds=round(spent * (1 - used) / gained))) if gained else "?"
-        line = f"loss {loss:.4f}  PSNR {psnr:5.2f}  {rate:.0f} images/s  {left} left"
+        quality = f"{Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
+        line = f"loss {loss:.4f}  {quality}  {rate:.0f} images/s  {left} left"
         if self._console.is_terminal:
             self._bar.update(self._task, completed=used, step=step, line=line, refresh=True)
         else:

@@ -35,7 +35,7 @@ class Names:
     unused: tuple[str, ...]
 
     def mismatches(self, shapes: Shapes) -> list[str]:
-        """What stands against taking a published state dict of these `shapes`, line by line."""
+        """Problems of a published state dict of these `shapes` with this recipe, line by line."""
         found = [f"no published name: {name}" for name in self.unnamed]
         return found + differing_tensors(shapes, self.published_shapes(), set(self.unused))
 
@@ -65,7 +65,7 @@ class Names:
 def names_of(recipe: Recipe) -> Names:
     """Both names of the parameters of the model of `recipe`, by the first layout that can hold it.
 
-    Raises PublishedError that says of each layout what stands against it.
+    Raises PublishedError with the components that each layout does not know.
     """
     registry = load_registry([name for name in recipe.plugin_versions if name != "qgs"])
     reasons = []

@@ -151,11 +151,11 @@ def _as_float32(
     given = names.from_published(file.tensors)
     others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
     kinds = Counter(str(dtype).removeprefix("torch.") for dtype in others.values())
-    told = ", ".join(f"{count} of {len(given)} are {kind}" for kind, count in kinds.items())
+    report = ", ".join(f"{count} of {len(given)} are {kind}" for kind, count in kinds.items())
     strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
     if strange:
         raise PublishedError(
-            f"{file.path} holds weights that are no real numbers: {listed(strange)} ({told})"
+            f"{file.path} holds weights that are no real numbers: {listed(strange)} ({report})"
         )
     if others and not allowed:
         fix = "--to-float32 rounds them to the float32 that models here compute in"
@@ -164,7 +164,7 @@ def _as_float32(
                 "half precision has lost digits that no conversion brings back. Take the float32 "
                 "file, or convert with --to-float32"
             )
-        raise PublishedError(f"{file.path} holds weights that are not float32 ({told}); {fix}")
+        raise PublishedError(f"{file.path} holds weights that are not float32 ({report}); {fix}")
     tensors: dict[str, Tensor] = {}
     stored: set[int] = set()
     for name, tensor in given.items():
@@ -178,7 +178,7 @@ def _as_float32(
             f"{file.path} holds NaN or infinite values in {len(broken)} tensors: {listed(broken)}; "
             "the training that wrote it had diverged, or the file is damaged"
         )
-    return tensors, [f"converted to float32: {told}"] if others else []
+    return tensors, [f"converted to float32: {report}"] if others else []
 
 
 def _settings(recipe: Recipe, layout: WeightLayout, shapes: Shapes) -> tuple[str, ...]:

@@ -24,6 +24,10 @@ def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
     return colour[:, None, :, None, None].expand(-1, targets.shape[1], -1, *targets.size)
 
 
+BASELINES = {"nearest_input": nearest_input, "mean_colour": mean_colour}
+"""By their names in results; tables write blanks for underscores."""
+
+
 @full_precision
 def _distance(inputs: Tensor, targets: Tensor) -> Tensor:
     """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4)."""

@@ -113,5 +113,5 @@ def _concerns(owner: Any, case: Case) -> bool:
 def _unsound(installed: InstalledPlugin, what: str, fault: str) -> PluginError:
     return PluginError(
         f"the `{what}` of the plugin `{installed.plugin.name}` of {installed.released_as}: {fault}",
-        f"mend the `{what}` of its Plugin",
+        f"correct the `{what}` of its Plugin",
     )

@@ -1,6 +1,6 @@
 import pytest
 
-from qgs.analysis.report import Baseline, Contender, Report, report_html
+from qgs.analysis.report import Contender, Report, report_html
 from qgs.composer import resolve
 from qgs.contracts import Column
 from qgs.data.evaluation import evaluation_samples, true_depth
@@ -61,7 +61,7 @@ def page_of(tree: dict, name: str) -> str:
         },
         title="A title",
         contenders=[contender],
-        baselines=[Baseline("Mean colour", {"psnr": 11.11, "mine": None, "none": None})],
+        baselines={"Mean colour": {"psnr": 11.11, "mine": None, "none": None}},
         samples=samples,
         depths=[true_depth(source, sample) for sample in samples],
         facts={"Budget": "none"},

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from qgs import DISTRIBUTIONS
 from qgs.cli import COMMANDS, app
-from qgs.cli.plugin_commands import DISTRIBUTIONS, GROUP
+from qgs.cli.plugin_commands import GROUP
 
 Offer = Callable[..., None]
 APP = """
@@ -59,6 +60,7 @@ def test_it_is_listed_without_an_import_and_imported_when_called(offer: Offer) -
         ("import no_such_package", "`colours_commands:app`: ModuleNotFoundError: No module named"),
         ("app = 3", "`colours_commands:app` is int, not a typer.Typer; update colours 2.1"),
         ("", "AttributeError"),
+        ("raise SystemExit('no display')", "SystemExit: no display; update colours 2.1"),
     ],
 )
 def test_one_that_cannot_be_used_is_told_and_the_others_work(
@@ -95,4 +97,4 @@ def test_a_command_of_this_repository_names_its_distribution(
     result = CliRunner().invoke(app, ["data", "check", "photos"])
     assert "run `pip install query-gaussians-datatools`" in str(result.exception)
     assert CliRunner().invoke(app, ["nothing"]).exit_code == 2
-    assert DISTRIBUTIONS.keys().isdisjoint(COMMANDS)
+    assert DISTRIBUTIONS[GROUP].keys().isdisjoint(COMMANDS)

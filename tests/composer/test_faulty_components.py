@@ -150,14 +150,14 @@ def test_an_import_that_fails_is_placed(name, editable, write, install):
     place = f"{file_of_the_plugin()}:{line}"
     assert told in problem.reason
     assert problem.reason.endswith(f"(at {place})")
-    assert problem.fix.startswith(f"mend {place}," if editable else "update qgs-faulty 1.2,")
+    assert problem.fix.startswith(f"correct {place}," if editable else "update qgs-faulty 1.2,")
     assert f'File "{file_of_the_plugin()}", line {line}' in shown
 
 
 def test_a_module_without_the_plugin_has_no_place(write, install):
     install("qgs-faulty", "faulty", "other = 1", editable=True)
     problem, _ = problem_of(write, "")
-    assert problem.fix.startswith("mend `_test_qgs_faulty:plugin`, or do without")
+    assert problem.fix.startswith("correct `_test_qgs_faulty:plugin`, or do without")
 
 
 @pytest.mark.parametrize("editable", [True, False])
@@ -172,7 +172,7 @@ def test_a_component_that_fails_is_placed(at, editable, write, install):
         f"the plugin `faulty` of qgs-faulty 0.3 fails: `{at}` of `faulty/faulty` raises "
         f"KeyError: 'x' (at {place})"
     )
-    assert problem.fix.startswith(f"mend {place}," if editable else "update qgs-faulty 0.3,")
+    assert problem.fix.startswith(f"correct {place}," if editable else "update qgs-faulty 0.3,")
     assert f'File "{file_of_the_plugin()}", line 9' in shown
 
 
@@ -247,7 +247,7 @@ def test_a_broken_promise_is_placed_at_its_forward(write, install):
     refine = build(recipe.parts["model", "decoder", "layers", "0", "refinement"], recipe.dims)
     with pytest.raises(PluginError, match="returns NoneType, not a QueryState") as caught:
         refine(QueryState(torch.zeros(1, 2, recipe.dims.width)))
-    assert caught.value.fix == f"mend {file_of_the_plugin()}:8, or choose another component"
+    assert caught.value.fix == f"correct {file_of_the_plugin()}:8, or choose another component"
 
 
 def test_a_plugin_in_memory_is_reported_without_a_distribution():
@@ -265,7 +265,7 @@ def test_a_plugin_in_memory_is_reported_without_a_distribution():
     recipe = {"recipe": 1, "plugins": ["mine"], "model": {"queries": {"type": "mine/silent"}}}
     problem = refused(recipe, plugins=[Plugin("mine", 1, (Silent,))])
     assert problem.reason.startswith("the plugin `mine` fails: `provides` of `mine/silent` raises")
-    place = rf"mend {re.escape(__file__)}:\d+, or choose another component"
+    place = rf"correct {re.escape(__file__)}:\d+, or choose another component"
     assert re.fullmatch(place, problem.fix)
 
 

@@ -85,7 +85,7 @@ class FixedWidth(MlpFeedForward):
 
 
 @mutant("unmet_requirement_fails_at_compose", "view size is not")
-@mutant("layout_makes_no_difference", "view size is not")
+@mutant("strides_make_no_difference", "view size is not")
 class ViewsAField(ContentSelfAttention):
     """Takes a field for contiguous; queries expand theirs to all scenes."""
 

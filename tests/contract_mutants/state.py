@@ -122,7 +122,7 @@ class ScalesByItsFirstInput(MlpFeedForward):
 @mutant(
     "eval_repeats_bitwise",
     "the second time output",
-    also="query_permutation layout_makes_no_difference saved_weights_load",
+    also="query_permutation strides_make_no_difference saved_weights_load",
 )
 class AddsNoise(MlpFeedForward):
     def forward(self, features):

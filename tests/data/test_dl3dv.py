@@ -51,7 +51,7 @@ def folder(path, files: dict[str, bytes]) -> None:
 
 opened = partial(photo_formats.opened, size=(9, 16), source=Dl3dvSource)
 
-LAYOUTS = {
+FOLDERS = {
     "archive": lambda path: archive(path / "1K" / "abc.zip", scene_files("abc/")),
     "flat archive": lambda path: archive(path / "abc.zip", scene_files()),
     "folder": lambda path: folder(path / "2K" / "abc", scene_files()),
@@ -63,11 +63,11 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("kind", FOLDERS)
 @pytest.mark.parametrize("url", ["{}", "file://{}", "memory://dl3dv{}"])
-def test_layouts_read_alike(tmp_path, layout, url):
-    root = UPath(url.format(tmp_path / layout.replace(" ", "_")))
-    LAYOUTS[layout](root)
+def test_folders_and_archives_read_alike(tmp_path, kind, url):
+    root = UPath(url.format(tmp_path / kind.replace(" ", "_")))
+    FOLDERS[kind](root)
     (scene,) = opened(root).scenes("train")
     assert scene.name == "abc"
     assert len(scene) == 4

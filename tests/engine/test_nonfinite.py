@@ -20,7 +20,7 @@ from qgs.data.stream import training_batches
 from qgs.engine.checkpoint import Saver
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.folder import RunFolder
-from qgs.engine.guard import MAX_SAVED, Finding, Guard, Watch
+from qgs.engine.guard import MAX_SAVED, BadTensor, Guard, Watch
 from qgs.engine.objective import Objective
 from qgs.engine.training import compute_gradients
 from qgs.types import named_tensors
@@ -43,13 +43,13 @@ class Step:
         self.batches = [next(stream), next(stream)]
         stream.close()
 
-    def first(self) -> Finding | None:
+    def first(self) -> BadTensor | None:
         watch = Watch()
         with watch.on(self.objective):
             self.gradients(self.batches)
         return watch.first
 
-    def first_bad(self) -> Finding:
+    def first_bad(self) -> BadTensor:
         found = self.first()
         assert found
         return found
@@ -92,7 +92,7 @@ def test_a_weight_comes_before_everything(step: Step) -> None:
     with torch.no_grad():
         parameter.view(-1)[:2] = torch.tensor([NAN, INF])
     values = f"1 NaN and 1 infinite of {parameter.numel()} values"
-    assert step.first() == Finding(f"weight model.{name}", values, 0)
+    assert step.first() == BadTensor(f"weight model.{name}", values, 0)
 
 
 @pytest.mark.parametrize(("side", "field"), [("inputs", "images"), ("targets", "cameras.c2w")])
@@ -101,7 +101,7 @@ def test_data_is_named_with_its_batch(step: Step, side: str, field: str) -> None
     tensor = views.images if field == "images" else views.cameras.c2w
     tensor.view(-1)[0] = NAN
     found = step.first()
-    assert found == Finding(f"{side}.{field}", f"1 NaN of {tensor.numel()} values", 1)
+    assert found == BadTensor(f"{side}.{field}", f"1 NaN of {tensor.numel()} values", 1)
 
 
 def test_a_module_is_named_by_its_output(step: Step) -> None:

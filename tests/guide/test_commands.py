@@ -76,7 +76,7 @@ def test_commands_are_found_on_every_page_that_has_some() -> None:
 def test_extras_that_are_named_exist(page: str) -> None:
     text = TEXTS[page]
     of_qgs = set(re.findall(r"extras? `(\w+)`", text))
-    of_qgs |= {e for es in re.findall(r"qgs\[([\w,]+)\]", text) for e in es.split(",")}
+    of_qgs |= {e for es in re.findall(r"gaussians\[([\w,]+)\]", text) for e in es.split(",")}
     installed = {e for es in re.findall(r"\.\[([\w,]+)\]", text) for e in es.split(",")}
     assert of_qgs <= EXTRAS
     assert installed <= (PLUGINS_EXTRAS if page in ("README", "plugin.md") else EXTRAS)

@@ -106,6 +106,14 @@ def test_the_code_of_the_five_ideas_computes_its_formula_and_keeps_its_contract(
     exec(code["state.py"], {})
 
 
+def test_the_five_ideas_count_and_name_all_slots() -> None:
+    first = text_of("ideas.md").partition("A forward pass")[0]
+    assert f"{len(SLOTS)} places" in first
+    assert [slot for slot in SLOTS if slot not in first] == []
+    without = [name for name, slot in SLOTS.items() if not (slot.default or slot.defaults)]
+    assert f"Every slot but `{'`, `'.join(without)}` has a default" in text_of("ideas.md")
+
+
 def test_recipes_of_the_five_ideas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name, text in blocks("ideas.md", "yaml").items():

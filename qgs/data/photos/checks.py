@@ -1,36 +1,19 @@
 """What cannot be right about a listed photo: its pose, its intrinsics, its size."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qgs.contracts import Problem
 from qgs.data.lenses import Intrinsics, Size
+from qgs.data.photos.reader import FrameProblem, PhotoFrame
 from qgs.data.scenes import warn_once
-
-if TYPE_CHECKING:
-    from qgs.data.photos.reader import PhotoFrame
 
 _RIGID = 1e-3  # of rotations against orthonormality
 _SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
 _SQUARE = 0.1  # relative difference of sides, or of fx and fy, that is none
 _NORMALISED = 5.0  # a focal length below is in units of the image, not of its pixels
 _FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
-
-
-@dataclass(frozen=True)
-class FrameProblem(Problem):
-    """A fault of a `PhotoFrame`'s field. fatal: whether `require_sound` refuses the frame."""
-
-    fatal: bool = True
-
-    def __str__(self) -> str:
-        return f"{self.reason}: {self.fix}"
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:

@@ -10,11 +10,21 @@ from typing import ClassVar, Literal
 import numpy as np
 from upath import UPath
 
+from qgs.contracts import Problem
 from qgs.data.lenses import Intrinsics, Lens, Size
-from qgs.data.photos.checks import FrameProblem
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _COPY = re.compile(r"images(_\d+)?")
+
+
+@dataclass(frozen=True)
+class FrameProblem(Problem):
+    """A fault of a `PhotoFrame`'s field. fatal: whether `require_sound` refuses the frame."""
+
+    fatal: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.fix}"
 
 
 @dataclass(frozen=True)

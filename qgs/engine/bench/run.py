@@ -59,9 +59,9 @@ def bench(
 
     All models, with initial weights, are in memory while latencies are measured, so that each round
     has all of them. step, memory, renderer: what is measured besides. rounds: samples of each
-    latency. warmup: calls before the first sample. overrides: what the report says of them. `say`
-    hears what is under way. Returns the report, plain values for JSON: seconds with every sample,
-    bytes, and ratios to the first subject, those of latencies round by round.
+    latency. warmup: calls before the first sample. overrides: what the report says of them. say:
+    called with what is measured next. Returns the report, plain values for JSON: seconds with every
+    sample, bytes, and ratios to the first subject, those of latencies round by round.
     Raises ValueError as the models, losses and renderers do, ChildProcessError as `peak_memory`.
     """
     threads = torch.get_num_threads()
@@ -137,7 +137,7 @@ def in_turn(
 ) -> list[list[float]]:
     """Seconds of each task: `warmup` calls of each unmeasured, then all of them in every round.
 
-    torch.utils.benchmark's clock waits for a GPU. `say` hears of each round, after `label`.
+    torch.utils.benchmark's clock waits for a GPU. say: called before each round.
     """
     for number in range(warmup):
         say(f"{label}warm-up {number + 1} of {warmup}")

@@ -135,7 +135,7 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
 
 
 @check(MODULES - {"queries"})
-def check_layout_makes_no_difference(case: Case) -> None:
+def check_strides_make_no_difference(case: Case) -> None:
     """Inputs that are not contiguous, such as expanded or sliced ones, give the same results."""
     module, inputs = case.lively(), inputs_of(case)
     # Other strides are summed up in another order.
