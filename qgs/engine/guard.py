@@ -21,9 +21,9 @@ from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
-from qgs.io.differences import listed
 from qgs.io.files import replacing_entries
 from qgs.types import named_tensors
+from qgs.wording import listed
 
 _log = logging.getLogger(__name__)
 

@@ -17,9 +17,9 @@ from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
 from qgs.data.sampling import Frames
 from qgs.engine.protocol import Protocol
-from qgs.io.differences import listed
 from qgs.io.files import write_text
 from qgs.metrics.dispersion import OPACITY_USED
+from qgs.wording import listed
 
 METHODS = ("model", "nearest_input", "mean_colour")
 TUNING = ("tuning_loss_before", "tuning_loss_after")
