@@ -2,6 +2,7 @@ import re
 
 import pytest
 import yaml
+from ply_files import read_ply
 from typer.testing import CliRunner
 
 import qgs
@@ -9,7 +10,6 @@ from qgs.cli import app
 from qgs.cli.contest import resolve_fairly
 from qgs.cli.demo import default_recipes, new_folder
 from qgs.engine.guard import CollapseError
-from qgs.io.ply import read_ply
 
 RECIPE = {
     "recipe": 1,

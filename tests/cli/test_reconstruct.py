@@ -3,12 +3,12 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from ply_files import read_ply
 from typer.testing import CliRunner
 
 import qgs
 from qgs.cli import app
 from qgs.cli.reconstruct import frame_list
-from qgs.io.ply import read_ply
 
 RECIPE = {
     "recipe": 1,
