@@ -33,9 +33,6 @@ _SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and t
 class ChunksConfig(SceneSource.Config):
     """Options of `qgs/chunks`."""
 
-    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
-
     path: str
     """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
     URL are read whole, by every process and worker: copy them to a local disk to train."""
@@ -161,6 +158,8 @@ class ChunksSource(LazySource):
 
     name = "chunks"
     Config = ChunksConfig
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     def __init__(self, config: ChunksConfig) -> None:
         super().__init__(config)

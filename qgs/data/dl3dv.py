@@ -29,9 +29,6 @@ Place: TypeAlias = UPath | ArchivePath
 class Dl3dvConfig(SceneSource.Config):
     """Options of `qgs/dl3dv`."""
 
-    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
-
     path: str
     """Folder or fsspec URL of the data set, of a subset or of one scene, relative to the working
     directory."""
@@ -58,6 +55,8 @@ class Dl3dvSource(LazySource):
 
     name = "dl3dv"
     Config = Dl3dvConfig
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     def __init__(self, config: Dl3dvConfig) -> None:
         super().__init__(config)

@@ -43,8 +43,6 @@ from qgs.types import Cameras, Views
 class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`."""
 
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
-
     path: str
     """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
     relative to the working directory, or an fsspec URL."""
@@ -189,6 +187,7 @@ class PhotosSource(LazySource):
 
     name = "photos"
     Config = PhotosConfig
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)
