@@ -99,7 +99,8 @@ BROKEN_PLUGINS = {
     "metric that does not say what it measures": (
         "class Mute(Psnr):\n    name = 'mute'\n    definition = ''\n"
         "plugin = Plugin('bad', 1, (Mute,))",
-        "lists Mute, which gives no `definition`; say in words what it measures, since protocols hash it",
+        "lists Mute, which gives no `definition`; say in words what it measures, since protocols "
+        "hash it",
     ),
     "wrong contract version": ("plugin = Plugin('bad', 0, ())", "contract version 0"),
     "contract version that is a text": (

@@ -13,7 +13,7 @@ from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap, write_nerfstudio
 from PIL import Image
 
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.data.paths import opened_path
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import frame_problems
