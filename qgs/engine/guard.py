@@ -76,7 +76,10 @@ class Guard:
 
     All processes must call each of its methods together; `step` counts finished optimiser steps.
     A step that is not finite leaves RUN/incidents/step-N with batch.safetensors (and another
-    process's batch-RANK.safetensors), weights.safetensors, for `qgs.load`, and report.json.
+    process's batch-RANK.safetensors), weights.safetensors, for `qgs.load`, and report.json. Batches
+    are read with `safetensors.torch.load_file`: inputs.images, inputs.cameras.c2w and .intrinsics,
+    inputs.masks where there are any, and the same of targets, all batches of the step one after the
+    other; scenes, input_frames and target_frames are metadata, in JSON.
 
     incidents: steps that were not finite. skipped: how many of them came last, without a good one.
     """
