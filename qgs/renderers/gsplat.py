@@ -7,14 +7,8 @@ from importlib.util import find_spec
 import torch
 from torch import Tensor
 
-from qgs.contracts import (
-    ComponentConfig,
-    MissingExtraError,
-    Problem,
-    RecipeContext,
-    Renderer,
-    RendererConfig,
-)
+from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
+from qgs.contracts.component import MissingExtraError
 from qgs.renderers.inputs import background_of, check_inputs
 from qgs.types import Cameras, Gaussians, Rendering
 

@@ -10,13 +10,8 @@ import torch
 
 from qgs.composer.errors import did_you_mean
 from qgs.composer.registry import file_of, package_of, place_in
-from qgs.contracts import (
-    CONTRACT_VERSION,
-    ComponentConfig,
-    Expected,
-    ExpectedError,
-    MissingExtraError,
-)
+from qgs.contracts import CONTRACT_VERSION, ComponentConfig, Expected, ExpectedError
+from qgs.contracts.component import MissingExtraError
 from qgs.testing.case import CannotCheck, Case, ContractError
 from qgs.testing.registry import (
     BASICS,

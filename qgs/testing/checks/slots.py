@@ -4,7 +4,6 @@ import copy
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -18,6 +17,7 @@ from qgs.contracts import (
     MetricInput,
     Optimizer,
     ParameterGroup,
+    SceneSource,
     Split,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
@@ -110,8 +110,7 @@ def check_supervision_weights(case: Case) -> None:
 @check({"data"})
 def check_scenes_repeat(case: Case) -> None:
     """A scene is the same each time: names, cameras, and images of the delivered size in [0, 1]."""
-    with _data_of_the_case():
-        first, second = (case.build().scenes("train")[0] for _ in range(2))
+    first, second = (_source(case).scenes("train")[0] for _ in range(2))
     expect(first.name == second.name, f"scene 0 is `{first.name}`, then `{second.name}`")
     frames = list(range(min(2, len(first))))
     images = first.images(frames)
@@ -127,26 +126,24 @@ def check_scenes_repeat(case: Case) -> None:
 @check({"data"})
 def check_scenes_are_as_listed(case: Case) -> None:
     """`names` are those of the scenes, `groups` hold each scene once, held-out frames exist."""
-    with _data_of_the_case():
-        source = case.build()
-        for split in get_args(Split):
-            scenes, names = source.scenes(split), list(source.names(split))
-            count, where = len(scenes), f"of the {split} split"
-            expect(len(names) == count, f"{where}, there are {count} scenes, {len(names)} names")
-            grouped = sorted(int(i) for group in source.groups(split) for i in group)
-            once = grouped == list(range(count))
-            expect(once, f"{where}, groups hold not each of {count} scenes once: {listed(grouped)}")
-            for place in {0, count // 2, count - 1} if count else ():
-                scene, name = scenes[place], f"scene {place} {where}"
-                expect(scene.name == names[place], f"{name} is `{scene.name}`, not {names[place]}")
-                outside = [frame for frame in scene.held_out if not 0 <= frame < len(scene)]
-                expect(not outside, f"{name} has {len(scene)} frames and holds out {outside}")
+    source = _source(case)
+    for split in get_args(Split):
+        scenes, names = source.scenes(split), list(source.names(split))
+        count, where = len(scenes), f"of the {split} split"
+        expect(len(names) == count, f"{where}, there are {count} scenes, {len(names)} names")
+        grouped = sorted(int(i) for group in source.groups(split) for i in group)
+        once = grouped == list(range(count))
+        expect(once, f"{where}, groups hold not each of {count} scenes once: {listed(grouped)}")
+        for place in {0, count // 2, count - 1} if count else ():
+            scene, name = scenes[place], f"scene {place} {where}"
+            expect(scene.name == names[place], f"{name} is `{scene.name}`, not {names[place]}")
+            outside = [frame for frame in scene.held_out if not 0 <= frame < len(scene)]
+            expect(not outside, f"{name} has {len(scene)} frames and holds out {outside}")
 
 
-@contextmanager
-def _data_of_the_case() -> Iterator[None]:
+def _source(case: Case) -> SceneSource:
     try:
-        yield
+        return case.build()
     except FileNotFoundError as error:
         raise CannotCheck(f"the data of this case is not here: {error}") from error
 
