@@ -109,38 +109,24 @@ class DrawsItsImages(SceneSource):
         return [NoiseScene()]
 
 
-class GreyScene(NoiseScene):
-    """Two frames of one grey."""
-
-    def images(self, frames):
-        return torch.full((len(frames), 3, 16, 24), 0.5)
-
-
-class GreySource(SceneSource):
-    """A sound source of three scenes, which mutants list otherwise."""
-
-    def scenes(self, split):
-        return [GreyScene(), GreyScene(), GreyScene()]
-
-
-@mutant("scenes_are_as_listed", "scene 0 of the train split is `noise`, not place 0")
-class NamesPlaces(GreySource):
+@mutant("scenes_are_as_listed", "is `noise`, not place 0", also="scenes_repeat")
+class NamesPlaces(DrawsItsImages):
     def names(self, split):
-        return [f"place {place}" for place in range(3)]
+        return ["place 0"]
 
 
-@mutant("scenes_are_as_listed", "groups hold not each of 3 scenes once: 0, 1")
-class LosesAScene(GreySource):
+@mutant("scenes_are_as_listed", "hold not each of 1 scenes once: 0, 0", also="scenes_repeat")
+class GroupsASceneTwice(DrawsItsImages):
     def groups(self, split):
-        return [[1], [0]]
+        return [[0], [0]]
 
 
-@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]")
-class HoldsOutTooMuch(GreySource):
+@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]", also="scenes_repeat")
+class HoldsOutTooMuch(DrawsItsImages):
     def scenes(self, split):
-        scenes = super().scenes(split)
-        scenes[2].held_out = (1, 2)
-        return scenes
+        (scene,) = super().scenes(split)
+        scene.held_out = (1, 2)
+        return [scene]
 
 
 @mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
