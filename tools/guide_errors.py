@@ -21,7 +21,7 @@ from unittest.mock import patch
 from guide_reference import PLUGINS
 
 import qgs
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.io.files import write_text
 
 PAGE = Path(__file__).parents[1] / "docs/errors.md"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qgs.cli.options import Device, Size, parse_size
+from qgs.wording import listed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
     from qgs.types import Gaussians
-
-_SHOWN = 8  # names of scenes in an error
 
 
 def reconstruct(
@@ -136,9 +135,8 @@ def scene_of(source: SceneSource, path: str, name: str | None) -> Scene:
     if name is None and len(places) == 1:
         (name,) = places
     if name not in places:
-        shown = ", ".join(list(places)[:_SHOWN]) + (", ..." if len(places) > _SHOWN else "")
         found = f"no scene {name!r}, but" if name is not None else f"{len(places)} scenes:"
-        raise ValueError(f"{path} holds {found} {shown}: name one of them with --scene")
+        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them with --scene")
     split, place = places[name]
     return source.scenes(split)[place]
 

@@ -20,7 +20,7 @@ import qgs.losses
 import qgs.metrics
 import qgs.renderers
 from qgs.composer.slots import SLOTS
-from qgs.contracts import Component, ComponentConfig, Renderer, WeightLayout
+from qgs.contracts import Component, ComponentConfig, Metric, Renderer, WeightLayout
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 
 BUILTIN = Plugin(
@@ -231,9 +231,13 @@ def component_fault(component: object) -> str:
         given: object = component.devices
         if not (isinstance(given, tuple) and given and set(given) <= set(RENDERER_DEVICES)):
             return f"whose `devices` is {given!r}; give some of {RENDERER_DEVICES} as a tuple"
+    if issubclass(component, Metric) and not getattr(component, "definition", ""):
+        return "which gives no `definition`; say in words what it measures, since protocols hash it"
     config: object = component.Config
     if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
         return "whose Config is no ComponentConfig"
+    if not config.model_config.get("frozen"):
+        return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
     if "type" in config.model_fields:
         return "whose Config has an option `type`, which names the component itself"
     return _schema_fault(config)

@@ -56,12 +56,6 @@ class Scene(ABC):
 class SceneSourceConfig(ComponentConfig):
     """What all sources have in common. Where a source's data lies is its option `path`."""
 
-    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path"})
-    """Options that change no scene, image or camera: where files lie, how they are kept in memory.
-    Hashes of evaluation protocols leave them out."""
-    split_options: ClassVar[frozenset[str]] = frozenset()
-    """Options that only choose which scenes and frames are trained on, and which are judged. Where
-    an evaluation index names these, hashes of protocols leave them out too."""
     image_size: tuple[Side, Side] = (64, 64)
     """(H, W) of every delivered image, in pixels."""
 
@@ -74,6 +68,12 @@ class SceneSource(Component):
     """
 
     slot: ClassVar[str] = "data"
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path"})
+    """Options that change no scene, image or camera: where files lie, how they are kept in memory.
+    Hashes of evaluation protocols leave them out."""
+    split_options: ClassVar[frozenset[str]] = frozenset()
+    """Options that only choose which scenes and frames are trained on, and which are judged. Where
+    an evaluation index names these, hashes of protocols leave them out too."""
 
     class Config(SceneSourceConfig):
         """The common settings."""

@@ -69,7 +69,7 @@ class Metric(Component, torch.nn.Module):
     """
 
     slot: ClassVar[str] = "metrics"
-    definition: ClassVar[str] = ""
+    definition: ClassVar[str]
     not_in_protocol: ClassVar[frozenset[str]] = frozenset()
     needs: ClassVar[tuple[Literal["masks", "gaussians", "depth", "true_depth"], ...]] = ()
     column: ClassVar[Column]

@@ -3,9 +3,9 @@
 from qgs.contracts import Component
 from qgs.data.chunks import ChunksSource
 from qgs.data.dl3dv import Dl3dvSource
-from qgs.data.photos.source import PhotosSource, read_photos
+from qgs.data.photos.source import PhotosSource
 
 COMPONENTS: tuple[type[Component], ...] = (ChunksSource, Dl3dvSource, PhotosSource)
-"""In the order in which they are asked whether they recognise a path."""
+"""In the order in which they are asked whether they recognise a path, after those of plugins."""
 
-__all__ = ["COMPONENTS", "ChunksSource", "Dl3dvSource", "PhotosSource", "read_photos"]
+__all__ = ["COMPONENTS", "ChunksSource", "Dl3dvSource", "PhotosSource"]

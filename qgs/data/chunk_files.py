@@ -31,6 +31,7 @@ from qgs.data.lenses import Intrinsics, Size
 from qgs.data.paths import is_local, stays_inside
 from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
 from qgs.data.scenes import warn_once
+from qgs.wording import listed
 
 INDEX = "index.json"
 SUFFIX = ".torch"
@@ -138,7 +139,7 @@ def a_type(value: object) -> str:
 
 def _described(data: Any) -> str:
     if isinstance(data, Mapping):
-        return f"a mapping with the keys {', '.join(map(repr, list(data)[:6])) or 'none'}"
+        return f"a mapping with the keys {listed(map(repr, data)) or 'none'}"
     return a_type(data)
 
 
@@ -259,11 +260,10 @@ class Chunk:
     def record(self, key: str) -> Record:
         """A scene. Raises ValueError when it is not in this chunk or is malformed."""
         if key not in self.entries:
-            keys = list(self.entries)
             raise ValueError(
                 f"{self.path} does not hold the scene {key!r}, which index.json places there: it "
-                f"holds {', '.join(keys[:5])}{', ...' if len(keys) > 5 else ''}. Remove "
-                "index.json to have the chunks read instead, or pack the data set again"
+                f"holds {listed(self.entries)}. Remove index.json to have the chunks read instead, "
+                "or pack the data set again"
             )
         if key not in self._parsed:
             self._parsed[key] = parse_record(str(self.path), self.entries[key])

@@ -24,6 +24,7 @@ from qgs.data.scenes import (
     warn_once,
 )
 from qgs.types import Cameras
+from qgs.wording import listed
 
 _OPEN = 4  # chunks kept open
 _SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
@@ -31,9 +32,6 @@ _SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and t
 
 class ChunksConfig(SceneSource.Config):
     """Options of `qgs/chunks`."""
-
-    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
     """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
@@ -160,6 +158,8 @@ class ChunksSource(LazySource):
 
     name = "chunks"
     Config = ChunksConfig
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     def __init__(self, config: ChunksConfig) -> None:
         super().__init__(config)
@@ -203,7 +203,7 @@ def _folders(path: UPath) -> dict[Split, UPath]:
     if not found and has_chunks(path):
         return {"train": path}
     if not found:
-        inside = ", ".join(sorted(item.name for item in path.iterdir())[:8]) or "nothing"
+        inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
         raise FileNotFoundError(
             f"{path} holds no chunks: expected train/ or test/ with index.json and .torch files, "
             f"found {inside}. `qgs data pack` makes chunks of other formats"

@@ -15,6 +15,7 @@ from qgs.data.paths import ArchivePath, opened_path
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
 from qgs.data.scenes import LazyScenes, LazySource, warn_once
+from qgs.wording import listed
 
 LISTING = "transforms.json"
 _INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
@@ -27,9 +28,6 @@ Place: TypeAlias = UPath | ArchivePath
 
 class Dl3dvConfig(SceneSource.Config):
     """Options of `qgs/dl3dv`."""
-
-    unhashed_options: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     path: str
     """Folder or fsspec URL of the data set, of a subset or of one scene, relative to the working
@@ -57,19 +55,21 @@ class Dl3dvSource(LazySource):
 
     name = "dl3dv"
     Config = Dl3dvConfig
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 
     def __init__(self, config: Dl3dvConfig) -> None:
         super().__init__(config)
         places = find_scenes(opened_path(config.path))
         train, test = places, places if config.holdout else {}
         if config.test_scenes is not None:
-            listed = read_scene_list(opened_path(config.test_scenes))
-            absent = [name for name in listed if name not in places]
-            test = {name: places[name] for name in listed if name in places}
+            named = read_scene_list(opened_path(config.test_scenes))
+            absent = [name for name in named if name not in places]
+            test = {name: places[name] for name in named if name in places}
             train = {name: place for name, place in places.items() if name not in test}
             if absent:
                 names = ", ".join(absent)
-                warn_once(f"{len(absent)} of {len(listed)} test scenes are not there: {names}")
+                warn_once(f"{len(absent)} of {len(named)} test scenes are not there: {names}")
         same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
         photos = PhotosConfig(format="nerfstudio", **same)
         opener = partial(_opened, config=photos, cache=image_cache(0))
@@ -108,7 +108,7 @@ def find_scenes(path: UPath) -> dict[str, Place]:
         if name not in scenes or isinstance(scenes[name], ArchivePath):
             scenes[name] = place
     if not scenes:
-        inside = ", ".join(sorted(item.name for item in path.iterdir())[:8]) or "nothing"
+        inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
         raise FileNotFoundError(
             f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING}, also "
             f"in folders such as 1K/, found {inside}"

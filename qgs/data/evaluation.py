@@ -15,6 +15,7 @@ from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
 from qgs.data.paths import opened_path
 from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, training_frames
 from qgs.geometry.poses import largest_distance
+from qgs.wording import listed
 
 FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
 
@@ -43,7 +44,6 @@ def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, .
 
 
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
-_SHOWN = 5
 
 
 def read_index(path: str) -> EvaluationIndex:
@@ -67,8 +67,7 @@ def read_index(path: str) -> EvaluationIndex:
             wrong = [
                 f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()
             ]
-            more = f"; and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
-            reason = "; ".join(wrong[:_SHOWN]) + more
+            reason = listed(wrong, between="; ")
         raise ValueError(f"{path} is no evaluation index {_FORM}: {reason}") from error
     if not any(index.values()):
         raise ValueError(f"the evaluation index {path} names no scene to judge")
@@ -77,7 +76,7 @@ def read_index(path: str) -> EvaluationIndex:
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if repeated := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
-        raise ValueError(f"written twice: {', '.join(repeated[:_SHOWN])}")
+        raise ValueError(f"written twice: {listed(repeated)}")
     return dict(pairs)
 
 
@@ -114,9 +113,9 @@ class EvaluationPlan:
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
         self._times = Counter(names)
-        listed = dict.fromkeys(names[: evaluation.scenes], True) if index is None else index
-        self.wanted = tuple(name for name, entry in listed.items() if entry)
-        self.null = tuple(name for name, entry in listed.items() if not entry)
+        entries = dict.fromkeys(names[: evaluation.scenes], True) if index is None else index
+        self.wanted = tuple(name for name, entry in entries.items() if entry)
+        self.null = tuple(name for name, entry in entries.items() if not entry)
         self.unlisted = tuple(name for name in self._places if index and name not in index)
 
     def samples(self) -> Iterator[Sample | SceneFailure]:
@@ -217,7 +216,7 @@ def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
     if scene.missing:
         raise ValueError(
             f"{len(scene.missing)} of its listed images do not exist, so that positions "
-            f"of the index would mean other frames: {', '.join(scene.missing)}"
+            f"of the index would mean other frames: {listed(scene.missing)}"
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:

@@ -1,28 +1,47 @@
 """Which source opens a path, and opening it for a trained model."""
 
 from collections.abc import Mapping
+from itertools import islice
 
 from upath import UPath
 
 from qgs.contracts import Component, SceneSource, SceneSourceConfig, component_of
+from qgs.data.evaluation import one_line
 from qgs.data.paths import opened_path
+from qgs.data.scenes import warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
     """PLUGIN/NAME of the first of `sources` that recognises `path`, else qgs/photos.
 
-    Photos say best what a folder lacks. Raises FileNotFoundError when `path` does not exist.
+    Those of plugins are asked before those of qgs, which know less of a special layout; where
+    several recognise it, a warning names them. Photos say best what a folder lacks. Raises
+    FileNotFoundError when `path` does not exist.
     """
     if not path.exists():
         raise FileNotFoundError(
             f"{path} (from {UPath.cwd()}) does not exist: give the folder of a data set"
         )
-    found = (
-        kind
-        for kind, source in sources.items()
-        if issubclass(source, SceneSource) and source.recognises(path)
-    )
-    return next(found, "qgs/photos")
+    own = [kind for kind in sources if kind.startswith("qgs/")]
+    found = [kind for kind in sources if kind not in own and _recognises(kind, sources[kind], path)]
+    found += islice((kind for kind in own if _recognises(kind, sources[kind], path)), 1)
+    if len(found) > 1:
+        warn_once(
+            f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
+            "choose another, name it as `data.type` of a recipe, or as --format of `qgs data check`"
+        )
+    return found[0] if found else "qgs/photos"
+
+
+def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
+    assert issubclass(source, SceneSource)
+    try:
+        return source.recognises(path)
+    except Exception as error:
+        if kind.startswith("qgs/"):
+            raise
+        warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")
+        return False
 
 
 def open_for(

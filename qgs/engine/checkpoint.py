@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.utils import gather_object
-from safetensors import safe_open
 from torch import Tensor, nn
 
 import qgs
@@ -25,6 +24,7 @@ from qgs.io.checkpoint import (
     load_recipe,
     load_weights,
     opened_tensors,
+    read_tensors,
     save,
     unique_tensors,
     write_tensors,
@@ -88,7 +88,6 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         raise FileNotFoundError(f"no training state at {path}")
     with opened_tensors(path) as file:
         metadata = file.metadata() or {}
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     if _PARTS not in metadata:
         raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
     if int(metadata[_FORMAT]) > FORMAT_VERSION:
@@ -97,7 +96,7 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
             f"this is qgs {qgs.__version__}, which knows {FORMAT_VERSION}: install the newer qgs"
         )
     parts: dict[str, dict[str, Any]] = json.loads(metadata[_PARTS])
-    for name, tensor in tensors.items():
+    for name, tensor in read_tensors(path).items():
         part, key = name.split("/", 1)
         parts[part][key] = tensor
     return SavedState(resolve(json.loads(metadata[_RECIPE])), parts)
@@ -335,8 +334,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         return []
     path = checkpoint_of(Path(recipe.init_from).expanduser())
     learned_by = load_recipe(path)
-    with safe_open(path, "pt") as file:
-        learned = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    learned = read_tensors(path)
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()

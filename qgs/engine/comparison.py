@@ -18,8 +18,8 @@ from qgs.engine.results import (
     print_lines,
     print_table,
 )
-from qgs.io.differences import listed
 from qgs.io.files import write_text
+from qgs.wording import listed
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95

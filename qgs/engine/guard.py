@@ -21,9 +21,9 @@ from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
-from qgs.io.differences import listed
 from qgs.io.files import replacing_entries
 from qgs.types import named_tensors
+from qgs.wording import listed
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +76,10 @@ class Guard:
 
     All processes must call each of its methods together; `step` counts finished optimiser steps.
     A step that is not finite leaves RUN/incidents/step-N with batch.safetensors (and another
-    process's batch-RANK.safetensors), weights.safetensors, for `qgs.load`, and report.json.
+    process's batch-RANK.safetensors), weights.safetensors, for `qgs.load`, and report.json. Batches
+    are read with `safetensors.torch.load_file`: inputs.images, inputs.cameras.c2w and .intrinsics,
+    inputs.masks where there are any, and the same of targets, all batches of the step one after the
+    other; scenes, input_frames and target_frames are metadata, in JSON.
 
     incidents: steps that were not finite. skipped: how many of them came last, without a good one.
     """

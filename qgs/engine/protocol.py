@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from qgs.composer import Recipe
-from qgs.contracts import Metric, SceneSourceConfig
+from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.engine.tuning import tuning_loss
 
@@ -57,9 +57,11 @@ def protocol_of(
     With an index the kind of data, how it is split, and options at their defaults are left out, so
     that one data set in two formats has one protocol.
     """
-    evaluation, config = recipe.evaluation, recipe.parts["data",].config
+    evaluation, part = recipe.evaluation, recipe.parts["data",]
+    config, source = part.config, part.component
     assert isinstance(config, SceneSourceConfig)
-    left_out = {"image_size", *config.unhashed_options}
+    assert issubclass(source, SceneSource)
+    left_out = {"image_size", *source.not_in_protocol}
     if index is None:
         data = {"type": recipe.tree["data"]["type"]}
         data |= config.model_dump(mode="json", exclude=left_out)
@@ -67,7 +69,7 @@ def protocol_of(
         rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
         judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
     else:
-        left_out |= config.split_options
+        left_out |= source.split_options
         data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
         judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
     tuning, metrics = None, {}

@@ -17,10 +17,10 @@ from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
 from qgs.data.sampling import Frames
 from qgs.engine.protocol import Protocol
-from qgs.io.differences import listed
 from qgs.io.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
+from qgs.wording import listed
 
 METHODS = ("model", *BASELINES)
 TUNING = ("tuning_loss_before", "tuning_loss_after")

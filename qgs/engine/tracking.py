@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from qgs.composer import Recipe
 from qgs.composer.recipe import flat
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.io.files import write_text
 from qgs.metrics.images import Psnr
 

@@ -1,7 +1,7 @@
 """In what two state dicts, or two recipes, differ: the lines that messages list."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -33,12 +33,6 @@ def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()
         for name, shape in recipe.items()
         if name in file and file[name] != shape
     ]
-
-
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """The first `most` of `names` with commas, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def differing_options(

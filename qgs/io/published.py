@@ -14,6 +14,7 @@ from qgs.contracts.weights import Shapes
 from qgs.io.checkpoint import unique_tensors
 from qgs.io.differences import differing_options, differing_tensors, shapes_of
 from qgs.io.weight_file import WeightFile
+from qgs.wording import listed
 
 
 class PublishedError(ValueError):
@@ -172,8 +173,8 @@ def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str,
     if layout is None:
         names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in known)
         raise PublishedError(
-            f"{origin} has the names of no published model that is known here ({names}); its first "
-            f"names are {', '.join(list(shapes)[:3])}"
+            f"{origin} has the names of no published model that is known here ({names}); its "
+            f"names are {listed(shapes, 3)}"
         )
     try:
         tree = layout.read(shapes)

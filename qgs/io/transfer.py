@@ -13,7 +13,7 @@ from qgs.composer import Recipe, resolve
 from qgs.contracts import WeightLayout
 from qgs.contracts.weights import Shapes
 from qgs.io.checkpoint import CheckpointError, load_recipe, read_tensors, write_checkpoint
-from qgs.io.differences import listed, options_beside_weights, shapes_of
+from qgs.io.differences import options_beside_weights, shapes_of
 from qgs.io.files import refuse_existing, replacing, write_text
 from qgs.io.published import (
     Names,
@@ -26,6 +26,7 @@ from qgs.io.published import (
     without_prefix,
 )
 from qgs.io.weight_file import WeightFile, read_weight_file
+from qgs.wording import listed
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError, Renderer, RendererConfig
 from qgs.renderers.inputs import background_of, check_inputs, raise_precision
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering

@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from qgs import cli
 from qgs.cli import app
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.engine import training
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"

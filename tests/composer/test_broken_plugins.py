@@ -65,6 +65,7 @@ IMPORTS = """
 from collections.abc import Callable
 from qgs.components import LatentQueries
 from qgs.contracts import Centers, ComponentConfig, Plugin, Queries
+from qgs.metrics.images import Psnr
 from qgs.renderers import TorchRenderer
 """
 BROKEN_PLUGINS = {
@@ -88,6 +89,18 @@ BROKEN_PLUGINS = {
         "    def forward(self, offsets, state):\n        return offsets\n"
         "plugin = Plugin('bad', 1, (Odd,))",
         "lists Odd, whose Config has options that YAML cannot express",
+    ),
+    "options that can be changed": (
+        "class Soft(LatentQueries):\n    name = 'soft'\n"
+        "    class Config(LatentQueries.Config):\n        model_config = {'frozen': False}\n"
+        "plugin = Plugin('bad', 1, (Soft,))",
+        "lists Soft, whose Config is not frozen; leave `frozen` of its `model_config` at True",
+    ),
+    "metric that does not say what it measures": (
+        "class Mute(Psnr):\n    name = 'mute'\n    definition = ''\n"
+        "plugin = Plugin('bad', 1, (Mute,))",
+        "lists Mute, which gives no `definition`; say in words what it measures, since protocols "
+        "hash it",
     ),
     "wrong contract version": ("plugin = Plugin('bad', 0, ())", "contract version 0"),
     "contract version that is a text": (

@@ -109,6 +109,26 @@ class DrawsItsImages(SceneSource):
         return [NoiseScene()]
 
 
+@mutant("scenes_are_as_listed", "is `noise`, not place 0", also="scenes_repeat")
+class NamesPlaces(DrawsItsImages):
+    def names(self, split):
+        return ["place 0"]
+
+
+@mutant("scenes_are_as_listed", "hold not each of 1 scenes once: 0, 0", also="scenes_repeat")
+class GroupsASceneTwice(DrawsItsImages):
+    def groups(self, split):
+        return [[0], [0]]
+
+
+@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]", also="scenes_repeat")
+class HoldsOutTooMuch(DrawsItsImages):
+    def scenes(self, split):
+        (scene,) = super().scenes(split)
+        scene.held_out = (1, 2)
+        return [scene]
+
+
 @mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
 class SumsOverScenes(OneTerm):
     renderings = "each"

@@ -13,7 +13,7 @@ from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap, write_nerfstudio
 from PIL import Image
 
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.data.paths import opened_path
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import frame_problems
@@ -200,8 +200,8 @@ def test_a_missing_package_is_told(tmp_path, monkeypatch):
 def test_pycolmap_is_imported_for_models_alone(tmp_path):
     folder = write_nerfstudio(tmp_path, synthetic(tmp_path / "photos", 2))
     code = (
-        "import sys; from qgs.data import read_photos;"
-        f"read_photos({str(folder)!r}, (8, 8)); print('pycolmap' in sys.modules)"
+        "import sys; from qgs.data import PhotosSource as Source;"
+        f"Source(Source.Config(path={str(folder)!r})); print('pycolmap' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -23,7 +23,7 @@ from photo_formats import (
 from PIL import Image
 from upath import UPath
 
-from qgs.data import PhotosSource, read_photos
+from qgs.data import PhotosSource
 from qgs.data import photos as formats
 from qgs.data.photos.reader import Listing, PhotoReader
 from qgs.data.photos.source import PhotoScene
@@ -205,7 +205,5 @@ def test_photos_in_memory_and_in_archives(tmp_path):
             (remote / name).write_bytes(file.read_bytes())
     expected = scene(tmp_path / "a").images(range(6))
     for url in ("memory://photos/a", f"zip://scene::file://{tmp_path}/a.zip"):
-        views = read_photos(url, (30, 40))
-        np.testing.assert_allclose(views.cameras.c2w[0], photos.c2w, atol=1e-6)
-        assert views.cameras.c2w.dtype == torch.float32
-        assert torch.equal(views.images[0], expected)
+        np.testing.assert_allclose(scene(url).cameras.c2w, photos.c2w, atol=1e-6)
+        assert torch.equal(scene(url).images(range(6)), expected)

@@ -12,7 +12,6 @@ from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
 
 from qgs.contracts import ViewsConfig
-from qgs.data import read_photos
 from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
 from qgs.data.photos.checks import frame_problems, intrinsics_problems, pose_problems, size_problems
@@ -56,14 +55,10 @@ def test_masks_reach_samples_and_views(folder):
     sample = make_sample(read(folder), (1, 3), (2,), ViewsConfig(inputs=2), mirror=True)
     assert sample.inputs.masks is not None
     assert sample.inputs.masks[0, :, 0, 5, 3].tolist() == [0, 1]
-    views = read_photos(folder, (30, 40), frames=[1])
-    assert views.masks is not None
-    assert views.masks[0, 0, 0, 5, [3, 30]].tolist() == [1, 0]
 
 
 def test_without_masks_there_are_none(folder):
     assert read(folder).masks([0]) is None
-    assert read_photos(folder, (30, 40)).masks is None
 
 
 def test_masks_that_do_not_exist_or_do_not_fit_are_told(folder):

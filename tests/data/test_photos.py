@@ -10,7 +10,6 @@ import torch
 from photo_formats import real_folder, row_of_frames
 from PIL import Image
 
-from qgs.data import read_photos
 from qgs.data.images import CropResize
 from qgs.data.lenses import RadialTangential
 
@@ -162,14 +161,6 @@ def test_each_coefficient_bends_rays_as_opencv_writes_it(place):
         bent = RadialTangential(*coefficients).distorted(torch.tensor([x, y]).double())
         assert bent.tolist() == pytest.approx(expected)
         assert bent.tolist() != pytest.approx((x, y))
-
-
-def test_read_photos(tmp_path):
-    views = read_photos(folder(tmp_path), (12, 16), frames=[2, 5])
-    assert views.images.shape == (1, 2, 3, 12, 16)
-    assert views.cameras.c2w[0, :, 0, 3].tolist() == [2, 5]
-    with pytest.raises(IndexError, match="0 to 9"):
-        read_photos(tmp_path, (12, 16), frames=[10])
 
 
 @pytest.mark.parametrize(("name", "count"), [("mary_rose", 69), ("office_walk", 186), ("desk", 7)])

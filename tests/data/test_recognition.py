@@ -48,10 +48,17 @@ def test_files_and_nothing(tmp_path):
         recognised(UPath(tmp_path / "b"), SOURCES)
 
 
-def test_a_plugin_takes_nothing_that_a_source_of_qgs_reads(tmp_path):
+def test_a_plugin_is_asked_before_qgs_and_both_are_named(tmp_path, caplog):
     for name in ("transforms.json", "a.tape"):
         (tmp_path / name).write_bytes(b"")
+    assert recognised(UPath(tmp_path), SOURCES) == "tapes/tape"
+    assert "looks like data of tapes/tape and of qgs/photos, and is read as tapes" in caplog.text
+
+
+def test_a_plugin_that_fails_hinders_no_other(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(TapeSource, "recognises", classmethod(lambda cls, path: {}[path]))
     assert recognised(UPath(tmp_path), SOURCES) == "qgs/photos"
+    assert "tapes/tape is not asked whether it reads" in caplog.text
 
 
 def test_options_for_other_data_and_for_that_of_the_training(tmp_path):

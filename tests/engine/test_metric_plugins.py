@@ -53,6 +53,7 @@ class MeanAbsoluteError(Metric):
 
 class DepthError(Metric):
     name: ClassVar[str] = "depth"
+    definition: ClassVar[str] = "rendered less true depth"
     needs = ("depth", "true_depth")
     column: ClassVar[Column] = Column("depth error", "lower")
 
@@ -62,6 +63,7 @@ class DepthError(Metric):
 
 class Masked(Metric):
     name: ClassVar[str] = "masked"
+    definition: ClassVar[str] = "mean of the mask"
     needs = ("masks",)
 
     def columns(self) -> Mapping[str, Column]:

@@ -25,6 +25,7 @@ from qgs.engine.objective import Objective
 from qgs.engine.training import compute_gradients
 from qgs.types import named_tensors
 
+README = Path(__file__).parents[2] / "README.md"
 NAN, INF = float("nan"), float("inf")
 
 
@@ -185,6 +186,12 @@ def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
             torch.testing.assert_close(
                 file.get_tensor(name)[2:], tensor, rtol=0, atol=0, equal_nan=True
             )
+    example = README.read_text(encoding="utf-8").split("To see it again:\n\n```python\n")[1]
+    ran: dict[str, Any] = {}
+    exec(example.split("```")[0].replace("RUN/incidents", str(tmp_path / "incidents")), ran)
+    saved = ran["views"](ran["saved"], "targets")
+    assert torch.equal(saved.images[2:].isnan(), bad.targets.images.isnan())
+    assert ran["prediction"].gaussians.means.isfinite().all()
     weights = qgs.load(place / "weights.safetensors").state_dict()
     assert all(torch.equal(t, weights[name]) for name, t in step.model.state_dict().items())
     report = json.loads((place / "report.json").read_text())

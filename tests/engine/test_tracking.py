@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from training_runs import Tiny, tensorboard_events
 
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.tracking import Trackers, TrainingProgress
 

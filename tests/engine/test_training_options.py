@@ -21,7 +21,7 @@ from training_runs import (
 import qgs
 from qgs.cli.contest import curves_of
 from qgs.composer import Recipe
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.data.sampling import Batch
 from qgs.engine import tracking as trackers
 from qgs.engine.checkpoint import read_state

@@ -8,8 +8,7 @@ from typer.testing import CliRunner
 from qgs.cli import app
 from qgs.components import FreeCenters, GaussianHead, MlpFeedForward
 from qgs.composer.registry import InstalledPlugin, PluginError
-from qgs.contracts import CONTRACT_VERSION, Plugin, ViewsConfig
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import CONTRACT_VERSION, MissingExtraError, Plugin, ViewsConfig
 from qgs.data import ChunksSource
 from qgs.renderers import TorchRenderer
 from qgs.testing import cases_of, check_plugin

@@ -18,8 +18,7 @@ from pydantic import ConfigDict
 from torch import Tensor
 
 from qgs.components import FreeCenters, MlpFeedForward
-from qgs.contracts import CONTRACT_VERSION, Centers, Component, ViewsConfig
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import CONTRACT_VERSION, Centers, Component, MissingExtraError, ViewsConfig
 from qgs.testing import (
     CHECKS,
     Case,

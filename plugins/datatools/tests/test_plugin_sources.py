@@ -1,10 +1,14 @@
 """Data of a source that a plugin brings is checked and packed as that of qgs is."""
 
+import re
+
 import numpy as np
 import photo_formats
 import pytest
 import tape_source
+import torch
 from qgs_datatools import sources
+from tape_source import Tape
 from typer.testing import CliRunner
 
 from qgs.cli import app
@@ -14,11 +18,11 @@ from qgs.data import ChunksSource
 @pytest.fixture
 def tapes(tmp_path, monkeypatch):
     tape_source.install(tmp_path / "site", monkeypatch)
-    sources.sources.cache_clear()
+    sources._installed.cache_clear()
     for name in "ab":
         tape_source.write_tape(tmp_path / "tapes" / f"{name}.tape")
     yield tmp_path / "tapes"
-    sources.sources.cache_clear()
+    sources._installed.cache_clear()
 
 
 def run(*arguments):
@@ -38,9 +42,63 @@ def test_check(tapes, format):
     bad = run("check", tapes, "--quick", "--format", format)
     assert bad.exit_code == 1
     assert "error: b, frame 3 (3): the pose has NaN" in bad.output
-    assert "no format 'tape': use one of auto, nerfstudio" in str(
-        run("check", tapes, "--format", "tape").exception
+    refused = str(run("check", tapes, "--format", "rooms/procedural").exception)
+    assert refused.startswith("there is no format 'rooms/procedural': use one of auto, nerfstudio")
+    assert "tapes/tape" in refused
+
+
+def test_missing_images_are_told_and_counted(tapes, monkeypatch):
+    monkeypatch.setattr(Tape, "missing", ("2.png", "4.png"))
+    (tapes / "index.json").write_text('{"a": {"context": [0, 6], "target": [2]}}')
+    output = run("check", tapes, "--quick").output
+    assert re.search("a +tapes/tape +8 +6 +2 ", output)
+    assert (
+        "error: a: listed images that do not exist: 2.png, 4.png; later frames move up in an "
+        "index: add the files, or take them out of what lists them" in output
     )
+    assert "context frame 6, but the scene's 6 frames are 0 to 5" in output
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("no luck")])
+@pytest.mark.parametrize("method", ["images", "frame_name"])
+def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch, error, method):
+    whole = getattr(Tape, method)
+
+    def fails(scene, asked):
+        if scene.name == "a" and asked in (1, [1]):
+            raise error
+        return whole(scene, asked)
+
+    monkeypatch.setattr(Tape, method, fails)
+    output = run("check", tapes, "--quick").output
+    told = f"{type(error).__name__}: {error}"
+    where = f"a, frame 1 (1): the image cannot be decoded ({told})" if method == "images" else "a: "
+    assert f"error: {where}" in output
+    assert told in output
+    assert re.search("b +tapes/tape +6 +6 +0 ", output)
+    assert "2 scenes, 1 error" in output
+
+
+def test_masks_are_looked_at(tapes, monkeypatch):
+    monkeypatch.setattr(Tape, "masks", lambda self, frames: torch.ones(len(frames), 1, 8, 8))
+    output = run("check", tapes, "--geometry", 0).output
+    reason = "its mask (1, 1, 8, 8) is not of shape (1, 1, 16, 16) and in [0, 1]: replace the mask"
+    assert f"error: b, frames 0-5 (0 to 5): {reason}" in output
+
+
+def test_a_folder_of_images_that_is_not_read_is_refused(tapes):
+    refused = run("check", tapes, "--images", "images_4").exception
+    assert str(refused) == "tapes/tape has no option `images`: leave --images out"
+
+
+def test_plugins_that_cannot_be_used_are_told(tapes, tmp_path):
+    with (tmp_path / "site" / "qgs_tapes-1.0.dist-info" / "entry_points.txt").open("a") as file:
+        file.write("bad = no_such_module:plugin\n")
+    sources._installed.cache_clear()
+    told = "left out: the plugin `bad` of qgs-tapes 1.0 cannot be imported"
+    assert f"note: {told}" in run("check", tapes, "--quick").output
+    assert told in run("pack", tapes, "--out", tmp_path / "chunks").output
+    assert told in str(run("check", tapes, "--format", "bad/source").exception)
 
 
 def test_pack(tapes, tmp_path):

@@ -12,6 +12,7 @@ from qgs.data.photos.llff import Llff
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoReader
 from qgs.data.scenes import warn_once
+from qgs.wording import listed
 
 READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Blender, Colmap, Llff)
 """All formats. Where a folder holds several listings, the first of this order is read."""
@@ -63,7 +64,7 @@ def _nothing(folder: UPath, format: Format, held: list[type[PhotoReader]]) -> st
         return f"{folder} has no {listing}, which {format} needs{other}"
     inside = sorted(item.name for item in folder.iterdir())
     images = sum(name.lower().endswith(IMAGE_SUFFIXES) for name in inside)
-    shown = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "") or "nothing"
+    shown = listed(inside) or "nothing"
     return (
         f"{folder} has no transforms.json nor another listing of cameras; it holds {shown} "
         f"({images} images). Camera poses are needed: make them with COLMAP or with nerfstudio's "

@@ -14,7 +14,7 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from upath import UPath
 
-from qgs.contracts.component import MissingExtraError
+from qgs.contracts import MissingExtraError
 from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
 from qgs.data.photos.checks import FrameProblem
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder

@@ -4,7 +4,6 @@ import io
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from operator import attrgetter
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -37,13 +36,11 @@ from qgs.data.scenes import (
     LazySource,
     warn_once,
 )
-from qgs.types import Cameras, Views
+from qgs.types import Cameras
 
 
 class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`."""
-
-    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     path: str
     """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
@@ -189,6 +186,7 @@ class PhotosSource(LazySource):
 
     name = "photos"
     Config = PhotosConfig
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)
@@ -285,25 +283,3 @@ def present_frames(
             f"first being {absent[0]}: add them, or remove their 'mask_path'"
         )
     return present, missing
-
-
-def read_photos(
-    path: str | Path | UPath,
-    image_size: tuple[int, int],
-    frames: Sequence[int] | None = None,
-    format: Format = "auto",
-) -> Views:
-    """Views (1, V) of a folder, in its poses' world. Raises as `PhotosSource`, and IndexError."""
-    folder = opened_path(path)
-    config = PhotosConfig(path=str(path), image_size=image_size, format=format)
-    scene = PhotoScene(folder_name(folder), folder, config, image_cache())
-    chosen = list(range(len(scene))) if frames is None else list(frames)
-    outside = [frame for frame in chosen if not 0 <= frame < len(scene)]
-    if outside:
-        raise IndexError(f"{folder} has frames 0 to {len(scene) - 1}, asked for {outside}")
-    cameras, masks = scene.cameras[chosen], scene.masks(chosen)
-    return Views(
-        scene.images(chosen)[None],
-        Cameras(cameras.c2w[None].float(), cameras.intrinsics[None].float(), cameras.size),
-        None if masks is None else masks[None],
-    )

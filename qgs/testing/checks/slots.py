@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,8 @@ from qgs.contracts import (
     MetricInput,
     Optimizer,
     ParameterGroup,
+    SceneSource,
+    Split,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.testing.case import CannotCheck, Case, expect
@@ -25,6 +27,7 @@ from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import check
 from qgs.testing.trees import cloned, described, difference, mapped, not_finite
 from qgs.types import GaussianAttributes, ImageMemory, Views, map_tensors
+from qgs.wording import listed
 
 Patch = tuple[int, int, int]  # view, row and column
 
@@ -107,10 +110,7 @@ def check_supervision_weights(case: Case) -> None:
 @check({"data"})
 def check_scenes_repeat(case: Case) -> None:
     """A scene is the same each time: names, cameras, and images of the delivered size in [0, 1]."""
-    try:
-        first, second = (case.build().scenes("train")[0] for _ in range(2))
-    except FileNotFoundError as error:
-        raise CannotCheck(f"the data of this case is not here: {error}") from error
+    first, second = (_source(case).scenes("train")[0] for _ in range(2))
     expect(first.name == second.name, f"scene 0 is `{first.name}`, then `{second.name}`")
     frames = list(range(min(2, len(first))))
     images = first.images(frames)
@@ -121,6 +121,31 @@ def check_scenes_repeat(case: Case) -> None:
     expect(low >= 0 and high <= 1, f"images are in [{low:.3g}, {high:.3g}]")
     found = difference([first.cameras, images], [second.cameras, second.images(frames)])
     expect(not found, f"opened again, {found}")
+
+
+@check({"data"})
+def check_scenes_are_as_listed(case: Case) -> None:
+    """`names` are those of the scenes, `groups` hold each scene once, held-out frames exist."""
+    source = _source(case)
+    for split in get_args(Split):
+        scenes, names = source.scenes(split), list(source.names(split))
+        count, where = len(scenes), f"of the {split} split"
+        expect(len(names) == count, f"{where}, there are {count} scenes, {len(names)} names")
+        grouped = sorted(int(i) for group in source.groups(split) for i in group)
+        once = grouped == list(range(count))
+        expect(once, f"{where}, groups hold not each of {count} scenes once: {listed(grouped)}")
+        for place in {0, count // 2, count - 1} if count else ():
+            scene, name = scenes[place], f"scene {place} {where}"
+            expect(scene.name == names[place], f"{name} is `{scene.name}`, not {names[place]}")
+            outside = [frame for frame in scene.held_out if not 0 <= frame < len(scene)]
+            expect(not outside, f"{name} has {len(scene)} frames and holds out {outside}")
+
+
+def _source(case: Case) -> SceneSource:
+    try:
+        return case.build()
+    except FileNotFoundError as error:
+        raise CannotCheck(f"the data of this case is not here: {error}") from error
 
 
 @check({"losses"})

@@ -21,6 +21,7 @@ class Photo:
     read: Callable[[], bytes]
     exists: bool = True
     mask_exists: bool = True
+    check_mask: Callable[[], None] | None = None  # for a mask that `listed` has no file of
 
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Pinhole RGB, `side` pixels long at most, and its intrinsics (4,). Raises OSError."""
@@ -37,7 +38,10 @@ class Photo:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to check. scene: its name in indices. photos: raises ValueError or OSError."""
+    """A scene to check. scene: its name in indices. photos: raises ValueError or OSError.
+
+    missing: names of listed images that do not exist and are none of `photos`; raises alike.
+    """
 
     name: str
     scene: str
@@ -45,3 +49,4 @@ class Candidate:
     convention: Convention
     photos: Callable[[], Sequence[Photo]]
     split: str = ""
+    missing: Callable[[], Sequence[str]] = tuple

@@ -11,15 +11,16 @@ import numpy as np
 from upath import UPath
 
 from qgs.data.photos import READERS, Format, read_listing
+from qgs.wording import listed
 from qgs_datatools.cameras import camera_findings, sharing_findings
 from qgs_datatools.candidates import Candidate
 from qgs_datatools.chunks import chunk_folders
-from qgs_datatools.decoding import DecodedScene, decode, file_findings, size_findings
+from qgs_datatools.decoding import DecodedScene, decode, file_findings, said, size_findings
 from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
 from qgs_datatools.indices import Held, found_indices, index_findings
-from qgs_datatools.sources import kind_of, source_scenes, sources
+from qgs_datatools.sources import kind_of, left_out, source_scenes, sources
 
 _PHOTO_FORMATS = {reader.name: reader.listing for reader in READERS}
 _LISTINGS = {**_PHOTO_FORMATS, "dl3dv": "transforms.json", "chunks": "the chunk"}
@@ -110,7 +111,8 @@ def check(
     """
     formats = ("auto", *_LISTINGS, *(kind for kind in sources() if not kind.startswith("qgs/")))
     if options.format not in formats:
-        raise ValueError(f"there is no format {options.format!r}: use one of {', '.join(formats)}")
+        told = "; ".join([", ".join(formats), *left_out()])
+        raise ValueError(f"there is no format {options.format!r}: use one of {told}")
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
     candidates, general, told = _candidates(path, options)
@@ -130,6 +132,7 @@ def check(
         findings, summary = index_findings(file, held, told)
         general += findings
         summaries += [summary] if summary else []
+    notes = [*left_out(), *notes]
     return CheckReport(str(path), scenes, general, summaries, len(judged), notes)
 
 
@@ -140,6 +143,8 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
         is_chunk = path.is_file() and path.suffix == ".torch"
         kind = "chunks" if is_chunk else kind_of(path)
     if kind == "chunks":
+        if options.images is not None:
+            raise ValueError("chunks hold their images: leave --images out")
         folders = chunk_folders(path)
         return (
             [candidate for folder in folders for candidate in folder.candidates],
@@ -149,7 +154,7 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
     if kind == "dl3dv":
         return dl3dv_scenes(path, options.images), [], set()
     if "/" in kind:
-        return list(source_scenes(kind, path)), [], set()
+        return list(source_scenes(kind, path, options.images)), [], set()
     items = list(photo_folders(path, _photo_format(options), options.images))
     return (
         [item for item in items if isinstance(item, Candidate)],
@@ -178,15 +183,18 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     name = candidate.name
     report = SceneReport(name, candidate.scene, candidate.kind, candidate.split)
     try:
-        photos = candidate.photos()
-    except (OSError, ValueError) as error:
+        photos, missing = candidate.photos(), candidate.missing()
+    except Exception as error:  # whatever a reader raises; the other scenes go on
         reason, colon, fix = str(error).rpartition(": ")  # messages end with a remedy
-        if not colon:
-            reason, fix = str(error), "get the files again"
+        if not colon or not isinstance(error, OSError | ValueError):
+            reason, fix = said(error), "get the files again, or mend what reads them"
         return replace(report, findings=[Finding(name, reason, fix)])
+    reason = f"listed images that do not exist: {listed(missing)}; later frames move up"
+    fix = "add the files, or take them out of what lists them"
+    absent = [Finding(name, f"{reason} in an index", fix)] if missing else []
     if not photos:
         nothing = Finding(name, "no photos are listed", "export the scene again")
-        return replace(report, findings=[nothing])
+        return replace(report, findings=absent or [nothing])
     with ThreadPoolExecutor(options.threads) as pool:
         decoded = pool.map(partial(decode, headers_only=options.headers_only), photos)
     scene = DecodedScene(name, photos, list(decoded))
@@ -199,7 +207,7 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
         if frame not in _frames(poses) and np.isfinite(photo.listed.c2w).all()
     ]
     sharing = list(sharing_findings(scene, placed, float32=candidate.kind == "chunks"))
-    findings = merged([*files, *sizes, *poses, *others, *sharing])
+    findings = merged([*absent, *files, *sizes, *poses, *others, *sharing])
     geometry = None
     if with_geometry:
         unsound = _frames([*sizes, *others, *sharing])
@@ -210,9 +218,9 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
             findings += geometry_findings(scene, geometry, candidate.convention)
     return replace(
         report,
-        listed=len(photos),
+        listed=len(photos) + len(missing),
         decodable=sum(result.size is not None for result in scene.decoded),
-        missing=sum(not photo.exists for photo in photos),
+        missing=len(missing) + sum(not photo.exists for photo in photos),
         pose_problems=len(_frames([*poses, *sharing])),
         geometry=geometry,
         findings=findings,
@@ -230,9 +238,9 @@ def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
         return {}
     fov, c2w = [], []
     for frame in frames:
-        listed = scene.photos[frame].listed
-        height, width = listed.size or scene.decoded[frame].size or (1, 1)
-        fov.append((width / 2 / listed.intrinsics[0], height / 2 / listed.intrinsics[1]))
-        c2w.append(listed.c2w[:3])
+        photo = scene.photos[frame].listed
+        height, width = photo.size or scene.decoded[frame].size or (1, 1)
+        fov.append((width / 2 / photo.intrinsics[0], height / 2 / photo.intrinsics[1]))
+        c2w.append(photo.c2w[:3])
     drawn = {"c2w": np.array(c2w, np.float32), "fov": np.array(fov, np.float32)}
     return {"frames": tuple(frames), **drawn}

@@ -25,11 +25,11 @@ from qgs.data.chunk_files import (
 )
 from qgs.data.lenses import Size
 from qgs.data.photos.reader import PhotoFrame
+from qgs.wording import listed
 from qgs_datatools.candidates import Candidate, Photo
 from qgs_datatools.conventions import OPENCV
 from qgs_datatools.findings import Finding
 
-_SHOWN = 3
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
 
@@ -166,8 +166,7 @@ class ChunkFolder:
 
 
 def _counted(keys: Sequence[str]) -> str:
-    more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-    return f"{len(keys)} scene{'s' if len(keys) > 1 else ''}: {', '.join(keys[:_SHOWN])}{more}"
+    return f"{len(keys)} scene{'s' if len(keys) > 1 else ''}: {listed(keys)}"
 
 
 @lru_cache(maxsize=1)
@@ -187,7 +186,7 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         c2w = np.linalg.inv(record.w2c[frame].numpy())
     except np.linalg.LinAlgError:
         c2w = np.full((4, 4), np.nan)
-    listed = PhotoFrame(
+    photo = PhotoFrame(
         name=record.names[frame],
         path=file,
         c2w=c2w,
@@ -195,7 +194,7 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         size=size,
         problems=tuple(unit_problems(record, frame)),
     )
-    return Photo(listed, lambda: record.images[frame].numpy().tobytes())
+    return Photo(photo, lambda: record.images[frame].numpy().tobytes())
 
 
 def _listed_sizes(record: Record) -> list[Size] | None:

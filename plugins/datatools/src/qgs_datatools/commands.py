@@ -144,8 +144,11 @@ def pack(
     from qgs.data.paths import opened_path
     from qgs_datatools import packing
     from qgs_datatools.entries import Encoding
+    from qgs_datatools.sources import left_out
 
     console = Console()
+    for note in left_out():
+        _line(console, note)
     source, settings = _opened(path, options or [], image_size)
     splits = _splits(source, test_scenes, test_every)
     settings |= {"test_scenes": test_scenes, "test_every": test_every}

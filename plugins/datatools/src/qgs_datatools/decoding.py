@@ -9,6 +9,7 @@ from statistics import median, median_low
 
 from PIL import Image, UnidentifiedImageError
 
+from qgs.data.evaluation import one_line
 from qgs.data.images import open_mask
 from qgs.data.lenses import Size
 from qgs.data.photos.checks import size_problems
@@ -62,20 +63,26 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
                 image.load()
     except UnidentifiedImageError:
         return Decoded(error="its header is none of a known image format")
-    except _ERRORS as error:
-        return Decoded(error=str(error) or type(error).__name__)
+    except Exception as error:  # whatever a reader raises; the other photos go on
+        return Decoded(error=said(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()
     return Decoded(size, digest, mask_error=None if headers_only else _mask_error(photo))
 
 
+def said(error: Exception) -> str:
+    """What an exception says, with its kind where that is no way to tell of a bad file."""
+    return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)
+
+
 def _mask_error(photo: Photo) -> str | None:
     mask = photo.listed.mask
-    if mask is None or not photo.mask_exists or mask == photo.listed.path:
-        return None
     try:
-        open_mask(mask)
-    except _ERRORS as error:
-        return str(error)
+        if photo.check_mask is not None:
+            photo.check_mask()
+        elif mask is not None and photo.mask_exists and mask != photo.listed.path:
+            open_mask(mask)
+    except Exception as error:
+        return said(error)
     return None
 
 

@@ -15,6 +15,7 @@ from qgs.contracts import SceneSource, Split
 from qgs.data.chunk_files import INDEX, SUFFIX
 from qgs.data.paths import is_local
 from qgs.io.files import replacing
+from qgs.wording import listed
 from qgs_datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames
 
 CHUNK_BYTES = 100 * 2**20
@@ -39,8 +40,8 @@ def splits_by_list(source: SceneSource, test_scenes: Collection[str]) -> Splits:
     places = [*splits["train"], *splits["test"]]
     if absent := [name for name in test_scenes if name not in set(places)]:
         raise ValueError(
-            f"{len(absent)} of {len(test_scenes)} test scenes are not there: {_some(absent)}; the "
-            f"{len(places)} scenes are called {_some(places)}. Correct the list, or take them out "
+            f"{len(absent)} of {len(test_scenes)} test scenes are not there: {listed(absent)}; the "
+            f"{len(places)} scenes are called {listed(places)}. Correct the list, or take them out "
             "of it"
         )
     return _split_again(splits, set(test_scenes))
@@ -70,10 +71,6 @@ def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
     return places
 
 
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-
-
 @dataclass
 class Journal:
     """A packing. settings: what decides its result. files: a scene's key to its whole chunk."""
@@ -99,7 +96,7 @@ def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
         inside = folder.iterdir() if folder.is_dir() else ()
         if held := sorted(item.name for item in inside if not _is_unfinished(item)):
             raise FileExistsError(
-                f"{folder} is not empty ({', '.join(held[:5])}), and packing never overwrites: "
+                f"{folder} is not empty ({listed(held)}), and packing never overwrites: "
                 "give a new folder"
             )
         return Journal(folder, settings)

@@ -1,13 +1,13 @@
 """Data sources of installed plugins: which of them reads a path, and its scenes to check."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from typing import get_args
 
 import numpy as np
 from upath import UPath
 
-from qgs.composer.registry import load_sound_plugins
+from qgs.composer.registry import Registry, load_sound_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
@@ -19,9 +19,19 @@ _SIZE = (256, 256)  # of the images that a source is asked for
 
 
 @cache
+def _installed() -> tuple[Registry, list[str]]:
+    return load_sound_plugins()
+
+
 def sources() -> dict[str, type[Component]]:
-    """The sources of qgs and of every installed plugin by PLUGIN/NAME."""
-    return load_sound_plugins()[0].components("data")
+    """The sources of qgs and of every sound plugin that read a path, by PLUGIN/NAME."""
+    found = _installed()[0].components("data")
+    return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
+
+
+def left_out() -> list[str]:
+    """What to tell of the plugins that cannot be used."""
+    return [f"left out: {problem}" for problem in _installed()[1]]
 
 
 def kind_of(path: UPath) -> str:
@@ -29,26 +39,41 @@ def kind_of(path: UPath) -> str:
     return recognised(path, sources()).removeprefix("qgs/")
 
 
-def source_scenes(kind: str, path: UPath) -> Iterator[Candidate]:
-    """The scenes of a plugin's source, as it delivers them. Raises as the source does."""
+def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
+    """The scenes of a plugin's source, as it delivers them. Raises as the source does.
+
+    images: for its option of that name. Raises ValueError where it has none.
+    """
     source = sources()[kind]
     assert issubclass(source, SceneSource)
-    opened = source(source.config_for(str(path), _SIZE, None))
+    if images is not None and "images" not in source.Config.model_fields:
+        raise ValueError(f"{kind} has no option `images`: leave --images out")
+    config = source.config_for(str(path), _SIZE, None)
+    opened = source(config if images is None else config.model_copy(update={"images": images}))
     known: set[str] = set()
     for split in get_args(Split):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
                 photos = partial(_photos, opened, split, place)
-                yield Candidate(name, name, kind, OPENCV, photos, split)
+                missing = partial(_missing, opened, split, place)
+                yield Candidate(name, name, kind, OPENCV, photos, split, missing)
             known.add(name)
+
+
+def _missing(source: SceneSource, split: Split, place: int) -> Sequence[str]:
+    return source.scenes(split)[place].missing
 
 
 def _photos(source: SceneSource, split: Split, place: int) -> list[Photo]:
     scene = source.scenes(split)[place]
-    return [Photo(_listed(scene, i), partial(_image_file, scene, i)) for i in range(len(scene))]
+    image, mask = partial(_image_file, scene), partial(_check_mask, scene)
+    return [
+        Photo(_frame(scene, i), partial(image, i), check_mask=partial(mask, i))
+        for i in range(len(scene))
+    ]
 
 
-def _listed(scene: Scene, frame: int) -> PhotoFrame:
+def _frame(scene: Scene, frame: int) -> PhotoFrame:
     camera, name = scene.cameras[frame], scene.frame_name(frame)
     fx, fy, cx, cy = camera.intrinsics.tolist()
     c2w = camera.c2w.double().numpy()
@@ -58,3 +83,9 @@ def _listed(scene: Scene, frame: int) -> PhotoFrame:
 def _image_file(scene: Scene, frame: int) -> bytes:
     pixels = scene.images([frame])[0].permute(1, 2, 0).mul(255).round().byte().numpy()
     return Encoding().image(np.ascontiguousarray(pixels))
+
+
+def _check_mask(scene: Scene, frame: int) -> None:
+    mask, wanted = scene.masks([frame]), (1, 1, *scene.cameras.size)
+    if mask is not None and (mask.shape != wanted or not bool(((mask >= 0) & (mask <= 1)).all())):
+        raise ValueError(f"its mask {tuple(mask.shape)} is not of shape {wanted} and in [0, 1]")

@@ -30,9 +30,6 @@ ImageCache = dict[tuple[str, int], np.ndarray]
 class RoomsConfig(SceneSource.Config):
     """Options of `rooms/procedural`."""
 
-    unhashed_options: ClassVar[frozenset[str]] = SceneSource.Config.unhashed_options | {"cache_mb"}
-    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
-
     scenes: int = Field(default=2000, ge=1)
     """Rooms of the training split."""
     test_scenes: int = Field(default=32, ge=1)
@@ -127,6 +124,8 @@ class RoomsSource(LazySource):
 
     name = "procedural"
     Config = RoomsConfig
+    not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
+    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
     def __init__(self, config: RoomsConfig) -> None:
         super().__init__(config)

@@ -1,0 +1,10 @@
+"""Words that messages share."""
+
+from collections.abc import Iterable
+
+
+def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
+    """The first `most` of `names`, and how many more there are; "" for none."""
+    shown = [*map(str, names)]
+    more = f" and {len(shown) - most} more" if len(shown) > most else ""
+    return between.join(shown[:most]) + more
