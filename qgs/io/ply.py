@@ -1,11 +1,10 @@
 """Gaussians as PLY files that splat viewers open (property names and order: 3DGS release)."""
 
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from qgs.io.files import replacing
 from qgs.types import Gaussians
@@ -56,36 +55,3 @@ def write_ply(gaussians: Gaussians, path: str | Path) -> None:
         vertices[name] = table[:, column]
     with replacing(path) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
-
-
-def read_ply(path: str | Path) -> Gaussians:
-    """Read the (1, G, ...) Gaussians of a 3DGS file, whoever wrote it.
-
-    Raises ValueError for a file without the 3DGS properties, and for view-dependent colour
-    (f_rest not zero), which `Gaussians` cannot hold.
-    """
-    try:
-        vertices = PlyData.read(BytesIO(Path(path).read_bytes()))["vertex"].data
-    except (PlyParseError, KeyError) as error:
-        raise ValueError(f"{path} is not a readable PLY file of vertices: {error}") from error
-    names = vertices.dtype.names or ()
-    missing = [name for name in PROPERTIES if name not in names and name not in ("nx", "ny", "nz")]
-    if missing:
-        raise ValueError(f"{path} is no 3DGS file: properties {', '.join(missing)} are missing")
-    if any(np.any(vertices[name]) for name in names if name.startswith("f_rest_")):
-        raise ValueError(
-            f"{path} holds view-dependent colour (f_rest), but Gaussians have one RGB each; "
-            "export it with spherical harmonics of degree 0"
-        )
-
-    def columns(*wanted: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([vertices[name] for name in wanted], -1, dtype=np.float32))
-
-    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
-    return Gaussians(
-        means=columns("x", "y", "z"),
-        scales=columns("scale_0", "scale_1", "scale_2").exp(),
-        quats=torch.nn.functional.normalize(quats, dim=-1),
-        opacities=columns("opacity")[:, 0].sigmoid(),
-        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * SH_C0 + 0.5,
-    )[None]
