@@ -29,7 +29,6 @@ CATEGORICAL: tuple[Color, ...] = (
 
 INK: Color = (32, 36, 42)
 MUTED: Color = (122, 128, 136)
-PAPER: Color = (255, 255, 255)
 COLUMN_INCHES = 1.9
 
 
