@@ -73,11 +73,12 @@ class ShapesAlone(TorchFunctionMode):
     """On "meta", makes the results of `randn`, `cat` and arithmetic from their shapes.
 
     torch's own way to do so (its `broadcast_shapes` too) imports its compiler or sympy, which
-    takes longer than everything else that `qgs compose` does. It is left what is not plain.
+    takes longer than everything else that `qgs compose` does. It is left all but plain float32.
     """
 
     names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
     arithmetic = frozenset(getattr(Tensor, name) for name in names)
+    plain = (Tensor, "meta", torch.float32, True, False)
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
@@ -87,21 +88,17 @@ class ShapesAlone(TorchFunctionMode):
         elif (func is torch.cat or func in self.arithmetic) and len(args) == 2 and not kwargs:
             joined = func is torch.cat
             tensors = args[0] if joined else [x for x in args if type(x) not in (int, float)]
-            if isinstance(tensors, list | tuple) and _are_plain(tensors):
+            if isinstance(tensors, list | tuple) and set(map(_kind, tensors)) == {self.plain}:
                 shapes = [list(x.shape) for x in tensors]
                 with suppress(ValueError, IndexError):  # what does not fit, torch refuses itself
                     shape = _joined(shapes, args[1]) if joined else np.broadcast_shapes(*shapes)
-                    return torch.empty(shape, dtype=tensors[0].dtype, device="meta")
+                    return torch.empty(shape, device="meta", dtype=torch.float32)
         return func(*args, **(kwargs or {}))
 
 
-def _are_plain(tensors: Sequence[Any]) -> bool:
-    """Whether shapes and one floating dtype say everything about `tensors`."""
-    plain = (
-        type(x) is Tensor and x.is_meta and x.is_contiguous() and not x.requires_grad
-        for x in tensors
-    )
-    return all(plain) and {x.dtype for x in tensors} in ({torch.float32}, {torch.float64})
+def _kind(x: Any) -> tuple[Any, ...]:
+    plain = isinstance(x, Tensor)
+    return (type(x), x.device.type, x.dtype, x.is_contiguous(), x.requires_grad) if plain else ()
 
 
 def _joined(shapes: Sequence[list[int]], dim: int) -> list[int]:

@@ -108,10 +108,10 @@ def resolve(
         check_flow(sound, dims.depth, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
-    spelled_out = _spell_out(tree, settings, registry, chosen)
+    out = _spell_out(tree, settings, registry, chosen)
     return Recipe(
-        tree=spelled_out.values,
-        provenance=spelled_out.provenance,
+        tree=out.values,
+        provenance=out.provenance,
         parts=chosen,
         dims=dims,
         layer_scale=decoder.layer_scale,
@@ -120,9 +120,7 @@ def resolve(
         views=settings["views",],
         training=settings["training",],
         evaluation=settings["evaluation",],
-        plugin_versions={
-            n: registry.plugins[n].version for n in ("qgs", *spelled_out.values["plugins"])
-        },
+        plugin_versions={n: registry.plugins[n].version for n in ("qgs", *out.values["plugins"])},
     )
 
 

@@ -96,8 +96,8 @@ def test_a_metric_of_a_plugin_that_was_installed_later(
     (info / "entry_points.txt").write_text("[qgs.plugins]\nmine = mine_later:plugin\n")
     monkeypatch.syspath_prepend(tmp_path)
     more = ("plugins=[mine]", "metrics.level.type=mine/mean")
-    settings = [word for setting in more for word in ("--set", setting)]
-    result = evaluated(runs / "tokengs", *settings, "--out", tmp_path / "out")
+    words = ("--set", more[0], "--set", more[1], "--out", tmp_path / "out")
+    result = evaluated(runs / "tokengs", *words)
     assert result.exit_code == 0, result.output
     assert "level" in summary(tmp_path / "out")["columns"]
     recipe = resolve(RECIPES / "tokengs.yaml", (*SMALL, "training.steps=1"))
