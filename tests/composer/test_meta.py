@@ -4,7 +4,7 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from torch import nn, ones, tensor
+from torch import ones, tensor
 
 from qgs.composer.build import ShapesAlone
 
@@ -16,7 +16,6 @@ EXPRESSIONS = (
     lambda: torch.cat([ones(0), ones(2, 3)], 0),
     lambda: torch.cat([], 0),
     lambda: ones(2, requires_grad=True) * 2,
-    lambda: ones(2) - nn.Parameter(ones(2)),
     lambda: ones(2, 1) * ones(3) + 1,
     lambda: ones(2) * ones(3),
     lambda: ones(2, dtype=torch.float64) * ones(2),
@@ -26,7 +25,6 @@ EXPRESSIONS = (
     lambda: 2 / ones(2) + 1 - 2 ** ones(2) ** 2,
     lambda: ones(2) * tensor(3.0, device="cpu"),
     lambda: torch.randn(2, 3),
-    lambda: torch.randn((2, 3), dtype=torch.float64),
     lambda: torch.randn(2, requires_grad=True),
     lambda: [float(x) for x in torch.arange(4, device="cpu") * 0.5],
     lambda: float((torch.from_numpy(torch.arange(3, device="cpu").numpy()) / 2).sum()),
@@ -41,8 +39,7 @@ def made(expression, mode):
             x = expression()
         except Exception as error:
             return type(error), str(error)
-    is_tensor = torch.is_tensor(x)
-    return (x.shape, x.stride(), x.dtype, x.device, x.requires_grad) if is_tensor else x
+    return (x.shape, x.stride(), x.dtype, x.device, x.requires_grad) if torch.is_tensor(x) else x
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)

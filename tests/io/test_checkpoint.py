@@ -143,7 +143,6 @@ def test_a_missing_plugin_is_told_by_file_and_distribution(
 def test_only_plugins_that_are_used_are_needed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The recipe of photos lies over one that trains on rooms."""
     path = tmp_path / "photos.safetensors"
     save(qgs.compose(RECIPES / "photos.yaml", SMALL), path)
     without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
