@@ -61,7 +61,7 @@ class DecoderLayer(nn.Module):
 class QueryGaussianModel(nn.Module):
     """Posed photos in, a fixed budget of Gaussians out.
 
-    refinements: one per decoder layer; layers may share a module.
+    refinements: one per decoder layer, at `refinement_of`; layers may share a module.
     recipe: the resolved recipe this model was composed from, None for one built by hand.
     """
 
@@ -84,7 +84,7 @@ class QueryGaussianModel(nn.Module):
         self.decoder = nn.ModuleList(decoder)
         self.refinements = nn.ModuleList(dict.fromkeys(refinements))
         shared = {id(module): index for index, module in enumerate(self.refinements)}
-        self._refinement_of = [shared[id(module)] for module in refinements]
+        self.refinement_of = [shared[id(module)] for module in refinements]
         self.head = head
         self.centers = centers
         self.supervision = supervision
@@ -131,7 +131,7 @@ class QueryGaussianModel(nn.Module):
             raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
         decoded: dict[int, LayerPrediction] = {}
         for number, layer in enumerate(self.decoder, start=1):
-            refine = self.refinements[self._refinement_of[number - 1]]
+            refine = self.refinements[self.refinement_of[number - 1]]
             state = refine(layer(state, memory))
             if number in layers or number == self.depth:
                 decoded[number] = LayerPrediction(self.decode(state), state)

@@ -161,7 +161,7 @@ def loaded_over_consumed(recipe: Recipe, workers: int) -> float:
 def _training_step(recipe: Recipe) -> Callable[[], None]:
     torch.set_num_threads(2)
     objective = Objective(recipe.build_model().train(), recipe.build_losses(), 0)
-    optimizer = make_optimizer(objective, recipe.build_optimizer())
+    optimizer = make_optimizer(objective, recipe.build_optimizer(), recipe.rate_factors(objective))
     accelerator = make_accelerator("cpu")
     with closing(training_batches(recipe.build_data(), recipe.views, 2, 0)) as stream:
         batch = next(stream)

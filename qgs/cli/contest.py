@@ -26,8 +26,6 @@ from qgs.metrics.baselines import BASELINES
 SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
 
-PICTURED_SCENES = 3
-
 
 @dataclass(frozen=True)
 class Entry:

@@ -39,8 +39,10 @@ def compose(
     from qgs.composer.recipe import annotated
 
     resolved = resolve(recipe, overrides or ())
+    model = resolved.build_model("meta")
+    resolved.rate_factors(model)  # patterns that name no parameter are refused
     typer.echo(annotated(resolved))
-    Console(stderr=True).print(parameter_table(resolved))
+    Console(stderr=True).print(parameter_table(resolved, model))
 
 
 def diff(

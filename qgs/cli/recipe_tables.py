@@ -7,13 +7,14 @@ from torch import nn
 from qgs.composer import Recipe
 from qgs.composer.slots import LAYER_SLOTS
 from qgs.io.differences import differing_options
+from qgs.model import QueryGaussianModel
 
 
-def parameter_table(recipe: Recipe) -> Table:
-    """Parameters of each component."""
+def parameter_table(recipe: Recipe, model: QueryGaussianModel) -> Table:
+    """Parameters of each component of `model`, built from `recipe`."""
     table = Table("component", "type", "parameters", title="parameters", title_justify="left")
     table.columns[2].justify = "right"
-    counts = parameter_counts(recipe)
+    counts = parameter_counts(model)
     for name, count in counts.items():
         table.add_row(name, _types(recipe, name), f"{count:,}")
     table.add_section()
@@ -44,7 +45,7 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
         elif not any(path.startswith(f"{kind}.") for kind in kinds):
             options.add_row(path, *cells)
     parameters.add_column("difference", justify="right", overflow="fold")
-    ours, theirs = parameter_counts(first), parameter_counts(second)
+    ours, theirs = (parameter_counts(r.build_model("meta")) for r in (first, second))
     rows = [(name, count, theirs[name]) for name, count in ours.items()]
     for name, x, y in [*rows, ("total", sum(ours.values()), sum(theirs.values()))]:
         if name == "total":
@@ -53,9 +54,8 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
     return [slots, options, parameters]
 
 
-def parameter_counts(recipe: Recipe) -> dict[str, int]:
+def parameter_counts(model: QueryGaussianModel) -> dict[str, int]:
     """Component to its number of parameters, decoder layers summed by slot."""
-    model = recipe.build_model("meta")
     sublayers = {
         f"decoder.{slot}": sum(_count(getattr(layer, slot)) for layer in model.decoder)
         for slot in LAYER_SLOTS

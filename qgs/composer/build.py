@@ -1,7 +1,7 @@
 """From chosen components to a model."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,7 @@ def build_model(
     with (
         torch.random.fork_rng(devices=()),
         torch.device("meta" if on_meta else "cpu"),
-        _ShapesAlone() if on_meta else nullcontext(),
+        ShapesAlone() if on_meta else nullcontext(),
     ):
         torch.default_generator.manual_seed(seed)
         encoder, queries = at("encoder"), at("queries")
@@ -69,38 +69,51 @@ def build_model(
     return model if on_meta or device is None else model.to(device)
 
 
-class _ShapesAlone(TorchFunctionMode):
+class ShapesAlone(TorchFunctionMode):
     """On "meta", makes the results of `randn`, `cat` and arithmetic from their shapes.
 
     torch's own way to do so (its `broadcast_shapes` too) imports its compiler or sympy, which
-    takes longer than everything else that `qgs compose` does.
+    takes longer than everything else that `qgs compose` does. It is left all but plain float32.
     """
 
-    arithmetic = ("add", "sub", "mul", "div", "pow", "__rsub__", "__rdiv__", "__rpow__")
+    names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
+    arithmetic = frozenset(getattr(Tensor, name) for name in names)
+    plain = (Tensor, "meta", torch.float32, True, False)
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
-        if func is torch.randn and "generator" not in (kwargs or {}):
+        if func is torch.randn and not kwargs:
             func = torch.empty
-        elif func is torch.cat and len(args) == 2 and not kwargs:
-            tensors, dim = args
-            shape = list(tensors[0].shape)
-            shape[dim] = sum(x.shape[dim] for x in tensors)
-            return torch.empty(shape, dtype=tensors[0].dtype)
-        elif getattr(func, "__name__", "") in self.arithmetic and not kwargs:
-            dtype = torch.result_type(*args)
-            shapes = [x.shape for x in args if isinstance(x, Tensor)]
-            if dtype.is_floating_point:
-                return torch.empty(np.broadcast_shapes(*shapes), dtype=dtype)
+        elif (func is torch.cat or func in self.arithmetic) and len(args) == 2 and not kwargs:
+            joined = func is torch.cat
+            tensors = args[0] if joined else [x for x in args if type(x) not in (int, float)]
+            if isinstance(tensors, list | tuple) and set(map(_kind, tensors)) == {self.plain}:
+                shapes = [list(x.shape) for x in tensors]
+                with suppress(ValueError, IndexError):  # what does not fit, torch refuses itself
+                    shape = _joined(shapes, args[1]) if joined else np.broadcast_shapes(*shapes)
+                    return torch.empty(shape, device="meta", dtype=torch.float32)
         return func(*args, **(kwargs or {}))
+
+
+def _kind(x: Any) -> tuple[Any, ...]:
+    plain = isinstance(x, Tensor)
+    return (type(x), x.device.type, x.dtype, x.is_contiguous(), x.requires_grad) if plain else ()
+
+
+def _joined(shapes: Sequence[list[int]], dim: int) -> list[int]:
+    length = sum(shape.pop(dim) for shape in shapes)
+    if shapes.count(shapes[0]) < len(shapes):
+        raise ValueError
+    shapes[0].insert(dim % (len(shapes[0]) + 1), length)
+    return shapes[0]
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
     """The component itself. arguments: what its constructor takes besides its Config.
 
-    What a plugin's constructor raises is reported with its distribution, except what is for the
-    user to put right: missing packages, data, training too short for its optimiser.
+    What a plugin's constructor raises is reported with its distribution, except mistakes of the
+    user: missing packages, data, training too short for its optimiser.
     """
     component: Any = chosen.component
     try:
@@ -108,10 +121,10 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
     except MissingExtraError:
         raise
     except Exception as error:
-        for_users = issubclass(component, SceneSource | Optimizer)
-        if chosen.installed.plugin is BUILTIN or (
-            for_users and isinstance(error, ValueError | OSError)
-        ):
+        users_mistake = isinstance(error, ValueError | OSError) and issubclass(
+            component, SceneSource | Optimizer
+        )
+        if chosen.installed.plugin is BUILTIN or users_mistake:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         where = chosen.place.origin.file, chosen.place.origin.line

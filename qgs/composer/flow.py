@@ -98,8 +98,8 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                 problems.add(origin, chosen.path, *_unmet(group, chosen, fixes, after))
         for name in needed.keys() - missing.keys():
             if fields[name][0] != needed[name]:
-                told = _mismatch(name, needed[name], chosen, *fields[name])
-                problems.add(origin, chosen.path, *told)
+                reason, fix = _mismatch(name, needed[name], chosen, *fields[name])
+                problems.add(origin, chosen.path, reason, fix)
         provided = chosen.component.provides(chosen.config)
         fields |= {name: (spec, chosen) for name, spec in provided.items() if name not in missing}
 

@@ -92,7 +92,9 @@ def apply_swaps(
         hits = [path for path in swappable if _matches(pattern, path)]
         if not hits:
             reason = f"the pattern `{pattern}` matches no place"
-            problems.add(origin, name, reason, _near_pattern(pattern, swappable))
+            known = dict.fromkeys(_starred(path).removeprefix("model.") for path in swappable)
+            fix = near_pattern(pattern, swappable) or f"places: {', '.join(known)}"
+            problems.add(origin, name, reason, fix)
         for path in hits:
             if conflict := _conflict(result[path]):
                 problems.add(origin, name, *conflict)
@@ -120,15 +122,12 @@ def _conflict(place: Place) -> tuple[str, str] | None:
     return None
 
 
-def _near_pattern(pattern: str, swappable: Iterable[KeyPath]) -> str:
-    """A fix: the place, or all layers of it, whose name is nearest to `pattern`."""
-    places: list[str] = []
-    for path in swappable:
-        parts = path[1:] if path[0] == "model" else path
-        if "layers" in parts:
-            places.append(".".join((*parts[:2], "*", *parts[3:])))
-        places.append(".".join(parts))
-    if near := nearest(pattern.removeprefix("model."), places):
-        return f"did you mean `{near}`?"
-    starred = dict.fromkeys(name for name in places if "*" in name or "layers" not in name)
-    return f"places: {', '.join(starred)}"
+def near_pattern(pattern: str, paths: Iterable[KeyPath]) -> str:
+    """A fix: the name of one of `paths`, or of it at all layers, that is nearest to `pattern`."""
+    names = {name for path in paths for name in (".".join(path), _starred(path))}
+    near = nearest(pattern.removeprefix("model."), {n.removeprefix("model.") for n in names})
+    return f"did you mean `{near}`?" if near else ""
+
+
+def _starred(path: KeyPath) -> str:
+    return ".".join("*" if x.isdigit() else x for x in path)

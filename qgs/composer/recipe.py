@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from qgs import contracts
 from qgs.composer.build import build, build_model
@@ -15,6 +16,7 @@ from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import check_flow, check_options
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
+from qgs.composer.rates import rate_factors
 from qgs.composer.registry import Registry
 from qgs.composer.sections import check_tree, decode_settings, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
@@ -61,6 +63,10 @@ class Recipe:
         """The optimiser; raises ValueError where `training` is too short for it."""
         return build(self.parts["optimizer",], self.training)
 
+    def rate_factors(self, module: nn.Module) -> dict[str, float]:
+        """Factor of the learning rate for every parameter of a model or objective, by name."""
+        return rate_factors(module, self.parts["optimizer",])
+
     def build_data(self) -> contracts.SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""
         if ("data",) not in self.parts:
@@ -102,10 +108,10 @@ def resolve(
         check_flow(sound, dims.depth, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
-    spelled_out, provenance = _spell_out(tree, settings, registry, chosen)
+    out = _spell_out(tree, settings, registry, chosen)
     return Recipe(
-        tree=spelled_out,
-        provenance=provenance,
+        tree=out.values,
+        provenance=out.provenance,
         parts=chosen,
         dims=dims,
         layer_scale=decoder.layer_scale,
@@ -114,7 +120,7 @@ def resolve(
         views=settings["views",],
         training=settings["training",],
         evaluation=settings["evaluation",],
-        plugin_versions={name: plugin.version for name, plugin in registry.plugins.items()},
+        plugin_versions={n: registry.plugins[n].version for n in ("qgs", *out.values["plugins"])},
     )
 
 
@@ -135,70 +141,86 @@ def _spell_out(
     settings: Mapping[KeyPath, contracts.ComponentConfig],
     registry: Registry,
     parts: Mapping[KeyPath, Chosen],
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """The tree of a resolved recipe, every default spelled out, and its provenance."""
-    tree: dict[str, Any] = {}
-    provenance: dict[str, str] = {}
+) -> "_Tree":
+    """What `source` describes, with every default; only plugins that are used."""
+    tree = _Tree(source)
+    tree.put_settings((), settings[()])
+    tree.values["plugins"] = []  # known at the end
+    tree.put_settings(("model",), settings["model",])
+    for name in MODEL_SLOTS:
+        tree.put_component(("model", name), parts["model", name])
+        if name == "queries":
+            tree.put_settings(("model", "decoder"), settings["model", "decoder"])
+            _put_decoder(tree, parts)
+    for name, section in SECTIONS.items():
+        for path, part in parts.items():
+            if path[0] == name:
+                tree.put_component(path, part)
+        dropped = [key for key in section.defaults if (name, key) not in parts]
+        if section.defaults_stay:
+            tree.put((name,), dict.fromkeys(dropped), source.child(name), "default")
+        if section.named and not tree.values.get(name):
+            tree.put((), {name: {}}, source, "default")
+    for name in ("views", "training", "evaluation"):
+        tree.put_settings((name,), settings[name,])
+    # One that offers layouts alone has no component to use, and is there for `qgs export`.
+    found = registry.plugins.items()
+    kept = [n for n, p in found if n in tree.used - {"qgs"} or not p.plugin.components]
+    tree.put((), {"plugins": kept}, source, "default")
+    written = source.get("plugins")
+    if isinstance(written, ListNode) and kept:
+        origins = [o for n, o in zip(written, written.origins, strict=True) if n in kept]
+        tree.provenance["plugins"] = ", ".join(dict.fromkeys(map(str, origins)))
+    return tree
 
-    # written: what the recipe has at `path`; the rest is set by `default`.
-    def put(path: KeyPath, values: Mapping[str, Any], written: Any, default: str) -> None:
+
+def _put_decoder(tree: "_Tree", parts: Mapping[KeyPath, Chosen]) -> None:
+    """The template, then every layer that differs; a template that no layer uses gives way."""
+    decoder = ("model", "decoder")
+    layers = {path: part for path, part in parts.items() if path[:-2] == (*decoder, "layers")}
+    templates = {}
+    for name in LAYER_SLOTS:
+        alike = [(part.type, part.config) for path, part in layers.items() if path[-1] == name]
+        same = alike.count(alike[0]) == len(alike)
+        template = parts[(*decoder, "layers", "0", name) if same else (*decoder, name)]
+        tree.put_component((*decoder, name), template)
+        templates[name] = (template.type, template.config)
+    for path, part in layers.items():
+        if (part.type, part.config) != templates[path[-1]]:
+            tree.put_component(path, part)
+
+
+class _Tree:
+    """The plain mapping of a resolved recipe, its provenance, and the plugins that it uses."""
+
+    def __init__(self, source: MapNode) -> None:
+        self.source, self.used = source, set[str]()
+        self.values: dict[str, Any] = {}
+        self.provenance: dict[str, str] = {}
+
+    def put(self, path: KeyPath, values: Mapping[str, Any], written: Any, default: str) -> None:
+        """written: what the recipe has at `path`; the rest is set by `default`."""
         origins = written.origins if isinstance(written, MapNode) else {}
-        below = tree
+        below = self.values
         for key in path:
             below = below.setdefault(key, {})
         for name, value in values.items():
             inner = written.get(name) if origins else None
             if isinstance(value, dict) and value and isinstance(inner, MapNode):
-                put((*path, name), value, inner, default)
+                self.put((*path, name), value, inner, default)
             else:
                 below[name] = value
                 origin = str(origins.get(name, default))
-                provenance.update(dict.fromkeys(flat({name: value}, path), origin))
+                self.provenance.update(dict.fromkeys(flat({name: value}, path), origin))
 
-    def put_settings(*path: str) -> None:
-        put(path, settings[path].model_dump(mode="json"), source.child(*path), "default")
+    def put_settings(self, path: KeyPath, config: contracts.ComponentConfig) -> None:
+        self.put(path, config.model_dump(mode="json"), self.source.child(*path), "default")
 
-    def put_component(path: KeyPath, chosen: Chosen) -> None:
-        put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
+    def put_component(self, path: KeyPath, chosen: Chosen) -> None:
+        self.used.add(chosen.installed.plugin.name)
+        self.put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
         options = chosen.config.model_dump(mode="json")
-        put(path, options, chosen.place.node, f"default of {chosen.type}")
-
-    put_settings()
-    put((), {"plugins": [name for name in registry.plugins if name != "qgs"]}, source, "default")
-    written = source.get("plugins")
-    if isinstance(written, ListNode) and written:
-        provenance["plugins"] = ", ".join(dict.fromkeys(map(str, written.origins)))
-    put_settings("model")
-    for name in MODEL_SLOTS[:2]:
-        put_component(("model", name), parts["model", name])
-    decoder = ("model", "decoder")
-    put_settings(*decoder)
-    # The template, then every layer that differs; a template that no layer uses gives way.
-    layers = {path: part for path, part in parts.items() if len(path) == 5}
-    templates = {}
-    for name in LAYER_SLOTS:
-        alike = [(part.type, part.config) for path, part in layers.items() if path[-1] == name]
-        same = alike.count(alike[0]) == len(alike)
-        path = (*decoder, "layers", "0", name) if same else (*decoder, name)
-        put_component((*decoder, name), parts[path])
-        templates[name] = (parts[path].type, parts[path].config)
-    for path, part in layers.items():
-        if (part.type, part.config) != templates[path[-1]]:
-            put_component(path, part)
-    for name in MODEL_SLOTS[2:]:
-        put_component(("model", name), parts["model", name])
-    for name, section in SECTIONS.items():
-        if section.named:
-            tree[name] = {}
-        for path, part in parts.items():
-            if path[0] == name:
-                put_component(path, part)
-        dropped = [key for key in section.defaults if (name, key) not in parts]
-        if section.defaults_stay:
-            put((name,), dict.fromkeys(dropped), source.child(name), "default")
-    for name in ("views", "training", "evaluation"):
-        put_settings(name)
-    return tree, provenance
+        self.put(path, options, chosen.place.node, f"default of {chosen.type}")
 
 
 def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import qgs.losses
 import qgs.metrics
 import qgs.renderers
 from qgs.composer.slots import SLOTS
-from qgs.contracts import Component, ComponentConfig, Metric, Renderer, WeightLayout
+from qgs.contracts import Component, ComponentConfig, Metric, OptionError, Renderer, WeightLayout
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 
 BUILTIN = Plugin(
@@ -45,13 +45,8 @@ RENDERER_DEVICES = ("cpu", "cuda", "mps")
 """Types of the devices that a renderer can render on."""
 
 
-class PluginError(ValueError):
+class PluginError(OptionError):
     """A plugin that cannot be used: `reason` names its distribution, `fix` says what to do."""
-
-    def __init__(self, reason: str, fix: str) -> None:
-        super().__init__(f"{reason}; {fix}")
-        self.reason = reason
-        self.fix = fix
 
 
 @dataclass(frozen=True)

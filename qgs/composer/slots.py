@@ -55,19 +55,31 @@ MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer
 LAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward", "refinement")
 SECTIONS = {name: SLOTS[name] for name in ("losses", "data", "metrics", "optimizer")}
 """Slots that are top-level sections of a recipe."""
+_RATE = ("learning_rate", "warmup", "initial_divisor", "final_divisor")
+_OF_OPTIMIZER = (*_RATE, "betas", "weight_decay")
 MOVED = {
     "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
     "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",
     "evaluation.lpips_weights": "metrics: {lpips: {type: qgs/lpips, weights: ...}}",
-    "training.learning_rate": "optimizer: {learning_rate: ...}",
-    "training.warmup": "optimizer: {warmup: ...}",
-    "training.initial_divisor": "optimizer: {initial_divisor: ...}",
-    "training.final_divisor": "optimizer: {final_divisor: ...}",
-    "training.betas": "optimizer: {betas: ...}",
-    "training.weight_decay": "optimizer: {weight_decay: ...}",
+    **{f"training.{key}": f"optimizer: {{{key}: ...}}" for key in _OF_OPTIMIZER},
     "qgs/rooms": "type: rooms/procedural` and, at the top, `plugins: [rooms]",
 }
 """Keys and types of older recipes, and what to write in their place."""
+
+
+def with_moved(tree: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A stored recipe with what has MOVED in its place of today."""
+    if "optimizer" in tree:
+        return tree
+    training, judged, data = ({**(tree[k] or {})} for k in ("training", "evaluation", "data"))
+    optimizer = {key: training.pop(key) for key in _OF_OPTIMIZER if key in training}
+    plugins, weights = tree["plugins"], judged.pop("lpips_weights", None)
+    metrics = {n: {"type": f"qgs/{n}", "weights": weights} for n in judged.pop("metrics", ())}
+    metrics["ssim"] = {"covariance": judged.pop("ssim_covariance", "population")}
+    if data.get("type") == "qgs/rooms":
+        data, plugins = {**data, "type": "rooms/procedural"}, ["rooms", *plugins]
+    moved = {"training": training, "evaluation": judged, "optimizer": optimizer}
+    return {**tree, **moved, "metrics": metrics, "data": data or None, "plugins": plugins}
 
 
 def slot_at(path: KeyPath) -> Slot | None:

@@ -13,16 +13,14 @@ from qgs.contracts.settings import TrainingConfig
 
 
 class OptimizerConfig(ComponentConfig):
-    """The options of every optimiser.
-
-    A pattern of `parts` names a module or a parameter of the model, segment by segment (`*`, `?`
-    and `[...]` stand for parts of one), and holds for everything below it: "encoder" is the whole
-    encoder, "decoder.*.cross_attention" all cross-attention. Of several that match, the last one
-    counts; one that matches nothing is an error.
-    """
+    """The options of every optimiser."""
 
     parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={})
-    """Parts of the model to factors of the learning rate: `{"encoder": 0.1}`; 0 freezes a part."""
+    """Parts of the model to factors of the learning rate: `{encoder: 0.1}`; 0 freezes a part. A
+    part is a path of the recipe, as in `swap`, or a module or parameter of the model; `*`, `?` and
+    `[...]` stand for parts of one segment. It holds for everything below it:
+    `decoder.layers.*.cross_attention` is all cross-attention. Of several that match, the last
+    counts; one that matches nothing is an error."""
 
 
 class ParameterGroup(TypedDict):

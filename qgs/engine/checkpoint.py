@@ -17,6 +17,7 @@ from torch import Tensor, nn
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.composer.recipe import flat
+from qgs.composer.slots import with_moved
 from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.io.checkpoint import (
@@ -99,7 +100,7 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
     for name, tensor in read_tensors(path).items():
         part, key = name.split("/", 1)
         parts[part][key] = tensor
-    return SavedState(resolve(json.loads(metadata[_RECIPE])), parts)
+    return SavedState(resolve(with_moved(json.loads(metadata[_RECIPE]))), parts)
 
 
 class Saver:
@@ -258,13 +259,15 @@ FREE = (
     "training.trackers",
     "evaluation",
     "metrics",
+    "plugins",
     "data.path",
 )
 """Parts of a recipe that may change when a run is continued.
 
 The budget may: the learning rate then follows the new one from there. The others say how long to
-watch, where data lies and what is reported, not what is learnt. `training.batch_size` and
-`training.accumulate` may change too, as long as a step sees as many samples over all processes.
+watch, where data lies and what is reported, not what is learnt; plugins that the model uses are
+compared by its types. `training.batch_size` and `training.accumulate` may change too, as long as a
+step sees as many samples over all processes.
 """
 
 

@@ -21,7 +21,7 @@ from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
-SECTIONS = ("data", "views", "evaluation", "metrics")
+SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
 """What of a recipe decides which views are judged, and how."""
 
 Observer = Callable[[int, int], None]

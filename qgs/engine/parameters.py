@@ -1,27 +1,22 @@
-"""Parameter groups, learning-rate factors of parts of the model, averaged weights."""
+"""Parameter groups and averaged weights."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from fnmatch import fnmatchcase
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from qgs.composer.errors import nearest
-from qgs.contracts import ModelComponent, Optimizer, OptimizerConfig, ParameterGroup
+from qgs.contracts import ModelComponent, Optimizer, ParameterGroup
 from qgs.engine.distributed import placed_like, whole
 from qgs.io.checkpoint import unique_tensors
 
 
-def make_optimizer(module: nn.Module, optimizer: Optimizer) -> torch.optim.Optimizer:
-    """Torch's optimiser of `module`, a model or an objective; what its `parts` freeze is frozen.
-
-    Raises ValueError for patterns of `parts` that match nothing, or freeze everything.
-    """
-    config = optimizer.config
-    factors = rate_factors(module, config.parts if isinstance(config, OptimizerConfig) else {})
+def make_optimizer(
+    module: nn.Module, optimizer: Optimizer, factors: Mapping[str, float]
+) -> torch.optim.Optimizer:
+    """Torch's optimiser; a `Recipe.rate_factors` of 0 freezes, ValueError if all are 0."""
     for name, parameter in module.named_parameters():
         if factors[name] == 0:
             parameter.requires_grad_(False)
@@ -29,32 +24,6 @@ def make_optimizer(module: nn.Module, optimizer: Optimizer) -> torch.optim.Optim
     if not groups:
         raise ValueError("optimizer.parts freezes every parameter, so there is nothing to train")
     return optimizer.build(groups)
-
-
-def rate_factors(module: nn.Module, parts: Mapping[str, float]) -> dict[str, float]:
-    """Factor of the learning rate for every parameter of `module`, by name; 1 where none is given.
-
-    parts: see `OptimizerConfig`; a shared parameter goes by its first name. Raises ValueError.
-    """
-    factors = {name: 1.0 for name, _ in module.named_parameters()}
-    for pattern, factor in parts.items():
-        wanted = pattern.removeprefix("model.").split(".")
-        matched = False
-        for name in factors:
-            steps = name.removeprefix("model.").split(".")
-            if len(wanted) <= len(steps) and all(map(fnmatchcase, steps, wanted)):
-                factors[name], matched = factor, True
-        if not matched:
-            paths = [name.removeprefix("model.").split(".") for name in factors]
-            starred = [["*" if step.isdigit() else step for step in path] for path in paths]
-            known = {".".join(path[: len(wanted)]) for path in paths + starred}
-            near = nearest(".".join(wanted), known)
-            outermost = ", ".join(dict.fromkeys(path[0] for path in paths))
-            raise ValueError(
-                f"optimizer.parts: the pattern `{pattern}` matches no parameter of the model; "
-                + (f"did you mean `{near}`?" if near else f"its parts: {outermost}")
-            )
-    return factors
 
 
 def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[ParameterGroup]:

@@ -85,10 +85,10 @@ def train(
     is none yet. A run whose budget is used is left as it is.
 
     Raises FileExistsError when `run` holds anything (with `resume`, anything but a run), ValueError
-    as `choose_device`, `make_optimizer` and the optimiser, OtherRunError for another recipe or data
-    than the run's, CollapseError when the model died (the checkpoint then holds the last good
-    weights), NonFiniteError for a step that gave NaN, and what the data source raises; the run is
-    then saved where it stood, and a note of the error says so.
+    as `choose_device`, `Recipe.rate_factors`, `make_optimizer` and the optimiser, OtherRunError for
+    another recipe or data than the run's, CollapseError when the model died (the checkpoint then
+    holds the last good weights), NonFiniteError for a step that gave NaN, and what the data source
+    raises; the run is then saved where it stood, and a note of the error says so.
     """
     if not resume:
         RunFolder(run).refuse_other(resume)
@@ -140,7 +140,8 @@ class Trainer:
         objective.to(self.accelerator.device)
         if wants_shards(self.accelerator):  # before the optimiser, whose moments lie in shards too
             shard(self.model)
-        prepared: Any = objective, make_optimizer(objective, self.optimizer)
+        factors = recipe.rate_factors(objective)
+        prepared: Any = objective, make_optimizer(objective, self.optimizer, factors)
         if not wants_shards(self.accelerator):
             prepared = self.accelerator.prepare(*prepared)
         self.objective, self.torch_optimizer = prepared

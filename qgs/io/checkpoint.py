@@ -17,12 +17,13 @@ from torch import Tensor, nn
 import qgs
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.registry import available_plugins, load_registry
+from qgs.composer.slots import with_moved
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, shapes_of
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Raised when what a checkpoint holds changes."""
 
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -123,7 +124,7 @@ def write_checkpoint(
 
     tensors: on the CPU, contiguous, named as by `unique_tensors`. tree: the resolved recipe.
     """
-    plugins = load_registry(set(resolve(tree).plugin_versions) - {"qgs"}).plugins
+    plugins = load_registry(tree["plugins"]).plugins
     metadata = {
         _RECIPE: json.dumps(tree),
         _PLUGINS: json.dumps({name: plugin.version for name, plugin in plugins.items()}),
@@ -153,9 +154,9 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """The recipe that a checkpoint carries. Raises as `load` does."""
     metadata = _read_metadata(path)
     try:
-        return resolve(json.loads(metadata[_RECIPE]))
+        return resolve(with_moved(json.loads(metadata[_RECIPE])))
     except RecipeError as error:
-        names = {"qgs": "query-gaussians", **json.loads(metadata.get(_DISTRIBUTIONS, "{}"))}
+        names = {**json.loads(metadata.get(_DISTRIBUTIONS, "{}")), "qgs": "query-gaussians"}
         releases = {
             plugin: f"{names.get(plugin) or f'the plugin `{plugin}`'} {version}"
             for plugin, version in json.loads(metadata.get(_PLUGINS, "{}")).items()

@@ -5,11 +5,14 @@ import shutil
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner, Result
 
 import qgs
 from qgs.cli import app
 from qgs.cli.evaluate import evaluation_folder
+from qgs.composer import resolve
+from qgs.engine.training import train
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
 SMALL = (
@@ -70,6 +73,35 @@ def test_tuning_goes_into_a_folder_of_its_own_and_is_told(runs: Path) -> None:
     assert "tokens tuned on the input views: 2 steps of Adam" in result.output
     assert summary(run / "evaluation-2")["tuning"]["steps"] == 2
     assert [file.read_bytes() for file in files] == before
+
+
+PLUGIN = """
+from qgs.contracts import Column, Metric, Plugin
+class Mean(Metric):
+    name = "mean"
+    definition, column = "mean colour", Column("level", "higher")
+    def forward(self, given):
+        return given.images.mean((-3, -2, -1))
+plugin = Plugin("mine", 1, (Mean,))
+"""
+
+
+def test_a_metric_of_a_plugin_that_was_installed_later(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "mine-1.dist-info"
+    info.mkdir()
+    (tmp_path / "mine_later.py").write_text(PLUGIN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[qgs.plugins]\nmine = mine_later:plugin\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    more = ("plugins=[mine]", "metrics.level.type=mine/mean")
+    evaluated(runs / "tokengs", "--set", more[0], "--set", more[1], "--out", tmp_path / "out")
+    assert "level" in summary(tmp_path / "out")["columns"]
+    recipe = resolve(RECIPES / "tokengs.yaml", (*SMALL, "training.steps=1"))
+    for judged in (recipe, resolve(recipe.tree, ("training.steps=2", *more))):
+        result = train(judged, tmp_path / "run", console=Console(quiet=True), resume=True)
+    assert (result.resumed_at, (result.model.recipe or {})["plugins"]) == (1, ["rooms", "mine"])
 
 
 def test_other_weights_of_a_run_keep_its_evaluation(tmp_path: Path) -> None:

@@ -69,6 +69,17 @@ def test_list_explains_options(recipe, name, words):
     assert "qgs/mlp" not in output
 
 
+def test_compose_refuses_a_part_to_learn_slower_that_is_not_there(recipe, tmp_path):
+    (tmp_path / "a.yaml").write_text(SMALL + "optimizer:\n  parts:\n    encodr: 0.1\n")
+    result = CliRunner().invoke(app, ["compose", recipe])
+    assert str(result.exception) == (
+        "1 problem in the recipe\na.yaml:12: optimizer.parts.encodr\n"
+        "  why: the pattern `encodr` matches no parameter of the model\n"
+        "  fix: did you mean `encoder`?"
+    )
+    assert not result.stdout
+
+
 def test_compose_prints_a_recipe_that_composes_again(recipe, tmp_path):
     result = CliRunner().invoke(app, ["compose", recipe, "--set", "model.queries.count=5"])
     assert result.exit_code == 0, result.output

@@ -1,6 +1,7 @@
 """Merging, swapping, provenance, and what a resolved recipe is."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -156,13 +157,18 @@ def test_plugins_are_united_and_each_keeps_its_line(write, spatial, install):
     for name in ("first", "second"):
         listed = f"plugin = Plugin('{name}', 1, (LatentQueries,))\n"
         install(f"qgs-{name}", name, source + listed)
-    write("recipe: 1\nplugins: [spatial]\n", "a.yaml")
-    write("recipe: 1\n\nplugins: [first, spatial]\n", "b.yaml")
+    write("recipe: 1\nplugins: [spatial]\ndata: {type: spatial/scenes}\n", "a.yaml")
+    queries = "model: {queries: {type: first/latent}}\n"
+    write(f"recipe: 1\n\nplugins: [first, spatial]\n{queries}", "b.yaml")
     overlay = write("recipe: 1\nextends: [a.yaml, b.yaml]\nplugins:\n- first\n")
     recipe = resolve(overlay, ["plugins=[second]"])
-    assert recipe.tree["plugins"] == ["spatial", "first", "second"]
-    assert recipe.provenance["plugins"] == "a.yaml:2, b.yaml:3, --set #1"
-    assert resolve(overlay, ["plugins=null"]).tree["plugins"] == []
+    assert recipe.tree["plugins"] == ["spatial", "first"], "nothing is of `second`"
+    assert set(recipe.plugin_versions) == {"qgs", "spatial", "first"}
+    assert recipe.provenance["plugins"] == "a.yaml:2, b.yaml:3"
+    recipe = resolve(overlay, ["plugins=[second]", "model.queries.type=second/latent"])
+    assert recipe.tree["plugins"] == ["spatial", "second"]
+    assert recipe.provenance["plugins"] == "a.yaml:2, --set #1"
+    assert resolve(SMALL | {"plugins": ["first"]}, ["plugins=null"]).tree["plugins"] == []
     problem = refused(overlay, ["plugins=[second, second]"])
     assert (problem.file, problem.option) == ("--set #1", "plugins.3")
 
@@ -193,6 +199,13 @@ def test_defaults_that_stay_lie_under_what_is_written_and_null_drops_one(monkeyp
     assert recipe.tree["losses"]["photometric"]["mse_weight"] == 2.0
     assert recipe.tree["losses"]["visibility"] is None
     assert resolve(recipe.tree).tree == recipe.tree
+
+
+def test_an_emptied_section_is_shown_with_what_emptied_it(write):
+    shown = annotated(resolve(write("recipe: 1\nlosses: {}\n")))
+    assert re.search(r"^losses: \{\} +# recipe.yaml:2$", shown, re.MULTILINE)
+    emptied = resolve(SMALL, ["losses={a: {type: qgs/opacity}}", "losses={a: null}"])
+    assert emptied.provenance["losses"] == "--set #2"
 
 
 def test_overrides_are_read_like_files_and_the_last_wins():

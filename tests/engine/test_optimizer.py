@@ -8,14 +8,14 @@ import torch
 from torch import nn
 from training_runs import Tiny, run, same, weights
 
-from qgs.composer import resolve
+from qgs.composer import RecipeError, resolve
 from qgs.engine.checkpoint import read_state
-from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups, rate_factors
+from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups
 from qgs.io.checkpoint import unique_tensors
 
 
 def undecayed_names(module: nn.Module) -> set[str]:
-    groups = parameter_groups(module, rate_factors(module, {}))
+    groups = parameter_groups(module, {n: 1.0 for n, _ in module.named_parameters()})
     chosen = {id(p) for group in groups if not group["decays"] for p in group["params"]}
     return {name for name, p in module.named_parameters() if id(p) in chosen}
 
@@ -39,7 +39,7 @@ def test_every_trained_parameter_is_in_one_group(tiny: Tiny) -> None:
     recipe = tiny("locus", "optimizer.weight_decay=0.1")
     model = recipe.build_model()
     model.queries.features.requires_grad_(False)
-    optimizer = make_optimizer(model, recipe.build_optimizer())
+    optimizer = make_optimizer(model, recipe.build_optimizer(), recipe.rate_factors(model))
     trained = [id(p) for p in model.parameters() if p.requires_grad]
     grouped = [id(p) for group in optimizer.param_groups for p in group["params"]]
     assert sorted(grouped) == sorted(trained)
@@ -50,7 +50,7 @@ def test_every_trained_parameter_is_in_one_group(tiny: Tiny) -> None:
 def test_decay_shrinks_only_what_decays(tiny: Tiny) -> None:
     recipe = tiny("tokengs", "optimizer.weight_decay=0.5", "optimizer.learning_rate=0.1")
     model = recipe.build_model()
-    optimizer = make_optimizer(model, recipe.build_optimizer())
+    optimizer = make_optimizer(model, recipe.build_optimizer(), recipe.rate_factors(model))
     before = {name: p.detach().clone() for name, p in model.named_parameters()}
     for parameter in model.parameters():
         parameter.grad = torch.zeros_like(parameter)
@@ -70,6 +70,10 @@ def test_decay_shrinks_only_what_decays(tiny: Tiny) -> None:
         ("queries.features", r"queries\.features"),
         ("decoder.*.cross_attention", r"decoder\.\d\.cross_attention\..*"),
         ("decoder.[01]", r"decoder\.[01]\..*"),
+        ("decoder.cross_attention", r"decoder\.\d\.cross_attention\..*"),
+        ("decoder.layers.[01].cross_attention", r"decoder\.[01]\.cross_attention\..*"),
+        ("decoder.refinement", r"refinements\..*"),
+        ("model.decoder.layers.2.refinement", r"refinements\..*"),
         ("decoder.*.*_scale.gamma", r"decoder\.\d\.\w+_scale\.gamma"),
     ],
 )
@@ -77,17 +81,18 @@ def test_decay_shrinks_only_what_decays(tiny: Tiny) -> None:
 def test_a_pattern_names_a_part_and_all_below_it(
     tiny: Tiny, pattern: str, expected: str, wrapped: bool
 ) -> None:
-    model = tiny("locus").build_model("meta")
-    factors = rate_factors(nn.ModuleDict({"model": model}) if wrapped else model, {pattern: 0.5})
+    recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.5}}')
+    model = recipe.build_model("meta")
+    factors = recipe.rate_factors(nn.ModuleDict({"model": model}) if wrapped else model)
     found = {name.removeprefix("model.") for name, factor in factors.items() if factor == 0.5}
     wanted = {name for name, _ in model.named_parameters() if re.fullmatch(expected, name)}
     assert found == wanted != set()
 
 
 def test_the_last_pattern_that_matches_counts(tiny: Tiny) -> None:
-    factors = rate_factors(
-        tiny("locus").build_model("meta"), {"*": 0.5, "head": 1, "head.linear.bias": 2}
-    )
+    parts = '{"*": 0.5, "head": 1, "head.linear.bias": 2}'
+    recipe = tiny("locus", f"optimizer.parts={parts}")
+    factors = recipe.rate_factors(recipe.build_model("meta"))
     names = ("queries.features", "head.linear.weight", "head.linear.bias")
     assert [factors[name] for name in names] == [0.5, 1, 2]
 
@@ -98,7 +103,9 @@ def test_the_last_pattern_that_matches_counts(tiny: Tiny) -> None:
         ("encodr", r"did you mean `encoder`\?"),
         ("decoder.9.self_attention", r"did you mean `decoder\.\d\.self_attention`\?"),
         ("decoder.*.self_atention", r"did you mean `decoder\.\*\.self_attention`\?"),
-        ("*.*.*.*.*.*.*", "its parts: encoder, queries, decoder, refinements, head"),
+        ("decoder.layers.*.self_atention", r"did you mean `decoder\.layers\.\*\.self_attention`\?"),
+        ("decoder.refinment.x", r"did you mean `decoder\.refinement`\?"),
+        ("*.*.*.*.*.*.*.*", "its parts: encoder, queries, decoder, refinements, head"),
         ("xy", "its parts: encoder, queries, decoder, refinements, head"),
     ],
 )
@@ -106,15 +113,20 @@ def test_a_pattern_that_matches_nothing_ends_the_start(
     tiny: Tiny, tmp_path: Path, pattern: str, fix: str
 ) -> None:
     recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
-    with pytest.raises(ValueError, match=rf"optimizer\.parts: .*`{re.escape(pattern)}`.*{fix}"):
+    with pytest.raises(RecipeError) as caught:
         run(recipe, tmp_path / "run")
+    [problem] = caught.value.problems
+    assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
+    assert f"`{pattern}`" in problem.reason
+    assert re.search(fix, problem.fix)
     assert not (tmp_path / "run").exists()
 
 
 def test_everything_frozen_is_refused(tiny: Tiny) -> None:
     recipe = tiny("tokengs", 'optimizer.parts={"*": 0}')
+    model = recipe.build_model("meta")
     with pytest.raises(ValueError, match="nothing to train"):
-        make_optimizer(recipe.build_model("meta"), recipe.build_optimizer())
+        make_optimizer(model, recipe.build_optimizer(), recipe.rate_factors(model))
 
 
 def test_a_factor_scales_the_step(tiny: Tiny, tmp_path: Path) -> None:

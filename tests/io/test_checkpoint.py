@@ -12,7 +12,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 import qgs
-from qgs.composer import resolve
+from qgs.composer import RecipeError, resolve
+from qgs.composer.registry import available_plugins
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.checkpoint import (
     CheckpointError,
@@ -137,6 +138,38 @@ def test_a_missing_plugin_is_told_by_file_and_distribution(
     assert f"{orphan} was made with query-gaussians {qgs.__version__}, {release}, and" in first
     assert first.endswith(f"install {release}:")
     assert any("no installed distribution offers a plugin `locus`" in line for line in rest)
+
+
+def test_only_plugins_that_are_used_are_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "photos.safetensors"
+    save(qgs.compose(RECIPES / "photos.yaml", SMALL), path)
+    without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
+    for module in ("qgs.composer.registry", "qgs.io.checkpoint"):
+        monkeypatch.setattr(f"{module}.available_plugins", lambda: without_rooms)
+    assert set(load_recipe(path).plugin_versions) == {"qgs", "locus"}
+    assert qgs.load(path).queries.count == 8
+    with pytest.raises(RecipeError, match="offers a plugin `rooms`"):
+        qgs.compose(RECIPES / "photos.yaml", SMALL)
+
+
+def test_a_recipe_of_before_the_optimiser_was_a_slot_is_translated(saved: Path) -> None:
+    now = json.loads(metadata_of(saved)["qgs.recipe"])
+    rates = {key: value for key, value in now["optimizer"].items() if key not in ("type", "parts")}
+    judged = {"metrics": ["lpips"], "ssim_covariance": "sample", "lpips_weights": "vgg"}
+    old = {k: v for k, v in now.items() if k not in ("optimizer", "metrics")} | {
+        "training": now["training"] | rates,
+        "evaluation": now["evaluation"] | judged,
+        "data": now["data"] | {"type": "qgs/rooms"},
+        "plugins": [name for name in now["plugins"] if name != "rooms"],
+    }
+    rewrite(saved, **{"qgs.recipe": json.dumps(old), "qgs.format_version": "1"})
+    found = load_recipe(saved).tree
+    assert found["metrics"].pop("lpips") == {"type": "qgs/lpips", "weights": "vgg"}
+    assert found["metrics"]["ssim"].pop("covariance") == "sample"
+    now["metrics"]["ssim"].pop("covariance")
+    assert found == now
 
 
 def test_another_release_of_a_plugin_is_told(old_locus: Path) -> None:

@@ -9,6 +9,21 @@ from qgs.io.ply import OPACITY_EPS, PROPERTIES, SH_C0, write_ply
 from qgs.types import Gaussians
 
 
+def read_ply(path) -> Gaussians:
+    vertices = PlyData.read(str(path))["vertex"].data
+
+    def columns(*names: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
+
+    return Gaussians(
+        means=columns("x", "y", "z"),
+        scales=columns("scale_0", "scale_1", "scale_2").exp(),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        opacities=columns("opacity")[:, 0].sigmoid(),
+        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * SH_C0 + 0.5,
+    )[None]
+
+
 def random_gaussians(*batch: int, seed: int = 0) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
 
@@ -22,22 +37,6 @@ def random_gaussians(*batch: int, seed: int = 0) -> Gaussians:
         opacities=draw() * 0.98 + 0.01,
         colors=draw(3),
     )
-
-
-def read_ply(path: Path) -> Gaussians:
-    """The (1, G, ...) Gaussians of a 3DGS file without view-dependent colour."""
-    vertices = PlyData.read(str(path))["vertex"].data
-
-    def columns(*names: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([vertices[name] for name in names], -1))
-
-    return Gaussians(
-        means=columns("x", "y", "z"),
-        scales=columns("scale_0", "scale_1", "scale_2").exp(),
-        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        opacities=columns("opacity")[:, 0].sigmoid(),
-        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * SH_C0 + 0.5,
-    )[None]
 
 
 def test_round_trip(tmp_path):

@@ -89,7 +89,8 @@ def make_task(
     if operation == "step":
         losses, render_views = recipe.build_losses(), recipe.training.render_views
         objective = Objective(model.train(), losses, render_views).to(workload.device)
-        optimizer = make_optimizer(objective, recipe.build_optimizer())
+        factors = recipe.rate_factors(objective)
+        optimizer = make_optimizer(objective, recipe.build_optimizer(), factors)
 
         def step() -> None:
             optimizer.zero_grad(set_to_none=True)
