@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from qgs.composer import slots
+from qgs.composer.decode import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.composer.registry import Registry, load_registry
-from qgs.composer.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig

@@ -23,6 +23,7 @@ from qgs.engine.training import train
 from qgs.io.ply import write_ply
 from qgs.metrics.baselines import BASELINES
 
+PICTURED_SCENES = 3
 SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
 """Parts of the recipes that must be equal, so that only the models differ."""
 

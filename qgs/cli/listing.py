@@ -7,10 +7,10 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from qgs.composer.decode import SETTINGS
 from qgs.composer.errors import did_you_mean
 from qgs.composer.registry import Registry, default_config
 from qgs.composer.schema import recipe_schema
-from qgs.composer.sections import SETTINGS
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import Component

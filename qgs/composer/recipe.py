@@ -10,15 +10,14 @@ from torch import nn
 
 from qgs import contracts
 from qgs.composer.build import build, build_model
-from qgs.composer.decode import Chosen, decode_place
+from qgs.composer.decode import Chosen, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
 from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import check_flow, check_options
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.rates import rate_factors
-from qgs.composer.registry import Registry
-from qgs.composer.sections import check_tree, decode_settings, load_plugins
+from qgs.composer.registry import Registry, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import inline
 from qgs.model import QueryGaussianModel

@@ -19,6 +19,8 @@ import qgs.data
 import qgs.losses
 import qgs.metrics
 import qgs.renderers
+from qgs.composer.errors import Problems
+from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
 from qgs.composer.slots import SLOTS
 from qgs.contracts import Component, ComponentConfig, Metric, OptionError, Renderer, WeightLayout
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
@@ -105,6 +107,32 @@ def available_plugins() -> dict[str, list[EntryPoint]]:
 def load_registry(names: Iterable[str]) -> Registry:
     """The built-in components and those of the plugins `names`; raises PluginError."""
     return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
+
+
+def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
+    """The components of the recipe's `plugins`; a problem for each that cannot be used."""
+    at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
+    plugins, seen = {"qgs": builtin()}, dict[str, Origin]()
+    written = tree.get("plugins")
+    if written is not None and not isinstance(written, ListNode):
+        reason = f"`plugins` is a list, this is {kind_of(written)}"
+        problems.add(tree.origins["plugins"], "plugins", reason, "write `plugins: [NAME]`")
+    written = written if isinstance(written, ListNode) else ListNode(tree.origin)
+    for index, (name, origin) in enumerate(zip(written, written.origins, strict=True)):
+        path = f"plugins.{index}"
+        if not isinstance(name, str):
+            reason = f"a plugin is a name, this is {kind_of(name)}"
+            problems.add(origin, path, reason, "write `plugins: [NAME]`")
+        elif name in seen:
+            reason = f"the plugin `{name}` is already listed at {seen[name]}"
+            problems.add(origin, path, reason, "list it once")
+        else:
+            seen[name] = origin
+            try:
+                plugins[name] = at_hand.get(name) or load_plugin(name)
+            except PluginError as error:
+                problems.add(origin, path, error.reason, error.fix, error)
+    return Registry(plugins, unusable=frozenset(seen.keys() - plugins.keys()))
 
 
 def load_sound_plugins() -> tuple[Registry, list[str]]:

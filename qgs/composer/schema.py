@@ -3,9 +3,9 @@
 import inspect
 from typing import Any
 
+from qgs.composer.decode import SETTINGS
 from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import Registry
-from qgs.composer.sections import SETTINGS
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS
 from qgs.contracts import Component, ComponentConfig
 

@@ -4,7 +4,7 @@ import pytest
 from refusals import refused
 
 from qgs.composer import RecipeError, resolve
-from qgs.composer.sections import SETTINGS
+from qgs.composer.decode import SETTINGS
 from qgs.composer.slots import MOVED
 
 

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from guide_pages import DOCS, text_of
 
+from qgs.composer.decode import RecipeSettings
 from qgs.composer.registry import load_registry
-from qgs.composer.sections import RecipeSettings
 from qgs.composer.slots import SLOTS
 from qgs.contracts import Component, ComponentConfig
 
