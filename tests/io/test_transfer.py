@@ -199,7 +199,7 @@ def test_extra_and_missing_keys_stay_whatever_the_recipe(
 
 def test_names_of_no_published_model(tmp_path: Path) -> None:
     save_file({"some.layer": torch.zeros(3)}, tmp_path / "w.safetensors")
-    with pytest.raises(PublishedError, match=r"no published model.*first names are some\.layer"):
+    with pytest.raises(PublishedError, match=r"no published model.*its names are some\.layer"):
         import_weights(tmp_path / "w.safetensors", None, tmp_path / "o.safetensors")
 
 
