@@ -77,12 +77,12 @@ def encoded(image: np.ndarray | Image.Image, kind: str = "PNG", **options: Any) 
     return file.getvalue()
 
 
-def row_of_frames(count: int, **top: Any) -> dict[str, Any]:
-    """The content of transforms.json for `images/0.png`, ...: cameras a unit apart along x."""
+def row_of_frames(count: int, step: float = 1.0, **top: Any) -> dict[str, Any]:
+    """The content of transforms.json for `images/0.png`, ...: cameras `step` apart along x."""
     frames = []
     for i in range(count):
         pose = np.eye(4)
-        pose[0, 3] = i
+        pose[0, 3] = step * i
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
     return {**top, "frames": frames}
 

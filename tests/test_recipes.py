@@ -1,5 +1,6 @@
 """What the shipped recipes promise of each other, of the papers' models and of the documents."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -36,12 +37,13 @@ def document(name: str) -> str:
 
 
 @pytest.mark.parametrize("file", sorted({*FILES} - {*OVERLAYS}))
-def test_every_recipe_composes(file: str) -> None:
+def test_every_recipe_resolves_to_itself_and_builds_without_memory(file: str) -> None:
     recipe = resolve(RECIPES / file)
+    assert resolve(json.loads(json.dumps(recipe.tree))).tree == recipe.tree
     model = recipe.build_model("meta")
     assert {parameter.device.type for parameter in model.parameters()} == {"meta"}
-    assert recipe.build_losses()
-    assert resolve(recipe.tree).tree == recipe.tree
+    assert model.recipe == recipe.tree
+    assert recipe.build_losses().keys() == recipe.tree["losses"].keys() != set()
 
 
 @pytest.mark.parametrize("pair", PAIRS)

@@ -1,4 +1,5 @@
 import pytest
+from commands import MODEL
 
 from qgs.analysis.report import Contender, Report, report_html
 from qgs.composer import resolve
@@ -9,12 +10,8 @@ from qgs.drawing.figures import Curves
 PLAIN = {
     "recipe": 1,
     "model": {
-        "width": 16,
-        "heads": 2,
-        "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-        "queries": {"type": "qgs/latent", "count": 16, "std": 1.0},
+        **MODEL,
         "decoder": {"depth": 2},
-        "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
         "supervision": {"type": "qgs/layers", "layers": [2]},
     },
     "plugins": ["rooms"],
@@ -28,7 +25,7 @@ def anchored() -> dict:
     pytest.importorskip("qgs_locus")
     model = {
         **PLAIN["model"],
-        "queries": {"type": "locus/anchored", "count": 16, "std": 1.0, "init_radius": 0.3},
+        "queries": {"type": "locus/anchored", "count": 8, "std": 1.0, "init_radius": 0.3},
         "decoder": {
             "depth": 2,
             "cross_attention": {"type": "locus/ray_biased"},

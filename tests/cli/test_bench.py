@@ -5,20 +5,18 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from commands import SMALL, run_qgs, sets
+from typer.testing import Result
 
-from qgs.cli import app
 from qgs.cli.bench import short_names
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 TOKENGS, LOCUS = RECIPES / "tiny/tokengs.yaml", RECIPES / "tiny/locus.yaml"
-SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
 
 
 def bench(*words: str | Path) -> Result:
-    sets = [word for setting in SMALL for word in ("--set", setting)]
     small = ["--size", "16x24", "--rounds", "3", "--warmup", "1", "--device", "cpu"]
-    return CliRunner().invoke(app, ["bench", *map(str, words), *small, *sets])
+    return run_qgs("bench", *words, *small, *sets())
 
 
 def test_tokengs_against_locusgs(tmp_path: Path) -> None:
@@ -69,7 +67,7 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_are_told(words: list[str], message: str) -> None:
-    result = CliRunner().invoke(app, ["bench", str(TOKENGS), *words, "--device", "cpu"])
+    result = run_qgs("bench", TOKENGS, *words, "--device", "cpu")
     assert isinstance(result.exception, ValueError)
     assert message in str(result.exception)
 

@@ -2,22 +2,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from commands import MODEL
 
 from qgs.cli.train import with_absolute_path
 from qgs.composer import resolve
 
-RECIPE = {
-    "recipe": 1,
-    "model": {
-        "width": 16,
-        "heads": 2,
-        "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-        "queries": {"type": "qgs/latent", "count": 8},
-        "decoder": {"depth": 1},
-        "head": {"type": "qgs/gaussian_head"},
-        "supervision": {"type": "qgs/layers", "layers": [1]},
-    },
-}
+RECIPE = {"recipe": 1, "model": MODEL}
 
 
 @pytest.mark.parametrize(
@@ -41,11 +31,6 @@ def test_paths_become_absolute_and_urls_stay(given, expected, tmp_path, monkeypa
 
 
 def test_data_without_a_path_stays():
-    recipe = resolve(
-        {
-            **RECIPE,
-            "plugins": ["rooms"],
-            "data": {"type": "rooms/procedural", "image_size": [16, 16]},
-        }
-    )
+    data = {"type": "rooms/procedural", "image_size": [16, 16]}
+    recipe = resolve({**RECIPE, "plugins": ["rooms"], "data": data})
     assert with_absolute_path(recipe).tree == recipe.tree

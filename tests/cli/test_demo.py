@@ -2,26 +2,17 @@ import re
 
 import pytest
 import yaml
+from commands import MODEL, run_qgs
 from plyfile import PlyData
-from typer.testing import CliRunner
 
 import qgs
-from qgs.cli import app
 from qgs.cli.contest import resolve_fairly
 from qgs.cli.demo import default_recipes, new_folder
 from qgs.engine.guard import CollapseError
 
 RECIPE = {
     "recipe": 1,
-    "model": {
-        "width": 16,
-        "heads": 2,
-        "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-        "queries": {"type": "qgs/latent", "count": 8, "std": 1.0},
-        "decoder": {"depth": 1},
-        "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
-        "supervision": {"type": "qgs/layers", "layers": [1]},
-    },
+    "model": MODEL,
     "plugins": ["rooms"],
     "data": {"type": "rooms/procedural", "image_size": [16, 16], "scenes": 4, "test_scenes": 3},
     "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
@@ -42,8 +33,7 @@ def recipes(tmp_path):
 
 def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
     out = tmp_path / "demo"
-    arguments = [*map(str, recipes), "--seconds", "1", "--out", str(out)]
-    result = CliRunner().invoke(app, ["demo", *arguments])
+    result = run_qgs("demo", *recipes, "--seconds", 1, "--out", out)
     assert result.exception is None
     for name, queries in (("few", 8), ("more", 12)):
         assert (out / name / "checkpoint.safetensors").is_file()
@@ -103,6 +93,6 @@ def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch
 
     monkeypatch.setattr("qgs.cli.contest.compete", collapse)
     out = tmp_path / "demo"
-    result = CliRunner().invoke(app, ["demo", str(recipes[0]), "--out", str(out)])
+    result = run_qgs("demo", recipes[0], "--out", out)
     assert result.exit_code == 1
     assert "collapsed at step 7" in result.stderr

@@ -2,31 +2,24 @@
 
 import json
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
+from commands import SMALL, run_qgs
 from rich.console import Console
-from typer.testing import CliRunner, Result
 
 import qgs
-from qgs.cli import app
 from qgs.cli.evaluate import evaluation_folder
 from qgs.composer import resolve
 from qgs.engine.training import train
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
-SMALL = (
-    "model.width=16",
-    "model.heads=2",
-    "model.queries.count=8",
-    "data.image_size=[32, 32]",
-    "views.targets=2",
-    "evaluation.scenes=3",
-)
+FEW = (*SMALL, "data.image_size=[32, 32]", "views.targets=2", "evaluation.scenes=3")
 
 
-def evaluated(*words: object) -> Result:
-    return CliRunner().invoke(app, ["eval", *(str(word) for word in words)])
+evaluated = partial(run_qgs, "eval")
 
 
 def summary(folder: Path) -> dict:
@@ -38,7 +31,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two untrained models, evaluated alike."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("locus", "tokengs"):
-        model = qgs.compose(RECIPES / f"{name}.yaml", overrides=SMALL)
+        model = qgs.compose(RECIPES / f"{name}.yaml", overrides=FEW)
         qgs.save(model, folder / name / "checkpoint.safetensors")
         result = evaluated(folder / name)
         assert result.exit_code == 0, result.output
@@ -87,18 +80,13 @@ plugin = Plugin("mine", 1, (Mean,))
 
 
 def test_a_metric_of_a_plugin_that_was_installed_later(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    runs: Path, tmp_path: Path, install: Callable[..., None]
 ) -> None:
-    info = tmp_path / "mine-1.dist-info"
-    info.mkdir()
-    (tmp_path / "mine_later.py").write_text(PLUGIN)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[qgs.plugins]\nmine = mine_later:plugin\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    install("mine", "mine", PLUGIN)
     more = ("plugins=[mine]", "metrics.level.type=mine/mean")
     evaluated(runs / "tokengs", "--set", more[0], "--set", more[1], "--out", tmp_path / "out")
     assert "level" in summary(tmp_path / "out")["columns"]
-    recipe = resolve(RECIPES / "tokengs.yaml", (*SMALL, "training.steps=1"))
+    recipe = resolve(RECIPES / "tokengs.yaml", (*FEW, "training.steps=1"))
     for judged in (recipe, resolve(recipe.tree, ("training.steps=2", *more))):
         result = train(judged, tmp_path / "run", console=Console(quiet=True), resume=True)
     assert (result.resumed_at, (result.model.recipe or {})["plugins"]) == (1, ["rooms", "mine"])

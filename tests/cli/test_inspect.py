@@ -7,10 +7,10 @@ from dataclasses import replace
 from io import StringIO
 
 import pytest
+from commands import run_qgs
 from rich.console import Console
-from typer.testing import CliRunner
 
-from qgs.cli import app, main
+from qgs.cli import main
 from qgs.cli.recipe_tables import difference_tables
 from qgs.composer import resolve
 
@@ -35,7 +35,7 @@ def recipe(tmp_path, monkeypatch):
 
 
 def run(*arguments: str) -> str:
-    result = CliRunner().invoke(app, arguments)
+    result = run_qgs(*arguments)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -71,7 +71,7 @@ def test_list_explains_options(recipe, name, words):
 
 def test_compose_refuses_a_part_to_learn_slower_that_is_not_there(recipe, tmp_path):
     (tmp_path / "a.yaml").write_text(SMALL + "optimizer:\n  parts:\n    encodr: 0.1\n")
-    result = CliRunner().invoke(app, ["compose", recipe])
+    result = run_qgs("compose", recipe)
     assert str(result.exception) == (
         "1 problem in the recipe\na.yaml:12: optimizer.parts.encodr\n"
         "  why: the pattern `encodr` matches no parameter of the model\n"
@@ -81,7 +81,7 @@ def test_compose_refuses_a_part_to_learn_slower_that_is_not_there(recipe, tmp_pa
 
 
 def test_compose_prints_a_recipe_that_composes_again(recipe, tmp_path):
-    result = CliRunner().invoke(app, ["compose", recipe, "--set", "model.queries.count=5"])
+    result = run_qgs("compose", recipe, "--set", "model.queries.count=5")
     assert result.exit_code == 0, result.output
     text, parameters = result.stdout, result.stderr
     assert "--set #1" in text

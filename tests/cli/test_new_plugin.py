@@ -6,13 +6,13 @@ import os
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner
+from commands import run_qgs
 
-from qgs.cli import app
 from qgs.cli.new_plugin import check_name, rendered
 from qgs.composer.errors import Problems
 from qgs.composer.yaml_text import load_mapping
@@ -27,7 +27,7 @@ def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["new-plugin", "far-sighted"])
+    result = run_qgs("new-plugin", "far-sighted")
     assert result.exit_code == 0, result.output
     folder = tmp_path / "qgs-far-sighted"
     written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
@@ -60,7 +60,7 @@ def test_component_and_test_are_short() -> None:
 
 
 def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
-    CliRunner().invoke(app, ["new-plugin", "tidy"])
+    run_qgs("new-plugin", "tidy")
     for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
         ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
         done = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
@@ -78,13 +78,8 @@ def test_names_that_are_taken_as_they_are(name: str) -> None:
     assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
 
 
-def test_a_distribution_that_is_installed_is_not_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    info = tmp_path / "site/qgs_far_sighted-2.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: qgs-far-sighted\nVersion: 2.0\n")
-    monkeypatch.syspath_prepend(info.parent)
+def test_a_distribution_that_is_installed_is_not_replaced(install: Callable[..., None]) -> None:
+    install("qgs-far-sighted", "far-sighted", "", version="2.0")
     with pytest.raises(ValueError, match=r"qgs-far-sighted 2\.0 is installed, which it would"):
         check_name("far_sighted")
 
@@ -114,7 +109,7 @@ def test_a_distribution_that_is_installed_is_not_replaced(
     ],
 )
 def test_names_that_are_refused(name: str, message: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["new-plugin", "--", name])
+    result = run_qgs("new-plugin", "--", name)
     assert message in str(result.exception)
     assert list(tmp_path.iterdir()) == []
 
@@ -131,7 +126,7 @@ def test_nothing_is_overwritten(kind: str, tmp_path: Path) -> None:
         if kind == "folder":
             (place / "README.md").write_text("mine")
     before = sorted(map(str, tmp_path.rglob("*")))
-    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "mine"])
+    result = run_qgs("new-plugin", "wide", "--out", "mine")
     assert isinstance(result.exception, FileExistsError)
     assert "never overwritten; choose another folder with `--out FOLDER`" in str(result.exception)
     assert sorted(map(str, tmp_path.rglob("*"))) == before
@@ -141,7 +136,7 @@ def test_a_place_that_cannot_be_written_is_told_by_the_users_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("")
-    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "file/wide"])
+    result = run_qgs("new-plugin", "wide", "--out", "file/wide")
     assert isinstance(result.exception, OSError)
     assert str(result.exception).startswith("cannot write file/wide: ")
 
@@ -149,7 +144,7 @@ def test_a_place_that_cannot_be_written_is_told_by_the_users_name(
         raise PermissionError(13, "Permission denied", "./.qgs-wide.4m63mcr7")
 
     monkeypatch.setattr("tempfile.mkdtemp", refuse)
-    result = CliRunner().invoke(app, ["new-plugin", "wide"])
+    result = run_qgs("new-plugin", "wide")
     told = "cannot write qgs-wide: Permission denied; choose another folder with `--out FOLDER`"
     assert str(result.exception) == told
 
@@ -158,13 +153,13 @@ def test_home_is_expanded_and_blanks_are_quoted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path / "my home"))
-    result = CliRunner().invoke(app, ["new-plugin", "wide", "--out", "~/wide"])
+    result = run_qgs("new-plugin", "wide", "--out", "~/wide")
     assert (tmp_path / "my home/wide/pyproject.toml").is_file()
     assert f"  cd '{tmp_path}/my home/wide'\n" in result.output
 
 
 def test_an_sdist_holds_no_training(tmp_path: Path) -> None:
-    CliRunner().invoke(app, ["new-plugin", "wide"])
+    run_qgs("new-plugin", "wide")
     folder = tmp_path / "qgs-wide"
     project = tomllib.loads((folder / "pyproject.toml").read_text())
     included = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
@@ -202,7 +197,6 @@ def test_its_component_computes_its_formula(sink: float) -> None:
     names: dict = {}
     exec(source, names)
     attention = names["AbstainingAttention"]
-    torch.manual_seed(0)
     module = attention(attention.Config(sink_init=sink), ModelDims(16, 2, 1))
     state = QueryState(torch.randn(2, 3, 16))
     keys, values = torch.randn(2, 2, 2, 6, 8)

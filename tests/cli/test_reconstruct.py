@@ -1,30 +1,26 @@
 import json
+from functools import partial
 
 import numpy as np
 import pytest
+from commands import MODEL, run_qgs
+from photo_formats import row_of_frames
 from PIL import Image
 from plyfile import PlyData
-from typer.testing import CliRunner
 
 import qgs
-from qgs.cli import app
 from qgs.cli.reconstruct import frame_list
 
 RECIPE = {
     "recipe": 1,
-    "model": {
-        "width": 16,
-        "heads": 2,
-        "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-        "queries": {"type": "qgs/latent", "count": 8, "std": 1.0},
-        "decoder": {"depth": 1},
-        "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
-        "supervision": {"type": "qgs/layers", "layers": [1]},
-    },
+    "model": MODEL,
     "plugins": ["rooms"],
     "data": {"type": "rooms/procedural", "image_size": [16, 16]},
     "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"},
 }
+
+
+run = partial(run_qgs, "reconstruct")
 
 
 @pytest.fixture(scope="module")
@@ -38,21 +34,14 @@ def checkpoint(tmp_path_factory):
 def photos(tmp_path_factory):
     """Seven noisy photos of 24x20 pixels, taken along a line."""
     folder = tmp_path_factory.mktemp("photos")
+    (folder / "images").mkdir()
     rng = np.random.default_rng(0)
-    frames = []
     for index in range(7):
         pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{index}.png")
-        pose = np.eye(4)
-        pose[0, 3] = 0.1 * index
-        frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
+        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
     camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    (folder / "transforms.json").write_text(json.dumps(row_of_frames(7, step=0.1, **camera)))
     return folder
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, ["reconstruct", *map(str, arguments)])
 
 
 def test_everything_is_written(checkpoint, photos, tmp_path):

@@ -7,14 +7,13 @@ from functools import partial
 
 import pytest
 import tape_source
+from commands import MODEL, run_qgs
 from photo_formats import centred, synthetic, write_llff, write_nerfstudio
 from PIL import Image
 from qgs_datatools import packing
-from typer.testing import CliRunner
 from upath import UPath
 
 import qgs
-from qgs.cli import app
 from qgs.cli.reconstruct import chosen_scene
 from qgs.composer import resolve
 from qgs.composer.registry import load_registry
@@ -22,15 +21,6 @@ from qgs.data import PhotosSource
 
 SIZE = (16, 16)
 SOURCES = load_registry(()).components("data")
-MODEL = {
-    "width": 16,
-    "heads": 2,
-    "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-    "queries": {"type": "qgs/latent", "count": 8},
-    "decoder": {"depth": 1},
-    "head": {"type": "qgs/gaussian_head"},
-    "supervision": {"type": "qgs/layers", "layers": [1]},
-}
 
 
 def recipe(**data):
@@ -135,9 +125,8 @@ def test_the_data_of_a_plugin(tmp_path, monkeypatch, data):
     }
     file = tmp_path / "checkpoint.safetensors"
     qgs.save(qgs.compose(trained), file)
-    arguments = ["reconstruct", file, tmp_path / "tapes", "--out", tmp_path / "out"]
-    chosen_views = ["--scene", "b", "--frames", "0,5", "--holdout", "1,2"]
-    result = CliRunner().invoke(app, [*map(str, arguments), *chosen_views])
+    views = ("--scene", "b", "--frames", "0,5", "--holdout", "1,2")
+    result = run_qgs("reconstruct", file, tmp_path / "tapes", "--out", tmp_path / "out", *views)
     assert result.exception is None, result.output
     views = json.loads((tmp_path / "out" / "cameras.json").read_text())["views"]
     last = "seen in training" if own else "novel"

@@ -6,18 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from commands import run_qgs, sets
+from typer.testing import Result
 
 from qgs import cli
-from qgs.cli import app
 from qgs.contracts import MissingExtraError
 from qgs.engine import training
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
-SMALL = (
-    "model.width=16",
-    "model.heads=2",
-    "model.queries.count=8",
+QUICK = (
     "data.image_size=[32, 32]",
     "views.targets=2",
     "evaluation.scenes=2",
@@ -27,13 +24,8 @@ SMALL = (
 )
 
 
-def qgs(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
-def train(out: Path, *overrides: str) -> Result:
-    sets = [word for setting in (*SMALL, *overrides) for word in ("--set", setting)]
-    return qgs("train", RECIPE, "--out", out, *sets)
+def train(out: Path, *words: str) -> Result:
+    return run_qgs("train", RECIPE, "--out", out, *sets(*QUICK), *words)
 
 
 @pytest.fixture(scope="module")
@@ -56,20 +48,19 @@ def test_training_ends_with_an_evaluation(run: Path) -> None:
 
 def test_resume_leaves_a_finished_run_and_refuses_another_recipe(run: Path) -> None:
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    sets = [word for setting in SMALL for word in ("--set", setting)]
-    again = qgs("train", RECIPE, "--out", run, "--resume", *sets)
+    again = train(run, "--resume")
     assert again.exit_code == 0, again.output
     words = " ".join(again.output.split())
     assert "already finished: 2 steps" in words
     assert "evaluated before" in words
-    other = qgs("train", RECIPE, "--out", run, "--resume", *sets, "--set", "seed=3")
+    other = train(run, "--resume", "--set", "seed=3")
     assert "seed: 3 here, 0 in the run" in str(other.exception)
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
 def test_eval_gives_the_same_numbers_and_shows_all_methods(run: Path) -> None:
     before = (run / "evaluation" / "summary.json").read_bytes()
-    result = qgs("eval", run)
+    result = run_qgs("eval", run)
     assert result.exit_code == 0, result.output
     assert (run / "evaluation" / "summary.json").read_bytes() == before
     for word in ("model", "nearest input", "mean colour"):
@@ -78,12 +69,12 @@ def test_eval_gives_the_same_numbers_and_shows_all_methods(run: Path) -> None:
 
 def test_eval_of_other_settings_keeps_the_first_results(run: Path, tmp_path: Path) -> None:
     checkpoint = run / "checkpoint.safetensors"
-    result = qgs("eval", checkpoint, "--set", "evaluation.scenes=1", "--out", tmp_path / "new")
+    result = run_qgs("eval", checkpoint, "--set", "evaluation.scenes=1", "--out", tmp_path / "new")
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "new" / "summary.json").read_text())["scenes"] == 1
     before = (run / "evaluation" / "summary.json").read_bytes()
     for name in ("evaluation-2", "evaluation-3"):
-        result = qgs("eval", run, "--set", "evaluation.scenes=1", "--device", "cpu")
+        result = run_qgs("eval", run, "--set", "evaluation.scenes=1", "--device", "cpu")
         assert result.exit_code == 0, result.output
         summary = json.loads((run / name / "summary.json").read_text())
         settings = summary["protocol"]["settings"]
@@ -121,7 +112,7 @@ def test_a_missing_extra_is_told_without_a_traceback(
 
 
 def test_eval_refuses_to_change_the_model(run: Path) -> None:
-    result = qgs("eval", run, "--set", "model.queries.count=9")
+    result = run_qgs("eval", run, "--set", "model.queries.count=9")
     assert isinstance(result.exception, ValueError)
     assert "would change the trained model" in str(result.exception)
 
@@ -134,7 +125,7 @@ def test_a_second_run_in_one_folder_is_refused(run: Path) -> None:
 
 
 def test_a_collapse_is_told_without_a_traceback(tmp_path: Path) -> None:
-    result = train(tmp_path / "run", "model.head.opacity_bias=-20.0")
+    result = train(tmp_path / "run", "--set", "model.head.opacity_bias=-20.0")
     assert result.exit_code == 1
     assert isinstance(result.exception, SystemExit)
     assert "training collapsed" in result.output

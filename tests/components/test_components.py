@@ -21,11 +21,6 @@ def _views(batch: int = 1, views: int = 2, size: tuple[int, int] = (16, 24)) -> 
     return Views(torch.rand(batch, views, 3, *size), cameras)
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def test_posact_and_its_slope_at_zero() -> None:
     t = torch.tensor([-3.0, -1e-4, 0.0, 1e-4, 3.0], requires_grad=True)
     y = posact(t)

@@ -98,14 +98,6 @@ BEGINNINGS = {
 """Numbers that say how training starts, what it weighs or how wide a layer is."""
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def numbers(components: tuple[type[Component], ...]) -> Iterator[tuple[str, str]]:
     """Component and option of every floating-point option, those of optimisers aside."""
     for component in components:

@@ -1,7 +1,5 @@
-"""Plugins for tests: fake distributions in a folder on sys.path."""
+"""A plugin whose components depend on each other, and recipes in the working directory."""
 
-import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from textwrap import dedent
@@ -66,39 +64,9 @@ class Scenes(SceneSource):
 plugin = Plugin("spatial", 1, (Placed, Near, Measure, Local, Scenes))
 """
 
-Install = Callable[..., None]
-
 
 @pytest.fixture
-def install(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Install:
-    """Make a distribution importable: install(distribution, plugin name, module source).
-
-    editable: as `pip install -e` leaves it.
-    """
-
-    def install(
-        distribution: str, plugin: str, source: str, version: str = "1.2", editable: bool = False
-    ) -> None:
-        folder = tmp_path_factory.mktemp("site")
-        module = f"_test_{distribution.replace('-', '_')}"
-        (folder / f"{module}.py").write_text(dedent(source))
-        info = folder / f"{distribution.replace('-', '_')}-{version}.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(
-            f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
-        )
-        (info / "entry_points.txt").write_text(f"[qgs.plugins]\n{plugin} = {module}:plugin\n")
-        if editable:
-            record = {"url": folder.as_uri(), "dir_info": {"editable": True}}
-            (info / "direct_url.json").write_text(json.dumps(record))
-        monkeypatch.syspath_prepend(folder)
-        monkeypatch.delitem(sys.modules, module, raising=False)
-
-    return install
-
-
-@pytest.fixture
-def spatial(install: Install) -> None:
+def spatial(install: Callable[..., None]) -> None:
     """A sound plugin whose components depend on each other."""
     install("qgs-spatial", "spatial", SPATIAL)
 

@@ -1,13 +1,12 @@
 """Components that cannot be built or called, or only with certain sizes or strides."""
 
 import torch
-from contract_mutants.fields import PLACE
+from contract_mutants.fields import PlacesByALayer
 from contract_mutants.mutant import mutant
 from torch import Tensor, nn
 
 from qgs.components import (
     ContentCrossAttention,
-    ContentSelfAttention,
     CrossAttentionCore,
     MlpFeedForward,
 )
@@ -86,16 +85,8 @@ class FixedWidth(MlpFeedForward):
 
 @mutant("unmet_requirement_fails_at_compose", "view size is not")
 @mutant("strides_make_no_difference", "view size is not")
-class ViewsAField(ContentSelfAttention):
+class ViewsAField(PlacesByALayer):
     """Takes a field for contiguous; queries expand theirs to all scenes."""
-
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.place = nn.Linear(3, dims.width)
-
-    @classmethod
-    def requires(cls, config):
-        return PLACE
 
     def forward(self, state):
         center = state["place.center"]

@@ -10,7 +10,23 @@ CHECK = "reads_within_requires"
 PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
 
 
-class Steps(Refinement):
+class AtPlaces:
+    """A component that reads centres."""
+
+    @classmethod
+    def requires(cls, config):
+        return PLACE
+
+
+class PlacesByALayer(AtPlaces, ContentSelfAttention):
+    """Attention that has a layer for centres."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.place = nn.Linear(3, dims.width)
+
+
+class Steps(AtPlaces, Refinement):
     """Sound: it moves the centres by a layer."""
 
     name = "steps"
@@ -18,10 +34,6 @@ class Steps(Refinement):
     def __init__(self, config, dims):
         super().__init__(config, dims)
         self.step = nn.Linear(dims.width, 3)
-
-    @classmethod
-    def requires(cls, config):
-        return PLACE
 
     @classmethod
     def provides(cls, config):

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from contract_mutants.fields import PLACE
+from contract_mutants.fields import AtPlaces
 from contract_mutants.mutant import mutant
 from contract_mutants.slots import ChangedEncoder, OneTerm
 
@@ -23,11 +23,7 @@ class DetachesTheImages(ContentCrossAttention):
 
 
 @mutant("gradients_reach_inputs", "state.fields.place.center", also="requires_are_read")
-class MultipliesAFieldByZero(ContentSelfAttention):
-    @classmethod
-    def requires(cls, config):
-        return PLACE
-
+class MultipliesAFieldByZero(AtPlaces, ContentSelfAttention):
     def forward(self, state):
         return super().forward(state) + 0 * state["place.center"].sum(-1, keepdim=True)
 
@@ -111,11 +107,7 @@ class DividesBySpread(ContentSelfAttention):
 
 
 @mutant("points_behind_cameras_stay_finite", "in the centre of a camera", also="zeros_stay_finite")
-class DividesByDepth(ContentSelfAttention):
-    @classmethod
-    def requires(cls, config):
-        return PLACE
-
+class DividesByDepth(AtPlaces, ContentSelfAttention):
     def forward(self, state):
         place = state["place.center"]
         return super().forward(state) + place[..., :1] / place[..., 2:]

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import torch
 import torch.nn.functional as F
-from contract_mutants.fields import PLACE
+from contract_mutants.fields import PlacesByALayer
 from contract_mutants.mutant import named
 from contract_mutants.renderers import RefusesWhatItDeclares
 from torch import nn
@@ -87,16 +87,8 @@ class PassesFieldsOn(ContentSelfAttention):
 
 
 @named
-class TurnsAutocastOff(ContentSelfAttention):
+class TurnsAutocastOff(PlacesByALayer):
     """PyTorch's own idiom for float32 geometry, which torch refuses on meta."""
-
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.place = nn.Linear(3, dims.width)
-
-    @classmethod
-    def requires(cls, config):
-        return PLACE
 
     def forward(self, state):
         center = state["place.center"]

@@ -1,10 +1,9 @@
 """Recipes that train in a blink."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
 from qgs.composer import Recipe, resolve
 
@@ -22,15 +21,6 @@ SMALL = (
     "training.seconds=null",
     "optimizer.warmup=2",
 )
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small models lose more by sharing work between threads than they gain."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -5,17 +5,17 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
-from typing import TypeAlias
 
 import pytest
 import torch
-from PIL import Image
+from photo_formats import synthetic, write_nerfstudio
 from qgs_rooms.source import RoomsSource
 from rich.console import Console
+from training_runs import Tiny, same
 
 from qgs.composer import Recipe
 from qgs.contracts import Scene
@@ -29,7 +29,6 @@ from qgs.metrics.dispersion import token_dispersion
 from qgs.metrics.images import Psnr, psnr, ssim
 from qgs.metrics.lpips import Lpips
 
-Tiny: TypeAlias = Callable[..., Recipe]
 FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
 
 
@@ -213,25 +212,14 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
     assert reasons[2] == "OSError: /data/set/truncated.png is cut off"
 
 
-def write_photos(folder: Path, count: int) -> None:
-    folder.mkdir(parents=True)
-    frames = []
-    for number in range(count):
-        Image.effect_noise((32, 32), 50).convert("RGB").save(folder / f"{number}.png")
-        pose = [[1, 0, 0, 0.1 * number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-        frames.append({"file_path": f"{number}.png", "transform_matrix": pose})
-    camera = {"fl_x": 32, "fl_y": 32, "cx": 16, "cy": 16, "w": 32, "h": 32}
-    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
-
-
 def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(
     tiny: Tiny, tmp_path: Path
 ) -> None:
     for name in ("a", "b", "c"):
-        write_photos(tmp_path / name, 12)
-    (tmp_path / "b" / "transforms.json").write_text("{")
-    (tmp_path / "c" / "6.png").write_bytes(b"no photo")
-    data = f"data={{type: qgs/photos, path: {tmp_path}, image_size: [32, 32], holdout: 4}}"
+        write_nerfstudio(tmp_path / "set" / name, synthetic(tmp_path / "photos", 12, (32, 32)))
+    (tmp_path / "set" / "b" / "transforms.json").write_text("{")
+    (tmp_path / "set" / "c" / "images" / "view_006.png").write_bytes(b"no photo")
+    data = f"data={{type: qgs/photos, path: {tmp_path / 'set'}, image_size: [32, 32], holdout: 4}}"
     recipe = tiny("tokengs", data, "evaluation.scenes=9")
     summary = (evaluation := evaluate(recipe.build_model(), recipe)).summary()
     assert [score.scene for score in evaluation.scores] == ["a"]
@@ -308,7 +296,7 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(tiny: Tiny) -> None
     model = plain.build_model()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     first, second = evaluate(model, plain), evaluate(model, tuned, batch=2)
-    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
+    assert same(model.state_dict(), before)
     assert first.protocol.sha256 != second.protocol.sha256
     assert first.summary()["tuning"] is None
     told = second.summary()["tuning"]

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, TypeAlias
 
@@ -11,6 +11,7 @@ import pytest
 import torch
 from rich.console import Console
 from torch import Tensor
+from training_runs import Tiny
 
 from qgs.analysis.report import Contender
 from qgs.cli.contest import Entry, report_of, table_of
@@ -80,14 +81,14 @@ Judged: TypeAlias = tuple[Recipe, Evaluation]
 
 
 @pytest.fixture(scope="module")
-def mine(tiny: Callable[..., Recipe]) -> Callable[..., Recipe]:
+def mine(tiny: Tiny) -> Tiny:
     """`mine("metrics.mae={type: mine/mae}")`: a small TokenGS with the plugin above."""
     tree, plugins = tiny("tokengs").tree, "plugins=[rooms, mine]"
     return lambda *more: resolve(tree, [plugins, *more], plugins=[PLUGIN])
 
 
 @pytest.fixture
-def judged(mine: Callable[..., Recipe]) -> Judged:
+def judged(mine: Tiny) -> Judged:
     recipe = mine("metrics.error={type: mine/mae}")
     return recipe, evaluate(recipe.build_model(), recipe)
 
@@ -118,7 +119,7 @@ def test_evaluations_and_their_files(judged: Judged, tmp_path: Path) -> None:
 
 
 def test_comparisons_need_no_plugin_and_know_which_way_is_better(
-    mine: Callable[..., Recipe], judged: Judged, tmp_path: Path
+    mine: Tiny, judged: Judged, tmp_path: Path
 ) -> None:
     judged[1].write(tmp_path / "a")
     other = mine("metrics.error={type: mine/mae}", "seed=1")
@@ -132,7 +133,7 @@ def test_comparisons_need_no_plugin_and_know_which_way_is_better(
     assert f"{found.difference:+.6f}" in shown(comparisons)
 
 
-def test_the_protocol_has_its_definition_and_options(mine: Callable[..., Recipe]) -> None:
+def test_the_protocol_has_its_definition_and_options(mine: Tiny) -> None:
     def protocol(options: str) -> object:
         return protocol_of(mine(f"metrics.error={{type: mine/mae{options}}}"), None, ["x"])
 
@@ -171,7 +172,7 @@ def test_contests_and_their_report_show_it(judged: Judged) -> None:
     assert report.contenders[0].scores["error"] == scores["error"]
 
 
-def test_what_a_metric_needs(mine: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_metric_needs(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = mine("metrics={depth: {type: mine/depth}, mask: {type: mine/masked}}")
     source = recipe.build_data()
     second = source.names("test")[1]
@@ -195,7 +196,7 @@ def test_what_a_metric_needs(mine: Callable[..., Recipe], monkeypatch: pytest.Mo
 
 
 def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(
-    mine: Callable[..., Recipe], tmp_path: Path
+    mine: Tiny, tmp_path: Path
 ) -> None:
     drop = "psnr: null, ssim: null, dispersion: null"
     recipe = mine(f"metrics={{{drop}, mask: {{type: mine/masked}}}}")
@@ -206,14 +207,14 @@ def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(
     assert read_results(tmp_path).scenes.keys() == {"test/000000", "test/000001"}
 
 
-def test_two_values_of_one_name_are_refused(mine: Callable[..., Recipe]) -> None:
+def test_two_values_of_one_name_are_refused(mine: Tiny) -> None:
     recipe = mine("metrics={mask_mean: {type: mine/mae}, mask: {type: mine/masked}}")
     with pytest.raises(ValueError, match="two values of the metrics are called mask_mean"):
         Measures(recipe)
 
 
 def test_a_metric_that_cannot_be_shown_is_refused_before_training(
-    mine: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    mine: Tiny, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     recipe = mine("metrics={mask: {type: mine/masked}}")
     monkeypatch.setattr(Masked, "columns", lambda self: self.no)
@@ -222,9 +223,7 @@ def test_a_metric_that_cannot_be_shown_is_refused_before_training(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_metric_that_fails_is_named(
-    mine: Callable[..., Recipe], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_metric_that_fails_is_named(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = mine("metrics={mask: {type: mine/masked}}")
     monkeypatch.setattr(Masked, "needs", ())
     monkeypatch.setattr(Masked, "forward", lambda self, given: {"typo": torch.zeros(1)})
@@ -232,7 +231,7 @@ def test_a_metric_that_fails_is_named(
         evaluate(recipe.build_model(), recipe)
 
 
-def test_written_metrics_lie_over_the_default_ones(tiny: Callable[..., Recipe]) -> None:
+def test_written_metrics_lie_over_the_default_ones(tiny: Tiny) -> None:
     recipe = tiny("tokengs", "metrics={lpips: {type: qgs/lpips}, psnr: null}")
     assert list(recipe.build_metrics()) == ["ssim", "dispersion", "lpips"]
     assert recipe.tree["metrics"]["psnr"] is None

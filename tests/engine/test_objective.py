@@ -20,7 +20,7 @@ from qgs.data.stream import training_batches
 from qgs.engine.objective import Objective, Outcome, measure
 from qgs.losses import Mask, Opacity
 from qgs.metrics.images import psnr
-from qgs.types import LayerPrediction, Rendering, Views, map_tensors
+from qgs.types import Views, map_tensors
 
 
 def first_batch(recipe: Recipe) -> Batch:
@@ -85,9 +85,7 @@ class Flicker(Loss):
         super().__init__(ComponentConfig())
         self.gain = nn.Parameter(torch.tensor(0.7))
 
-    def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
-    ) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == TARGETS
         brightness = rendering.rgb.mean((-3, -2, -1))
         return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
@@ -99,9 +97,7 @@ class Blind(Loss):
     name: ClassVar[str] = "blind"
     renderings = "none"
 
-    def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
-    ) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == 0
         assert target.images.shape[1] == TARGETS
         return {"blind": prediction.state.features.square().mean()}
@@ -200,9 +196,7 @@ def test_in_float64_they_are_the_same_numbers(setting: Setting) -> None:
     assert error(Objective(model, losses, 2), *batch) < 1e-13
 
 
-def test_under_autocast_the_gaussians_get_the_same_gradients(
-    setting: Setting,
-) -> None:
+def test_under_autocast_the_gaussians_get_the_same_gradients(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/cpu")
     found: dict[int, dict[str, Tensor]] = {}
     for render_views in (0, 2):

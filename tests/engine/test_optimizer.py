@@ -1,14 +1,16 @@
 """Which parameters decay, learn slower or stay; an optimiser of a plugin; the moving average."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 from training_runs import Tiny, run, same, weights
 
-from qgs.composer import RecipeError, resolve
+from qgs.composer import resolve
 from qgs.engine.checkpoint import read_state
 from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups
 from qgs.io.checkpoint import unique_tensors
@@ -113,9 +115,7 @@ def test_a_pattern_that_matches_nothing_ends_the_start(
     tiny: Tiny, tmp_path: Path, pattern: str, fix: str
 ) -> None:
     recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
-    with pytest.raises(RecipeError) as caught:
-        run(recipe, tmp_path / "run")
-    [problem] = caught.value.problems
+    problem = refused(recipe, tmp_path / "run", by=run)
     assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
     assert f"`{pattern}`" in problem.reason
     assert re.search(fix, problem.fix)
@@ -177,14 +177,9 @@ plugin = Plugin("plain", 1, (Plain,))
 
 
 def test_a_plugin_adds_an_optimiser_by_one_class(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Tiny, tmp_path: Path, install: Callable[..., None]
 ) -> None:
-    info = tmp_path / "plain-1.dist-info"
-    info.mkdir()
-    (tmp_path / "plain_optimizer.py").write_text(PLAIN)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plain\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[qgs.plugins]\nplain = plain_optimizer:plugin\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    install("plain", "plain", PLAIN)
     tree = {**tiny("tokengs", "training.save_every=2").tree, "plugins": ["rooms", "plain"]}
     tree["optimizer"] = {"type": "plain/sgd", "rate": 0.02, "parts": {"encoder": 0, "head": 0.5}}
     recipe = resolve(tree)

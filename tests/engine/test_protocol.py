@@ -1,19 +1,17 @@
 """Protocols: their hash follows what decides the numbers, and nothing else."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
 
 import pytest
 import yaml
+from training_runs import Tiny
 
 from qgs.composer import Recipe, resolve
 from qgs.data.evaluation import read_index
 from qgs.engine.protocol import Protocol, index_of, protocol_of
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
-Tiny: TypeAlias = Callable[..., Recipe]
 INDEX = {"a": {"context": [0, 3], "target": [1, 2]}, "b": None}
 
 

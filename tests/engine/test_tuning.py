@@ -1,10 +1,8 @@
 """Token tuning: the input views are met better, the weights stay as they are."""
 
-from collections.abc import Callable
-from typing import TypeAlias
-
 import pytest
 import torch
+from training_runs import Tiny
 
 from qgs.composer import Recipe
 from qgs.data.evaluation import evaluation_samples
@@ -12,8 +10,6 @@ from qgs.engine.tuning import tune, tuning_loss
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.types import QueryState, Views, map_tensors
-
-Tiny: TypeAlias = Callable[..., Recipe]
 
 
 def model_and_inputs(recipe: Recipe) -> tuple[QueryGaussianModel, Views]:
@@ -83,9 +79,7 @@ def test_every_floating_field_is_tuned_and_no_other(
     assert torch.equal(last["stranger.label"], numbers)
 
 
-def test_recipes_without_a_photometric_loss_take_the_published_one(
-    tiny: Tiny,
-) -> None:
+def test_recipes_without_a_photometric_loss_take_the_published_one(tiny: Tiny) -> None:
     recipe = tiny("tokengs", "losses={look: {type: qgs/visibility}}")
     assert tuning_loss(recipe).config == Photometric.Config()
 

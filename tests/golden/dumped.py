@@ -45,7 +45,7 @@ def metadata(kind: str, **changes: Any) -> dict[str, Any]:
     }
 
 
-def write(path: Path, config: dict[str, Any], sizes: Sizes) -> None:
+def write(path: Path, config: dict[str, Any], sizes: Sizes) -> Path:
     """A file of `config`: random photos and cameras, perturbed weights, all that they lead to."""
     recipe = resolve(RECIPES[config["kind"]](config["options"]))
     with torch.random.fork_rng(devices=()):
@@ -61,6 +61,7 @@ def write(path: Path, config: dict[str, Any], sizes: Sizes) -> None:
     tensors["intrinsics"] = views.cameras.intrinsics
     outputs = sorted(set(computed) - {"images", "rays_o", "rays_d", "plucker"})
     save(path, tensors, config | {"outputs": outputs})
+    return path
 
 
 def save(path: Path, tensors: dict[str, Tensor], config: dict[str, Any]) -> None:

@@ -43,8 +43,7 @@ def changed(path: Path, change: Any, source: str = "locus_full_a") -> Path:
 @pytest.mark.parametrize("sizes", [(1, 1), (3, 4)], ids=str)
 def test_tokengs_of_another_size(tmp_path: Path, sizes: tuple[int, int], saturation: float) -> None:
     config = metadata("tokengs", **BIGGER, dec_patch_size=3, gaussian_z_offset=0.5, opacity_bias=1)
-    write(tmp_path / "file", config, Sizes(*sizes, saturation))
-    assert problems(tmp_path / "file") == {}
+    assert problems(write(tmp_path / "file", config, Sizes(*sizes, saturation))) == {}
 
 
 @pytest.mark.parametrize("saturation", [1.0, 4.0])
@@ -54,8 +53,7 @@ def test_locusgs_of_another_size(tmp_path: Path, layers: list[int], saturation: 
         "locusgs", **BIGGER, num_gaussians_per_token=5, anchor_radius_init=0.2,
         anchor_radius_min=0.05, anchor_supervision_layers=layers,
     )  # fmt: skip
-    write(tmp_path / "file", config, Sizes(2, 3, saturation))
-    assert problems(tmp_path / "file") == {}
+    assert problems(write(tmp_path / "file", config, Sizes(2, 3, saturation))) == {}
 
 
 @pytest.mark.parametrize(("cross", "own", "centers", "radius"), VARIANTS)
@@ -67,8 +65,7 @@ def test_combinations_of_variants(
         use_anchor_radius=radius != "none", anchor_radius_refinement=radius == "refined",
         anchor_radius_affects_bias=radius in ("refined", "static"),
     )  # fmt: skip
-    write(tmp_path / "file", config, Sizes())
-    assert problems(tmp_path / "file") == {}
+    assert problems(write(tmp_path / "file", config, Sizes())) == {}
 
 
 @pytest.mark.parametrize("source", ["locus_full_a", "tokengs_a", "loss_a"])

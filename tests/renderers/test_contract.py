@@ -18,14 +18,14 @@ def oracle(**options: object) -> TorchRenderer:
     return TorchRenderer(RendererConfig(**options))
 
 
-def assert_images_match(found: Rendering, expected: Rendering, tolerance: float = 2e-5) -> None:
+def assert_images_match(found: Rendering, expected: Rendering, tolerance: float) -> None:
     for name in IMAGES:
         torch.testing.assert_close(
             getattr(found, name).double(), getattr(expected, name), atol=tolerance, rtol=tolerance
         )
 
 
-def assert_gradients_match(found: dict, expected: dict, tolerance: float = 2e-5) -> None:
+def assert_gradients_match(found: dict, expected: dict, tolerance: float) -> None:
     for name, grad in found.items():
         scale = expected[name].abs().max().item()
         torch.testing.assert_close(
@@ -35,6 +35,15 @@ def assert_gradients_match(found: dict, expected: dict, tolerance: float = 2e-5)
             rtol=0,
             msg=lambda m, name=name: f"{name}: {m}",
         )
+
+
+def compared(differentiate, renderer, scene, tolerances=(2e-5, 2e-5), **options) -> tuple:
+    """What `renderer` and then the oracle make of a scene, their images and gradients alike."""
+    found = differentiate(renderer, *scene)
+    expected = differentiate(oracle(**options), *(part.to(torch.float64) for part in scene))
+    assert_images_match(found[0], expected[0], tolerances[0])
+    assert_gradients_match(found[1], expected[1], tolerances[1])
+    return found, expected
 
 
 def assert_finite(rendering: Rendering, gradients: dict) -> None:
@@ -63,12 +72,9 @@ def one_gaussian(z: float = 2.0, scale: float = 0.1, opacity: float = 0.7) -> Ga
 @pytest.mark.parametrize("size", [(16, 16), (24, 40), (33, 17), (5, 64), (1, 1)])
 @pytest.mark.parametrize("scale", [0.02, 0.1, 1.0])
 def test_images_and_gradients_match_the_oracle(build, make_scene, differentiate, size, scale):
-    gaussians, cameras = make_scene(batch=2, views=2, size=size, scale=scale)
-    found = differentiate(build(), gaussians, cameras)
-    expected = differentiate(oracle(), gaussians.to(torch.float64), cameras.to(torch.float64))
-    assert expected[0].alpha.max() > 0.05
-    assert_images_match(found[0], expected[0])
-    assert_gradients_match(found[1], expected[1])
+    scene = make_scene(batch=2, views=2, size=size, scale=scale)
+    _, (rendering, _) = compared(differentiate, build(), scene)
+    assert rendering.alpha.max() > 0.05
 
 
 def test_scenes_and_views_do_not_mix(build, make_scene):
@@ -145,12 +151,8 @@ def test_what_cannot_be_seen_leaves_the_background(build, make_scene, differenti
 @pytest.mark.parametrize("change", ["tiny", "discs", "opaque", "coincident", "huge"])
 def test_extreme_gaussians_match_the_oracle(build, make_scene, differentiate, change):
     gaussians, _ = make_scene(count=12)
-    gaussians = extreme(gaussians, change)
-    cameras = identity_camera()
-    found = differentiate(build(), gaussians, cameras)
-    expected = differentiate(oracle(), gaussians.to(torch.float64), cameras.to(torch.float64))
-    assert_images_match(found[0], expected[0], 1e-4)
-    assert_gradients_match(found[1], expected[1], 1e-3)
+    scene = extreme(gaussians, change), identity_camera()
+    compared(differentiate, build(), scene, (1e-4, 1e-3))
 
 
 def test_near_and_far_are_inclusive(build):
@@ -218,19 +220,13 @@ def test_rigid_motion_of_everything_changes_nothing(build, make_scene):
     ],
 )
 def test_every_option_has_its_effect(build, make_scene, differentiate, option, value):
-    gaussians, cameras = make_scene(scale=0.2)
+    scene = make_scene(scale=0.2)
     try:
         renderer = build(**{option: value})
     except ValueError:
         pytest.skip(f"this renderer refuses {option}")
-    found = differentiate(renderer, gaussians, cameras)
-    default = build()(gaussians, cameras)
-    assert (found[0].rgb - default.rgb).abs().max() > 1e-2
-    expected = differentiate(
-        oracle(**{option: value}), gaussians.to(torch.float64), cameras.to(torch.float64)
-    )
-    assert_images_match(found[0], expected[0])
-    assert_gradients_match(found[1], expected[1])
+    (rendering, _), _ = compared(differentiate, renderer, scene, **{option: value})
+    assert (rendering.rgb - build()(*scene).rgb).abs().max() > 1e-2
 
 
 def test_alpha_is_capped(build):
@@ -241,12 +237,9 @@ def test_alpha_is_capped(build):
 def test_opaque_layers_stop_the_ray(build, make_scene, differentiate):
     gaussians, cameras = make_scene(count=200, scale=0.6)
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.5 + 0.5)
-    found = differentiate(build(), gaussians, cameras)
-    expected = differentiate(oracle(), gaussians.to(torch.float64), cameras.to(torch.float64))
+    found, _ = compared(differentiate, build(), (gaussians, cameras), (1e-4, 1e-3))
     assert found[0].alpha.min() > 0.99
     assert found[0].alpha.max() < 1 - 1e-4 + 1e-6
-    assert_images_match(found[0], expected[0], 1e-4)
-    assert_gradients_match(found[1], expected[1], 1e-3)
     last = gaussians.means[0, :, 2].argmax()
     assert found[1]["colors"][0, last].eq(0).all()
 

@@ -1,11 +1,10 @@
 """The contract suite on a whole plugin: its report, its examples, its exemptions."""
 
 import pytest
+from commands import run_qgs
 from contract_mutants.basics import RaisesWhenCalled
 from contract_mutants.state import CountsItsCalls
-from typer.testing import CliRunner
 
-from qgs.cli import app
 from qgs.components import FreeCenters, GaussianHead, MlpFeedForward
 from qgs.composer.registry import InstalledPlugin, PluginError
 from qgs.contracts import CONTRACT_VERSION, MissingExtraError, Plugin, ViewsConfig
@@ -68,11 +67,11 @@ def _installed(*components, **parts) -> InstalledPlugin:
 def _report(monkeypatch, installed: InstalledPlugin, *options: str):
     for module in ("qgs.composer.registry", "qgs.testing.plugins"):
         monkeypatch.setattr(f"{module}.load_plugin", lambda name: installed)
-    return CliRunner().invoke(app, ["check-plugin", "mine", *options])
+    return run_qgs("check-plugin", "mine", *options)
 
 
 def test_an_unknown_plugin_is_told() -> None:
-    result = CliRunner().invoke(app, ["check-plugin", "lucos"])
+    result = run_qgs("check-plugin", "lucos")
     assert "no installed distribution offers a plugin `lucos`" in str(result.exception)
 
 
@@ -198,7 +197,7 @@ def test_what_cannot_be_built_here_is_not_checked(monkeypatch, component, why) -
 
 @pytest.mark.slow
 def test_locus_passes() -> None:
-    result = CliRunner().invoke(app, ["check-plugin", "locus"])
+    result = run_qgs("check-plugin", "locus")
     assert result.exit_code == 0, result.output
     assert "7 components" in result.output
     assert " 0 failed" in result.output

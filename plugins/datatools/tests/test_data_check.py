@@ -2,9 +2,7 @@ import re
 import shutil
 
 import pytest
-from typer.testing import CliRunner
-
-from qgs.cli import app
+from commands import run_qgs
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +21,7 @@ def broken(sound, tmp_path_factory):
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, ["data", "check", *map(str, arguments)])
+    return run_qgs("data", "check", *arguments)
 
 
 def test_a_sound_set_has_exit_code_0_and_a_table(sound):

@@ -10,12 +10,11 @@ import numpy as np
 import photo_formats
 import pytest
 import torch
+from commands import run_qgs
 from PIL import Image
 from qgs_datatools import packing
-from typer.testing import CliRunner
 from upath import UPath
 
-from qgs.cli import app
 from qgs.composer import resolve
 from qgs.data import ChunksSource, Dl3dvSource
 from qgs.data.paths import opened_path
@@ -272,7 +271,7 @@ def test_a_journal_that_packing_did_not_write(tmp_path, content, message):
 
 
 def command(*words) -> str:
-    result = CliRunner().invoke(app, ["data", "pack", *map(str, words)])
+    result = run_qgs("data", "pack", *words)
     assert result.exit_code == 0, result.output
     return result.output
 

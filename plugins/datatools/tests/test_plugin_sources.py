@@ -1,18 +1,20 @@
 """Data of a source that a plugin brings is checked and packed as that of qgs is."""
 
 import re
+from functools import partial
 
 import numpy as np
 import photo_formats
 import pytest
 import tape_source
 import torch
+from commands import run_qgs
 from qgs_datatools import sources
 from tape_source import Tape
-from typer.testing import CliRunner
 
-from qgs.cli import app
 from qgs.data import ChunksSource
+
+run = partial(run_qgs, "data")
 
 
 @pytest.fixture
@@ -23,10 +25,6 @@ def tapes(tmp_path, monkeypatch):
         tape_source.write_tape(tmp_path / "tapes" / f"{name}.tape")
     yield tmp_path / "tapes"
     sources._installed.cache_clear()
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, ["data", *map(str, arguments)])
 
 
 @pytest.mark.parametrize("format", ["auto", "tapes/tape"])

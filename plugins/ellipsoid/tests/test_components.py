@@ -12,6 +12,7 @@ from qgs_ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_ellipsoid.rotations import quat_product, turned
 from qgs_locus.fields import CENTER, RadiusOptions, support_radius
+from refusals import refused
 
 from qgs import QueryState
 from qgs.components import GaussianHead, posact
@@ -174,9 +175,7 @@ def test_options_without_effect_are_refused(options: dict, path: str, why: str) 
     ((slot, given),) = options.items()
     kinds = {"refinement": "refine", "cross_attention": "ray_biased"}
     decoder = {slot: {"type": f"ellipsoid/{kinds[slot]}", **given}}
-    with pytest.raises(RecipeError) as caught:
-        resolve({**ELLIPSOID, "model": {**ANCHORED, "decoder": decoder}})
-    (problem,) = caught.value.problems
+    problem = refused({**ELLIPSOID, "model": {**ANCHORED, "decoder": decoder}})
     assert problem.option.endswith(path)
     assert why in problem.reason
 
@@ -191,9 +190,7 @@ def test_options_without_effect_are_refused(options: dict, path: str, why: str) 
     ],
 )
 def test_components_that_lack_a_shape_are_refused_with_the_fix(queries: str, reader: dict) -> None:
-    with pytest.raises(RecipeError) as caught:
-        resolve({**ELLIPSOID, "model": {"queries": {"type": queries}, **reader}})
-    (problem,) = caught.value.problems
+    problem = refused({**ELLIPSOID, "model": {"queries": {"type": queries}, **reader}})
     assert "in the slot `queries`" in problem.fix
 
 

@@ -11,11 +11,12 @@ from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
 from qgs_locus.fields import RadiusOptions, raw_radius_of, support_radius
 from qgs_locus.refinement import AnchorRefinement
 from qgs_locus.self_attention import sine_embedding
+from refusals import refused
 
 from qgs import QueryState
 from qgs.components import posact
-from qgs.composer import RecipeError, resolve
-from qgs.contracts import ModelDims, Problem
+from qgs.composer import RecipeProblem, resolve
+from qgs.contracts import ModelDims
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
 
@@ -133,11 +134,8 @@ LOCUS = {"recipe": 1, "plugins": ["locus"]}
 ANCHORED = {"queries": {"type": "locus/anchored"}}
 
 
-def problem_of(model: dict) -> Problem:
-    with pytest.raises(RecipeError) as caught:
-        resolve({**LOCUS, "model": model})
-    (problem,) = caught.value.problems
-    return problem
+def problem_of(model: dict) -> RecipeProblem:
+    return refused({**LOCUS, "model": model})
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,27 @@
+"""`qgs` as a user types it, a model of one layer, and overrides that make recipes small."""
+
+from typing import Any
+
+from typer.testing import CliRunner, Result
+
+from qgs.cli import app
+
+MODEL: dict[str, Any] = {
+    "width": 16,
+    "heads": 2,
+    "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
+    "queries": {"type": "qgs/latent", "count": 8, "std": 1.0},
+    "decoder": {"depth": 1},
+    "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
+    "supervision": {"type": "qgs/layers", "layers": [1]},
+}
+SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
+
+
+def run_qgs(*words: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, words)])
+
+
+def sets(*overrides: str) -> list[str]:
+    """The words of a command that make SMALL and these overrides."""
+    return [word for setting in (*SMALL, *overrides) for word in ("--set", setting)]
