@@ -91,6 +91,11 @@ class Registry:
         }
 
 
+def builtin() -> InstalledPlugin:
+    """The plugin `qgs`."""
+    return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
+
+
 def available_plugins() -> dict[str, list[EntryPoint]]:
     """Name to entry points of every installed plugin, by metadata alone."""
     found: dict[str, list[EntryPoint]] = {}
@@ -101,13 +106,13 @@ def available_plugins() -> dict[str, list[EntryPoint]]:
 
 def load_registry(names: Iterable[str]) -> Registry:
     """The built-in components and those of the plugins `names`; raises PluginError."""
-    return Registry({name: load_plugin(name) for name in ("qgs", *names)})
+    return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
 
 
 def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
     """The components of the recipe's `plugins`; a problem for each that cannot be used."""
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
-    plugins, seen = {"qgs": load_plugin("qgs")}, dict[str, Origin]()
+    plugins, seen = {"qgs": builtin()}, dict[str, Origin]()
     written = tree.get("plugins")
     if written is not None and not isinstance(written, ListNode):
         reason = f"`plugins` is a list, this is {kind_of(written)}"
@@ -132,7 +137,7 @@ def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()
 
 def load_sound_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
-    plugins, broken = {"qgs": load_plugin("qgs")}, []
+    plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()
     for release in map(_release, available.pop("qgs", [])):
         reason = f"{release} offers a plugin `qgs`, the framework's own name"
@@ -148,7 +153,7 @@ def load_sound_plugins() -> tuple[Registry, list[str]]:
 def load_plugin(name: str) -> InstalledPlugin:
     """Import and check the plugin `name`; raises PluginError."""
     if name == "qgs":
-        return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
+        return builtin()
     available = available_plugins()
     if not (entries := available.get(name)):
         installed = ", ".join(sorted(available)) or "none"

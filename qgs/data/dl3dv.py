@@ -4,7 +4,8 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator
-from typing import ClassVar, TypeAlias, cast
+from functools import partial
+from typing import Any, ClassVar, TypeAlias, cast
 
 from pydantic import Field
 from upath import UPath
@@ -71,11 +72,7 @@ class Dl3dvSource(LazySource):
                 warn_once(f"{len(absent)} of {len(named)} test scenes are not there: {names}")
         same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
         photos = PhotosConfig(format="nerfstudio", **same)
-        cache = image_cache(0)
-
-        def opener(name: str, place: Place) -> PhotoScene:
-            return PhotoScene(name, scene_folder(place), photos, cache)
-
+        opener = partial(_opened, config=photos, cache=image_cache(0))
         self.splits = {
             "train": LazyScenes(train, opener, config.max_scenes),
             "test": LazyScenes(test, opener, config.max_scenes),
@@ -92,6 +89,10 @@ class Dl3dvSource(LazySource):
             isinstance(place, ArchivePath) or _HASH.fullmatch(name) or not formats_of(place)
             for name, place in _places(path, _DEPTH)
         )
+
+
+def _opened(name: str, place: Place, **options: Any) -> PhotoScene:
+    return PhotoScene(name, scene_folder(place), **options)
 
 
 def find_scenes(path: UPath) -> dict[str, Place]:

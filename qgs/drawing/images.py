@@ -61,9 +61,8 @@ def png_bytes(picture: Picture) -> bytes:
 
 def write_png(picture: Picture, path: str | Path) -> None:
     """Write a uint8 (H, W, 3) picture."""
-    data = png_bytes(picture)
     with replacing(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(png_bytes(picture))
 
 
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:

@@ -4,7 +4,7 @@ import pytest
 from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
 
-from qgs.composer.registry import InstalledPlugin, Registry, load_plugin
+from qgs.composer.registry import InstalledPlugin, Registry, builtin
 from qgs.contracts import SceneSourceConfig
 from qgs.data import PhotosSource
 from qgs.data.recognition import open_for, recognised
@@ -28,7 +28,7 @@ HOLDINGS = {
     "garden.tape": "tapes/tape",
     "readme.txt": "qgs/photos",
 }
-SOURCES = Registry({"qgs": load_plugin("qgs"), "tapes": InstalledPlugin(plugin)}).components("data")
+SOURCES = Registry({"qgs": builtin(), "tapes": InstalledPlugin(plugin)}).components("data")
 
 
 @pytest.mark.parametrize("held", HOLDINGS)
