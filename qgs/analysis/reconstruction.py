@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
@@ -24,6 +23,7 @@ from qgs.drawing.images import (
     write_gif,
     write_png,
 )
+from qgs.geometry.poses import look_at
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
 from qgs.metrics.baselines import BASELINES
@@ -35,6 +35,7 @@ ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
 FRAMES_PER_SECOND = 16
 OVERVIEW_COLUMNS = 8
+NOVEL, SWAY = 6, 0.12
 
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
@@ -46,13 +47,12 @@ def choose_frames(
     span: int,
     frames: Sequence[int] | None = None,
     compare: Sequence[int] | None = None,
-    novel: int = 6,
     held_out: Sequence[int] = (),
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Input frames and novel frames, from 0 to total - 1.
 
     frames: the inputs; None spreads `inputs` of them, ends included, over the middle `span` frames.
-    compare: the novel ones; None spreads at most `novel` between the inputs. held_out: frames that
+    compare: the novel ones; None spreads at most NOVEL between the inputs. held_out: frames that
     training left out; inputs are then chosen from the others, and these are compared.
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
@@ -68,7 +68,7 @@ def choose_frames(
     if compare is None:
         between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
-        compare = _evenly(between, min(novel, len(between)))
+        compare = _evenly(between, min(NOVEL, len(between)))
     every = [*frames, *compare]
     missing = [frame for frame in every if not 0 <= frame < total]
     if missing:
@@ -108,8 +108,8 @@ def orbit_path(
     return finer(orbit(inputs, (near + far) / 2, frames), side)
 
 
-def orbit(inputs: Cameras, depth: float, frames: int, sway: float = 0.12) -> Cameras:
-    """A loop (1, frames) past the input cameras (1, V), swaying by `sway` times `depth`."""
+def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
+    """A loop (1, frames) past the input cameras (1, V), swaying by SWAY times `depth`."""
     angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
     count = inputs.shape[1]
     # From 0, the first input, to count - 1, the last, and back.
@@ -119,21 +119,11 @@ def orbit(inputs: Cameras, depth: float, frames: int, sway: float = 0.12) -> Cam
     mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
     _, down, forward, centre = mean[:, :3].unbind(-1)
     right, down, forward, centre = look_at(centre, forward, down)[:, :3].unbind(-1)
-    reach = sway * depth
+    reach = SWAY * depth
     eye = centre + reach * angles.sin()[:, None] * right
     eye = eye - reach / 2 * angles.cos()[:, None] * down
     c2w = look_at(eye, centre + depth * forward - eye, down)
     return Cameras(c2w[None], inputs.intrinsics[:, :1].expand(1, frames, 4), inputs.size)
-
-
-def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
-    """OpenCV poses c2w (..., 4, 4) at eye (..., 3), looking along `forward`, upright by `down`."""
-    forward = F.normalize(forward, dim=-1)
-    down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
-    right = torch.linalg.cross(down, forward)
-    top = torch.stack([right, down, forward, eye], -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], -2)
 
 
 @dataclass(frozen=True)

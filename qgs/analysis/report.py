@@ -15,14 +15,13 @@ from qgs.data.sampling import Sample
 from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
 from qgs.drawing.images import (
     Picture,
+    data_uri,
     depth_picture,
     depth_range,
     enlarged,
     finer,
-    png_uri,
     rgb_picture,
     side_by_side,
-    webp_uri,
 )
 from qgs.drawing.queries import (
     Token,
@@ -108,7 +107,7 @@ def report_html(report: Report) -> str:
         scene_columns(report.contenders, sample, depth)
         for sample, depth in zip(report.samples, report.depths, strict=True)
     ]
-    environment = page_environment(uri=_uri, hex=hex_color)
+    environment = page_environment(uri=data_uri, hex=hex_color)
     return environment.get_template("report.html").render(
         report=report, scenes=scenes, sections=sections
     )
@@ -125,10 +124,6 @@ def page_environment(*packages: str, **filters: Callable[..., str]) -> Environme
     )
     environment.filters.update(filters)
     return environment
-
-
-def _uri(image: Picture | list[Picture]) -> str:
-    return webp_uri(image) if isinstance(image, list) else png_uri(image)
 
 
 def scene_columns(

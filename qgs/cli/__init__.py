@@ -54,16 +54,13 @@ def main() -> None:
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
-        if os.environ.get("QGS_DEBUG") or not _is_users_mistake(error):
+        from qgs.contracts.component import MissingExtraError
+
+        theirs = isinstance(error, MissingExtraError) or not isinstance(error, RuntimeError)
+        if os.environ.get("QGS_DEBUG") or not theirs:
             raise
         # A note of several lines is the traceback of another process.
         notes = [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
         for line in (f"error: {error}", *notes, "(QGS_DEBUG=1 shows where it was raised)"):
             print(line, file=sys.stderr)
         raise SystemExit(2) from None
-
-
-def _is_users_mistake(error: Exception) -> bool:
-    from qgs.contracts.component import MissingExtraError
-
-    return isinstance(error, MissingExtraError) or not isinstance(error, RuntimeError)

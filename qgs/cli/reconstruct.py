@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Component, Scene, SceneSource, Split
-    from qgs.data.sampling import Sample
-    from qgs.model import QueryGaussianModel
-    from qgs.types import Gaussians
+    from qgs.contracts import Component, Scene, Split
 
 
 def reconstruct(
@@ -71,6 +68,8 @@ def reconstruct(
     from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
+    from qgs.engine.tuning import tune as fit
+    from qgs.engine.tuning import tuning_loss
     from qgs.io.checkpoint import load, load_recipe
 
     console = Console()
@@ -83,13 +82,14 @@ def reconstruct(
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
     sample, world = choose_sample(scene, recipe.views, inputs, chosen, compared)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    gaussians, record = tuned(model, recipe, sample, tune) if tune else (None, None)
-    if record:
-        console.print(
-            "{steps} steps of token tuning: photometric loss of the inputs {loss_before:.5f} -> "
-            "{loss_after:.5f}".format(**record),
-            highlight=False,
-        )
+    gaussians = record = None
+    if tune:
+        rate = recipe.evaluation.tuning_rate
+        tuning = fit(model, sample.inputs, tuning_loss(recipe), tune, rate)
+        gaussians, before, after = tuning.prediction.gaussians, tuning.losses[0], tuning.losses[-1]
+        record = {"steps": tune, "rate": rate, "loss_before": before, "loss_after": after}
+        losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
+        console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, gaussians, record)
     console.print(score_table(result))
     for path in write_reconstruction(model, result, out):
@@ -121,13 +121,6 @@ def chosen_scene(
             "such as --size 256x256"
         )
     source, is_training_data = open_for(path, size, trained, sources)
-    scene = scene_of(source, path, name)
-    seen = is_training_data and scene.name in source.names("train")
-    return scene, training_frames(scene) if seen else ()
-
-
-def scene_of(source: SceneSource, path: str, name: str | None) -> Scene:
-    """The scene called `name`, of either split, or the only one. Raises ValueError otherwise."""
     splits: tuple[Split, ...] = ("train", "test")
     places: dict[str, tuple[Split, int]] = {
         known: (split, place) for split in splits for place, known in enumerate(source.names(split))
@@ -138,19 +131,9 @@ def scene_of(source: SceneSource, path: str, name: str | None) -> Scene:
         found = f"no scene {name!r}, but" if name is not None else f"{len(places)} scenes:"
         raise ValueError(f"{path} holds {found} {listed(places)}: name one of them with --scene")
     split, place = places[name]
-    return source.scenes(split)[place]
-
-
-def tuned(
-    model: QueryGaussianModel, recipe: Recipe, sample: Sample, steps: int
-) -> tuple[Gaussians, dict[str, Any]]:
-    """Gaussians of tokens tuned on the inputs of `sample`, and a record of the tuning."""
-    from qgs.engine.tuning import tune, tuning_loss
-
-    rate = recipe.evaluation.tuning_rate
-    tuning = tune(model, sample.inputs, tuning_loss(recipe), steps, rate)
-    losses = {"loss_before": tuning.losses[0], "loss_after": tuning.losses[-1]}
-    return tuning.prediction.gaussians, {"steps": steps, "rate": rate, **losses}
+    scene = source.scenes(split)[place]
+    seen = is_training_data and scene.name in source.names("train")
+    return scene, training_frames(scene) if seen else ()
 
 
 def frame_list(text: str | None, option: str) -> list[int] | None:

@@ -65,9 +65,11 @@ class OneCycleAdamW(Optimizer):
 
     def learning_rate(self, step: int, seconds: float) -> float:
         """The one-cycle rate; where the fall starts is where the warm-up was first over."""
-        used = self._used(step, seconds)
+        of_steps, of_seconds = step / max(self.training.steps - 1, 1), seconds / self.budget
+        used = min(max(of_steps, of_seconds), 1.0)
         if self._descent_starts is None:
-            warmed = self._warmed(step, seconds)
+            top = self.options.warmup - 1
+            warmed = max(step / top if top > 0 else 1.0, of_seconds / WARMUP_TIME)
             if warmed < 1:
                 return _cosine(self.first, self.peak, warmed)
             self._descent_starts = used
@@ -81,15 +83,6 @@ class OneCycleAdamW(Optimizer):
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self._descent_starts = state["descent_starts"]
-
-    def _warmed(self, step: int, seconds: float) -> float:
-        """Fraction of the warm-up that is over; may exceed 1."""
-        top = self.options.warmup - 1
-        return max(step / top if top > 0 else 1.0, seconds / (WARMUP_TIME * self.budget))
-
-    def _used(self, step: int, seconds: float) -> float:
-        """Fraction of the budget that is used."""
-        return min(max(step / max(self.training.steps - 1, 1), seconds / self.budget), 1.0)
 
 
 def _cosine(start: float, end: float, part: float) -> float:

@@ -131,21 +131,15 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
         raise RecipeError([problem]) from error
     if issubclass(component, Queries | Refinement):
-        _check_first_state(built, chosen)
+
+        def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
+            if fault := _state_fault(chosen, arguments, state):
+                place = place_of(component.forward)
+                raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
+            hook.remove()  # the state is checked until it has once been what it must be
+
+        hook = built.register_forward_hook(check)
     return built
-
-
-def _check_first_state(module: nn.Module, chosen: Chosen) -> None:
-    """Make `module` raise PluginError until it has once returned the state that it must."""
-
-    def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
-        fault = _state_fault(chosen, arguments, state)
-        if fault:
-            place = place_of(chosen.component.forward)  # type: ignore[attr-defined]
-            raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
-        hook.remove()
-
-    hook = module.register_forward_hook(check)
 
 
 def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:

@@ -96,11 +96,18 @@ def apply_swaps(
             fix = near_pattern(pattern, swappable) or f"places: {', '.join(known)}"
             problems.add(origin, name, reason, fix)
         for path in hits:
-            if conflict := _conflict(result[path]):
-                problems.add(origin, name, *conflict)
-                break
-            source = ("swap", pattern)
-            result[path] = replace(places[path], source=source, node=node, origin=origin)
+            place, shown = result[path], ".".join(path)
+            if place.source[0] == "swap":
+                reason = f"`{shown}` is already swapped by `{place.source[1]}` ({place.origin})"
+                fix = "narrow one of the two patterns, or remove one"
+            elif "layers" in place.source:
+                reason = f"`{shown}` is already set for this layer at {place.origin}"
+                fix = f"narrow the pattern, or remove `{shown}` (null removes an inherited one)"
+            else:
+                result[path] = replace(place, source=("swap", pattern), node=node, origin=origin)
+                continue
+            problems.add(origin, name, reason, fix)
+            break
     return result
 
 
@@ -108,18 +115,6 @@ def _matches(pattern: str, path: KeyPath) -> bool:
     parts = tuple(pattern.split("."))
     shown = path[1:] if path[0] == "model" and parts[0] != "model" else path
     return len(parts) == len(shown) and all(map(fnmatchcase, shown, parts))
-
-
-def _conflict(place: Place) -> tuple[str, str] | None:
-    """Reason and fix if `place` is already swapped, or set for its layer alone."""
-    name = ".".join(place.path)
-    if place.source[0] == "swap":
-        reason = f"`{name}` is already swapped by `{place.source[1]}` ({place.origin})"
-        return reason, "narrow one of the two patterns, or remove one"
-    if "layers" in place.source:
-        reason = f"`{name}` is already set for this layer at {place.origin}"
-        return reason, f"narrow the pattern, or remove `{name}` (null removes an inherited one)"
-    return None
 
 
 def near_pattern(pattern: str, paths: Iterable[KeyPath]) -> str:

@@ -156,7 +156,13 @@ class _Reader:
             fix = "remove the tag; components are named with `type`"
             return self.stop(node, path, f"the tag {node.tag!r} is not allowed in a recipe", fix)
         if isinstance(node, yaml.ScalarNode):
-            return self.read_scalar(node, path)
+            try:
+                return scalar_value(node.tag, node.value)
+            except OverflowError as error:
+                return self.stop(node, path, str(error), "write a smaller number")
+            except ValueError:
+                kind = node.tag.removeprefix(_STANDARD)
+                return self.stop(node, path, f"{node.value!r} is no {kind}", "remove the tag")
         self.open.append(node)
         try:
             if isinstance(node, yaml.MappingNode):
@@ -185,15 +191,6 @@ class _Reader:
             else:
                 read[key] = (key, self.read(value_node, (*path, key)), origin)
         return MapNode(self.origin(node), read.values())
-
-    def read_scalar(self, node: yaml.Node, path: KeyPath) -> Node:
-        try:
-            return scalar_value(node.tag, node.value)
-        except OverflowError as error:
-            return self.stop(node, path, str(error), "write a smaller number")
-        except ValueError:
-            kind = node.tag.removeprefix(_STANDARD)
-            return self.stop(node, path, f"{node.value!r} is no {kind}", "remove the tag")
 
     def stop(self, node: yaml.Node, path: KeyPath, reason: str, fix: str) -> None:
         self.problems.stop(self.origin(node), ".".join(path), reason, fix)

@@ -151,14 +151,11 @@ class EvaluationPlan:
 
 
 def evaluation_samples(
-    source: SceneSource,
-    views: ViewsConfig,
-    evaluation: EvaluationConfig,
-    index: EvaluationIndex | None = None,
+    source: SceneSource, views: ViewsConfig, evaluation: EvaluationConfig
 ) -> Sequence[Sample]:
-    """All samples of an `EvaluationPlan`; raises ValueError for the first scene that fails."""
+    """Samples of a plan without an index; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
-    for sample in EvaluationPlan(source, views, evaluation, index).samples():
+    for sample in EvaluationPlan(source, views, evaluation).samples():
         if isinstance(sample, SceneFailure):
             raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
         samples.append(sample)

@@ -61,9 +61,8 @@ def png_bytes(picture: Picture) -> bytes:
 
 def write_png(picture: Picture, path: str | Path) -> None:
     """Write a uint8 (H, W, 3) picture."""
-    data = png_bytes(picture)
     with replacing(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(png_bytes(picture))
 
 
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
@@ -79,16 +78,13 @@ def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: fl
         images[0].save(temporary, "GIF", save_all=True, append_images=images[1:], **options)
 
 
-def png_uri(picture: Picture) -> str:
-    """A picture as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(png_bytes(picture)).decode()
-
-
-def webp_uri(frames: Sequence[Picture], milliseconds: int = 90) -> str:
-    """Frames as the data URI of an endless WebP animation."""
+def data_uri(image: Picture | list[Picture]) -> str:
+    """A picture as PNG, frames as an endless WebP animation."""
+    if not isinstance(image, list):
+        return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
     buffer = BytesIO()
-    first, *rest = map(_checked, frames)
-    options = {"duration": milliseconds, "loop": 0, "quality": 80, "method": 2}
+    first, *rest = map(_checked, image)
+    options = {"duration": 90, "loop": 0, "quality": 80, "method": 2}  # milliseconds a frame
     first.save(buffer, format="WEBP", save_all=True, append_images=rest, **options)
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 

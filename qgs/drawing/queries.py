@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from qgs.drawing.figures import INK, Color, categorical
-from qgs.drawing.images import Picture, rgb_picture, washed
+from qgs.drawing.images import Picture, enlarged, rgb_picture, washed
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.model import QueryGaussianModel
@@ -65,9 +65,7 @@ def project_support(support: SpatialSupport, cameras: Cameras) -> Ellipses:
 
 def _oversampled(picture: Picture) -> Image.Image:
     """An image OVERSAMPLING times as large, to draw smooth lines on; `_reduced` takes it back."""
-    height, width = picture.shape[:2]
-    size = (width * OVERSAMPLING, height * OVERSAMPLING)
-    return Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
+    return Image.fromarray(enlarged(picture, OVERSAMPLING * max(picture.shape[:2])))
 
 
 def _reduced(image: Image.Image) -> Picture:

@@ -202,13 +202,6 @@ class OptimizerState:
             self._optimizer.state[parameter][key] = value
 
 
-def set_seed(seed: int) -> None:
-    """Seed python, numpy and torch on all devices."""
-    random.seed(seed)
-    np.random.seed(seed)
-    torch.manual_seed(seed)
-
-
 class RandomStates:
     """The generators of python, numpy and torch, of every process by its rank."""
 

@@ -24,22 +24,20 @@ from qgs.types import Gaussians, Views
 SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
 """What of a recipe decides which views are judged, and how."""
 
-Observer = Callable[[int, int], None]
-"""Called with how many scenes are done, and how many there are."""
-
 
 def evaluate(
     model: QueryGaussianModel,
     recipe: Recipe,
     step: int | None = None,
     batch: int = 1,
-    observe: Observer | None = None,
+    observe: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
     A scene that fails is named in the result with the reason, and the others go on. Leaves the
     model in the mode it was in. step: optimiser steps behind the weights. batch: scenes that pass
-    through the model together; with tuned tokens each passes alone.
+    through the model together; with tuned tokens each passes alone. observe: called with how many
+    scenes are done, and how many there are.
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene at all could be judged or `batch` is less than 1.
     """
@@ -223,7 +221,7 @@ def _name(metric: str, key: str) -> str:
 def _by_scene(
     wanted: Sequence[str],
     results: Iterable[SceneScore | SceneFailure],
-    observe: Observer | None,
+    observe: Callable[[int, int], None] | None,
 ) -> tuple[list[SceneScore], list[SceneFailure]]:
     """Scores and failures in the order of `wanted`; one failed sample fails its scene."""
     samples: dict[str, list[SceneScore]] = {}

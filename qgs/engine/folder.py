@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
 
-from qgs.composer import Recipe
-from qgs.composer.recipe import annotated
 from qgs.io.files import is_leftover, read_records, write_text
 
 
@@ -76,10 +74,6 @@ class RunFolder:
                 self.close()  # this file system knows no locks
         for leftover in filter(is_leftover, self.path.iterdir()):
             leftover.unlink()
-
-    def write_recipe(self, recipe: Recipe) -> None:
-        """Write the resolved recipe; comments say what set each value."""
-        write_text(self.recipe, annotated(recipe) + "\n")
 
     def append(self, record: Mapping[str, float]) -> None:
         """Add one line to the history."""

@@ -165,7 +165,7 @@ class Guard:
 
     def refuse_collapse(self, step: int) -> None:
         """Raise CollapseError when the last steps, a whole window of them, were dead."""
-        if self.detector.collapsed:
+        if self.detector.dead_steps >= self.detector.window:
             symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
             self._collapse(step, symptom, COLLAPSE_CAUSES)
 
@@ -256,11 +256,6 @@ class CollapseDetector:
             self.symptom = "the renderings equal the background"
         self.dead_steps = self.dead_steps + 1 if self.symptom else 0
         self._has_drawn |= numbers["deviation"] > 8 * FLAT
-
-    @property
-    def collapsed(self) -> bool:
-        """Whether the window is full of dead steps."""
-        return self.dead_steps >= self.window
 
     def dead_after(self, steps: int) -> bool:
         """Whether all of a run's `steps` so far, or the whole window, were dead."""

@@ -54,9 +54,8 @@ class Objective(nn.Module):
             raise ValueError("a recipe needs at least one loss to train; add one under `losses`")
         self.model = model
         self.losses = nn.ModuleDict(losses)
-        reads_none = {name: loss.renderings == "none" for name, loss in losses.items()}
-        self._of_images = [name for name, none in reads_none.items() if not none]
-        self._of_gaussians = [name for name, none in reads_none.items() if none]
+        self._of_gaussians = [n for n, loss in losses.items() if loss.renderings == "none"]
+        self._of_images = [name for name in losses if name not in self._of_gaussians]
         self.render_views = render_views
         self.hook: Callable[[str, Any], None] = lambda name, value: None
         self._owners: dict[str, str] = {}

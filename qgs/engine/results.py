@@ -103,7 +103,7 @@ class Evaluation:
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
         values = {name: self._values(f"model_{name}") for name in self.columns}
-        p = self.protocol
+        used, p = spread(self._values("gaussians_used")), self.protocol
         return {
             "protocol": {"name": p.name, "sha256": p.sha256, "settings": p.settings()},
             "step": self.step,
@@ -120,7 +120,7 @@ class Evaluation:
             "incomplete": dict(self.incomplete),
             "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
             "gaussians": self.gaussians,
-            "gaussians_used": {"opacity_above": OPACITY_USED, **self._used()},
+            "gaussians_used": {"opacity_above": OPACITY_USED, **used},
             "tuning": self._tuning(),
             "held_out_frames": self.held_out,
         }
@@ -149,9 +149,6 @@ class Evaluation:
     def _of_wanted(self, count: int) -> str:
         wanted = len(self.wanted)
         return str(count) if count == wanted else f"{count} of {wanted}"
-
-    def _used(self) -> dict[str, float]:
-        return spread(self._values("gaussians_used"))
 
     def _tuning(self) -> dict[str, Any] | None:
         settings = self.protocol.content["tuning"]
@@ -221,7 +218,7 @@ class Evaluation:
             yield f"{self.columns[name].heading} is {over}: {why}"
         if self.held_out:
             yield "judged on {} of {} held-out frames".format(*self.held_out)
-        used = self._used()
+        used = spread(self._values("gaussians_used"))
         yield (
             f"{self.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "
             f"above {OPACITY_USED:.4f}; mean over scenes, median {used['median']:,.0f})"

@@ -11,22 +11,22 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
+from accelerate.utils import set_seed
 from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.composer import Recipe
+from qgs.composer.recipe import annotated
 from qgs.contracts import TrainingConfig
 from qgs.data.sampling import Batch
 from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
 from qgs.engine.checkpoint import (
     OptimizerState,
     RandomStates,
-    SavedState,
     Saver,
     initialise,
     refuse_other_data,
     saved_state,
-    set_seed,
 )
 from qgs.engine.distributed import (
     StopRequest,
@@ -46,6 +46,7 @@ from qgs.engine.objective import Objective, Outcome
 from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
+from qgs.io.files import write_text
 from qgs.model import QueryGaussianModel
 
 
@@ -133,7 +134,13 @@ class Trainer:
         recipe, config = self.recipe, self.config
         self.optimizer = recipe.build_optimizer()
         self.accelerator = make_accelerator(device)
-        saved = self._claim_folder() if self._resumes else None
+        saved = None
+        if self._resumes:  # a folder that holds a run is this one's from now on
+            self.folder.refuse_other(resume=True)
+            if self.accelerator.is_main_process and not self.folder.is_new:
+                self.folder.take()
+            self.accelerator.wait_for_everyone()
+            saved = saved_state(self.folder, recipe)
         self.model = recipe.build_model(device=self.accelerator.device).train()
         self.notes = [] if saved else initialise(self.model, recipe)
         objective = Objective(self.model, recipe.build_losses(), config.render_views)
@@ -183,14 +190,6 @@ class Trainer:
         self.feed.fetch()
         if self.feed.error:
             raise self.feed.error
-
-    def _claim_folder(self) -> SavedState | None:
-        """The state to continue from; a folder that holds a run is this one's from now on."""
-        self.folder.refuse_other(resume=True)
-        if self.accelerator.is_main_process and not self.folder.is_new:
-            self.folder.take()
-        self.accelerator.wait_for_everyone()
-        return saved_state(self.folder, self.recipe)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
@@ -292,7 +291,7 @@ class Trainer:
             if not self._resumes:
                 self.folder.refuse_other(resume=False)
             self.folder.take()
-            self.folder.write_recipe(self.recipe)
+            write_text(self.folder.recipe, annotated(self.recipe) + "\n")
             self.folder.cut_history(self.resumed_at or 0)
             self.trackers.open(self.folder.path, self.recipe, self.resumed_at or 0)
         self.accelerator.wait_for_everyone()

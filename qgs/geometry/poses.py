@@ -19,14 +19,19 @@ def mean_camera(c2w: Tensor) -> Tensor:
 
     c2w (..., V, 4, 4) -> (..., 4, 4).
     """
-    mean = c2w.mean(dim=-3)
-    forward = F.normalize(mean[..., :3, 2], dim=-1)
-    down = mean[..., :3, 1]
+    _, down, forward, position = c2w.mean(dim=-3)[..., :3, :].unbind(-1)
+    return look_at(position, forward, down)
+
+
+@full_precision
+def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
+    """OpenCV poses c2w (..., 4, 4) at eye (..., 3), looking along `forward`, upright by `down`."""
+    forward = F.normalize(forward, dim=-1)
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
-    right = torch.linalg.cross(down, forward, dim=-1)
-    rotation = torch.stack([right, down, forward], -1)
-    top = torch.cat([rotation, mean[..., :3, 3:]], -1)
-    return torch.cat([top, c2w[..., 0, 3:, :]], -2)
+    right = torch.linalg.cross(down, forward)
+    top = torch.stack([right, down, forward, eye], -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], -2)
 
 
 @full_precision

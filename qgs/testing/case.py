@@ -131,9 +131,14 @@ class Case:
         return list(self.component.problems(self.config, RecipeContext(self.dims, size)))
 
     def build(self, seed: int = 0) -> Any:
-        """A new instance whose initial parameters are drawn under `seed`."""
-        with seeded(seed):
-            built = self.construct()
+        """A new instance, parameters drawn under `seed`. CannotCheck where its data is missing."""
+        try:
+            with seeded(seed):
+                built = self.construct()
+        except FileNotFoundError as error:
+            if self.slot != "data":
+                raise
+            raise CannotCheck(f"the data of this case is not here: {error}") from error
         return built.to(self.device) if isinstance(built, nn.Module) else built
 
     def construct(self) -> Any:

@@ -1,6 +1,7 @@
 import torch
 
-from qgs.analysis.reconstruction import look_at, orbit
+from qgs.analysis.reconstruction import orbit
+from qgs.geometry.poses import look_at
 
 
 def test_the_loop_is_smooth_closed_and_rigid(cameras):

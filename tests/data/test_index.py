@@ -15,7 +15,6 @@ from qgs.data.evaluation import (
     EvaluationPlan,
     IndexEntry,
     SceneFailure,
-    evaluation_samples,
     read_index,
 )
 from qgs.data.sampling import Sample
@@ -81,7 +80,8 @@ def test_a_missing_index_is_told_with_its_path() -> None:
 def test_samples_are_those_of_the_index_in_its_order() -> None:
     source = Strips(Strip("one"), Strip("two"), Strip("three"))
     index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
-    samples = evaluation_samples(source, VIEWS, EvaluationConfig(scenes=1), index)
+    plan = EvaluationPlan(source, VIEWS, EvaluationConfig(scenes=1), index)
+    samples = [sample for sample in plan.samples() if isinstance(sample, Sample)]
     assert [s.scene for s in samples] == ["three", "one"]
     first = samples[0]
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))

@@ -49,18 +49,18 @@ def observed(*signs: dict[str, float]) -> CollapseDetector:
 )
 def test_a_window_of_dead_steps_is_a_collapse(dead: dict[str, float], words: str) -> None:
     detector = observed(ALIVE, *[ALIVE | dead] * 9)
-    assert not detector.collapsed
+    assert not detector.dead_after(10)
     detector.observe(ALIVE | dead)
-    assert detector.collapsed
+    assert detector.dead_after(10)
     assert words in detector.symptom
 
 
 def test_one_living_step_starts_the_count_again() -> None:
-    assert not observed(*[*[DEAD] * 9, ALIVE] * 5).collapsed
+    assert not observed(*[*[DEAD] * 9, ALIVE] * 5).dead_after(50)
 
 
 def test_images_that_are_still_plain_at_the_start_are_no_collapse() -> None:
-    assert not observed(*[ALIVE | {"deviation": 1e-4}] * 50).collapsed
+    assert not observed(*[ALIVE | {"deviation": 1e-4}] * 50).dead_after(50)
 
 
 def test_good_weights_are_the_older_of_two_copies() -> None:

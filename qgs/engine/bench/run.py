@@ -139,18 +139,15 @@ def in_turn(
 
     torch.utils.benchmark's clock waits for a GPU. say: called before each round.
     """
-    for number in range(warmup):
-        say(f"{label}warm-up {number + 1} of {warmup}")
-        for task in tasks:
-            task()
     columns: list[list[float]] = [[] for _ in tasks]
-    for number in range(rounds):
-        say(f"{label}round {number + 1} of {rounds}")
-        for task, column in zip(tasks, columns, strict=True):
-            start = timer()
-            task()
-            column.append(timer() - start)
-    return columns
+    for what, count in (("warm-up", warmup), ("round", rounds)):
+        for number in range(count):
+            say(f"{label}{what} {number + 1} of {count}")
+            for task, column in zip(tasks, columns, strict=True):
+                start = timer()
+                task()
+                column.append(timer() - start)
+    return [column[warmup:] for column in columns]
 
 
 def _processor() -> str:

@@ -10,7 +10,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 
 from qgs.composer.flow import fits
 from qgs.composer.registry import file_of
-from qgs.testing.case import CannotCheck, Case, ContractError, expect
+from qgs.testing.case import Case, ContractError, expect
 from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of, tracked_inputs
 from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import ALL_SLOTS, MODULES, PARAMETRIC, check
@@ -54,12 +54,7 @@ def check_builds(case: Case) -> None:
     """A component can be built from its options, in which its `problems` finds none."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
     expect(not found, f"the options of this case are refused: {', '.join(found)}")
-    try:
-        case.build()
-    except FileNotFoundError as error:
-        if case.slot != "data":
-            raise
-        raise CannotCheck(f"the data of this case is not here: {error}") from error
+    case.build()
 
 
 @check(MODULES)

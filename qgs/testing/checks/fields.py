@@ -15,7 +15,7 @@ from qgs.testing.case import Case, expect
 from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of, required_fields
 from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import ALL_SLOTS, MODULES, STATEFUL, check
-from qgs.testing.trees import described, difference, leaves, mapped, not_finite, scalar
+from qgs.testing.trees import described, difference, gradients, leaves, mapped, not_finite, scalar
 from qgs.types import LayerPrediction, QueryState, map_tensors
 
 PLUGIN = "under_test"
@@ -231,10 +231,9 @@ def run_training_step(recipe: Recipe, case: Case, sizes: Sizes | None = None) ->
             terms = loss(prediction, seen, target)
             _expect_finite("losses", terms)
             total = total + scalar(terms)
-    total.backward()
-    gradients = {n: p.grad for n, p in model.named_parameters() if p.grad is not None}
-    expect(bool(gradients), "in the model that it is composed into nothing gets a gradient")
-    _expect_finite("gradients", gradients)
+    found = gradients(total, dict(model.named_parameters()))
+    expect(bool(found), "in the model that it is composed into nothing gets a gradient")
+    _expect_finite("gradients", found)
 
 
 def _expect_finite(what: str, tree: Any) -> None:

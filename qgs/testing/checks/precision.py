@@ -67,30 +67,33 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
     if case.slot == "queries":
         module.requires_grad_(False)  # its parameters are no layers: they are the geometry
     for mode in each_mode(module):
-        _expect_geometry_in_float32(case, module, f"in {mode} under autocast")
-
-
-def _expect_geometry_in_float32(case: Case, module: Any, where: str) -> None:
-    inputs = _halved(inputs_of(case))
-    autocast = torch.autocast(case.device, dtype=torch.bfloat16)
-    with seeded(0), autocast, LearnedLayers() as layers:
-        outputs = _with_explanation(module, inputs)
-    broken = [name for name in not_finite(outputs) if name != EXPLAINED]
-    expect(not broken, f"{where} {', '.join(broken)} is not finite")
-    seen = {n: x for n, x in floating(outputs).items() if n.startswith(GEOMETRY.get(case.slot, ()))}
-    for name, tensor in seen.items():
-        kept = tensor.dtype == torch.float32
-        expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
-    with seeded(0), LearnedLayers(layers.outputs) as replayed:
-        exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
-    placed = {name: x for name, x in seen.items() if name not in _learned_fields(case)}
-    found = difference({name: exact[name] for name in placed}, placed, RTOL, ATOL)
-    if found and replayed.differs:
-        raise CannotCheck("in float32 it calls other layers than under autocast")
-    expect(not found, f"{where}, against float32, {found}")
-    if isinstance(module, CrossAttention | SelfAttention):
-        names = ", ".join(sorted(layers.halved))
-        expect(not names, f"{where} the product of float32 geometry by {names} is in bfloat16")
+        where = f"in {mode} under autocast"
+        inputs = _halved(inputs_of(case))
+        autocast = torch.autocast(case.device, dtype=torch.bfloat16)
+        with seeded(0), autocast, LearnedLayers() as layers:
+            outputs = _with_explanation(module, inputs)
+        broken = [name for name in not_finite(outputs) if name != EXPLAINED]
+        expect(not broken, f"{where} {', '.join(broken)} is not finite")
+        seen = {
+            n: x for n, x in floating(outputs).items() if n.startswith(GEOMETRY.get(case.slot, ()))
+        }
+        for name, tensor in seen.items():
+            kept = tensor.dtype == torch.float32
+            expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
+        with seeded(0), LearnedLayers(layers.outputs) as replayed:
+            exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
+        required = case.component.requires(case.config)
+        provided = case.component.provides(case.config).items()
+        # Fields that stand in no frame and carry on none that was read.
+        learned = {f"fields.{n}" for n, s in provided if s.frame == "none" and n not in required}
+        placed = {name: x for name, x in seen.items() if name not in learned}
+        found = difference({name: exact[name] for name in placed}, placed, RTOL, ATOL)
+        if found and replayed.differs:
+            raise CannotCheck("in float32 it calls other layers than under autocast")
+        expect(not found, f"{where}, against float32, {found}")
+        if isinstance(module, CrossAttention | SelfAttention):
+            names = ", ".join(sorted(layers.halved))
+            expect(not names, f"{where} the product of float32 geometry by {names} is in bfloat16")
 
 
 def _halved(inputs: Inputs) -> Inputs:
@@ -107,13 +110,6 @@ def _with_explanation(module: Any, inputs: Inputs) -> dict[str, Any]:
         if weights is not None and weights.geometry is not None:
             outputs[EXPLAINED] = weights.geometry
     return outputs
-
-
-def _learned_fields(case: Case) -> set[str]:
-    """Provided fields that stand in no frame and carry on none that was read."""
-    required = case.component.requires(case.config)
-    provided = case.component.provides(case.config).items()
-    return {f"fields.{n}" for n, spec in provided if spec.frame == "none" and n not in required}
 
 
 @check(MODULES)

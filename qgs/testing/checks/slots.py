@@ -17,7 +17,6 @@ from qgs.contracts import (
     MetricInput,
     Optimizer,
     ParameterGroup,
-    SceneSource,
     Split,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
@@ -39,8 +38,7 @@ def check_head_gives_gaussians(case: Case) -> None:
     With initial parameters too, for ordinary features.
     """
     modules = [(case.build(), 1.0, "with initial parameters,")]
-    for factor in (0.0, 1.0, 100.0):
-        modules.append((case.lively(), factor, f"for features times {factor:g}"))
+    modules += [(case.lively(), f, f"for features times {f:g}") for f in (0.0, 1.0, 100.0)]
     state = inputs_of(case)["state"]
     for module, factor, where in modules:
         for mode in each_mode(module):
@@ -110,7 +108,7 @@ def check_supervision_weights(case: Case) -> None:
 @check({"data"})
 def check_scenes_repeat(case: Case) -> None:
     """A scene is the same each time: names, cameras, and images of the delivered size in [0, 1]."""
-    first, second = (_source(case).scenes("train")[0] for _ in range(2))
+    first, second = (case.build().scenes("train")[0] for _ in range(2))
     expect(first.name == second.name, f"scene 0 is `{first.name}`, then `{second.name}`")
     frames = list(range(min(2, len(first))))
     images = first.images(frames)
@@ -126,7 +124,7 @@ def check_scenes_repeat(case: Case) -> None:
 @check({"data"})
 def check_scenes_are_as_listed(case: Case) -> None:
     """`names` are those of the scenes, `groups` hold each scene once, held-out frames exist."""
-    source = _source(case)
+    source = case.build()
     for split in get_args(Split):
         scenes, names = source.scenes(split), list(source.names(split))
         count, where = len(scenes), f"of the {split} split"
@@ -139,13 +137,6 @@ def check_scenes_are_as_listed(case: Case) -> None:
             expect(scene.name == names[place], f"{name} is `{scene.name}`, not {names[place]}")
             outside = [frame for frame in scene.held_out if not 0 <= frame < len(scene)]
             expect(not outside, f"{name} has {len(scene)} frames and holds out {outside}")
-
-
-def _source(case: Case) -> SceneSource:
-    try:
-        return case.build()
-    except FileNotFoundError as error:
-        raise CannotCheck(f"the data of this case is not here: {error}") from error
 
 
 @check({"losses"})

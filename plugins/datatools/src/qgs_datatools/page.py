@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from qgs.analysis.report import page_environment
 from qgs.drawing.figures import INK, figure_picture, figure_style, hex_color
-from qgs.drawing.images import Picture, png_uri
+from qgs.drawing.images import Picture, data_uri
 from qgs_datatools.check import CheckReport, SceneReport
 from qgs_datatools.epipolar import Pair
 
@@ -29,7 +29,7 @@ _GAP = 0.02  # between two photos, of a photo's width
 
 def check_html(report: CheckReport) -> str:
     """The whole page; it needs no other file and no network."""
-    environment = page_environment("qgs_datatools", png=png_uri)
+    environment = page_environment("qgs_datatools", png=data_uri)
     scenes = sorted(report.scenes, key=_badness, reverse=True)
     return environment.get_template("check.html").render(
         report=report,
