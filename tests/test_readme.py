@@ -1,4 +1,4 @@
-"""What the README shows is what the repository holds."""
+"""What the README and the pages that it leads to show is what the repository holds."""
 
 import re
 from importlib.metadata import entry_points
@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def section(title: str) -> str:
-    return README.split(f"\n## {title}\n")[1].split("\n## ")[0]
+def page(name: str) -> str:
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
 
 
 def test_overlay_is_the_recipe() -> None:
@@ -25,7 +25,7 @@ def test_overlay_is_the_recipe() -> None:
 
 
 def test_slots_and_their_defaults() -> None:
-    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", section("Slots"), re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", page("recipes.md").split("\n## ")[1], re.MULTILINE)
     shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
     defaults = {name: [slot.default] if slot.default else [] for name, slot in SLOTS.items()}
     defaults |= {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.named}
@@ -33,11 +33,15 @@ def test_slots_and_their_defaults() -> None:
 
 
 def test_commands() -> None:
-    shown = re.findall(r"^\| `qgs ([\w-]+)", section("On the command line"), re.MULTILINE)
+    shown = re.findall(r"^\| `qgs ([\w-]+)", page("commands.md"), re.MULTILINE)
     assert set(shown) == {*COMMANDS, *entry_points(group=GROUP).names}
 
 
 def test_paths_exist() -> None:
-    paths = re.findall(r"`(?:\./)?((?:recipes|tools|docs|plugins|tests)/[\w./-]+)`", README)
+    paths = re.findall(r"[`(](?:\./)?((?:recipes|tools|docs|plugins|tests)/[\w./-]+)[`)]", README)
     assert paths
     assert [path for path in paths if not (ROOT / path).exists()] == []
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 120

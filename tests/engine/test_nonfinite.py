@@ -25,7 +25,7 @@ from qgs.engine.objective import Objective
 from qgs.engine.training import compute_gradients
 from qgs.types import named_tensors
 
-README = Path(__file__).parents[2] / "README.md"
+GUIDE = Path(__file__).parents[2] / "docs/training.md"
 NAN, INF = float("nan"), float("inf")
 
 
@@ -186,7 +186,7 @@ def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
             torch.testing.assert_close(
                 file.get_tensor(name)[2:], tensor, rtol=0, atol=0, equal_nan=True
             )
-    example = README.read_text(encoding="utf-8").split("To see it again:\n\n```python\n")[1]
+    example = GUIDE.read_text(encoding="utf-8").split("To see it again:\n\n```python\n")[1]
     ran: dict[str, Any] = {}
     exec(example.split("```")[0].replace("RUN/incidents", str(tmp_path / "incidents")), ran)
     saved = ran["views"](ran["saved"], "targets")
