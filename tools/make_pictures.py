@@ -1,0 +1,134 @@
+"""The pictures of README.md and docs/, drawn from trained models.
+
+    python tools/make_pictures.py [--tokengs CHECKPOINT] [--locus CHECKPOINT] [--scene 2]
+
+Writes docs/images/first_sight.webp (a room that no model has seen: the photos, a walk through each
+model's Gaussians, LocusGS's anchors) and docs/images/anchors.png (the anchors layer by layer).
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+import qgs
+from qgs.analysis.reconstruction import orbit_path
+from qgs.composer import resolve
+from qgs.data.evaluation import evaluation_samples
+from qgs.drawing.figures import INK
+from qgs.drawing.images import Picture, enlarged, rgb_picture, write_png
+from qgs.drawing.queries import notable_tokens, support_picture
+from qgs.io.files import replacing
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Gaussians, Prediction, Views
+
+ROOT = Path(__file__).parents[1]
+IMAGES = ROOT / "docs" / "images"
+SIDE, GAP, TITLE = 240, 6, 26  # pixels
+FRAMES, MILLISECONDS = 48, 80
+OUTLINED = 12  # queries whose support is drawn
+
+
+def titled(pictures: Sequence[Picture], titles: Sequence[str]) -> Picture:
+    """Pictures of one height in a row on white, each under its title."""
+    widths = [picture.shape[1] for picture in pictures]
+    size = sum(widths) + GAP * (len(widths) - 1), pictures[0].shape[0] + TITLE
+    canvas = Image.new("RGB", size, "white")
+    draw, font, left = ImageDraw.Draw(canvas), ImageFont.load_default(15), 0
+    for picture, title, width in zip(pictures, titles, widths, strict=True):
+        draw.text((left + width / 2, TITLE / 2), title, INK, font, anchor="mm")
+        canvas.paste(Image.fromarray(picture), (left, TITLE))
+        left += width + GAP
+    return np.asarray(canvas)
+
+
+def stacked(photos: Sequence[Picture]) -> Picture:
+    """Two square pictures one above the other, as high as one of SIDE pixels."""
+    side = (SIDE - GAP) // 2
+    spacer = np.full((SIDE - 2 * side, side, 3), 255, np.uint8)
+    return np.concatenate([enlarged(photos[0], side), spacer, enlarged(photos[-1], side)])
+
+
+def walk(model: QueryGaussianModel, gaussians: Gaussians, path: Cameras) -> list[Picture]:
+    """What the cameras (1, F) of `path` see."""
+    rendered = [model.render(gaussians, path[:, i : i + 1]).rgb[0, 0] for i in range(FRAMES)]
+    return [enlarged(rgb_picture(image), SIDE) for image in rendered]
+
+
+def anchors_on(
+    model: QueryGaussianModel,
+    prediction: Prediction,
+    pictures: Sequence[Picture],
+    path: Cameras,
+    views: Views,
+) -> list[Picture]:
+    """`pictures` washed out, with the anchors and the supports of OUTLINED queries upon them."""
+    tokens = notable_tokens(model, prediction.gaussians, views.cameras, OUTLINED)
+    colors = {token.query: token.color for token in tokens}
+    support = model.queries.support(prediction.state)
+    assert support is not None
+    return [
+        support_picture(picture, support, path[:, i : i + 1], colors)
+        for i, picture in enumerate(pictures)
+    ]
+
+
+def write_webp(frames: Sequence[Picture], path: Path) -> None:
+    """Write an endless animation."""
+    first, *rest = map(Image.fromarray, frames)
+    options = {"duration": MILLISECONDS, "loop": 0, "quality": 72, "method": 6}
+    with replacing(path) as temporary:
+        first.save(temporary, "WEBP", save_all=True, append_images=rest, **options)
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tokengs", default="rooms/tokengs-64")
+    parser.add_argument("--locus", default="rooms/locus-64")
+    parser.add_argument("--scene", type=int, default=2, help="Number of the test room.")
+    arguments = parser.parse_args()
+    models = [qgs.load(arguments.tokengs), qgs.load(arguments.locus)]
+    assert models[1].recipe is not None
+    recipe = resolve(models[1].recipe)
+    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[
+        arguments.scene
+    ]
+    predictions: list[Prediction] = [model(sample.inputs) for model in models]
+    rendering = models[1].render(predictions[1].gaussians, sample.inputs.cameras)
+    path = orbit_path(sample.inputs.cameras, rendering.depth, FRAMES, SIDE)
+    walks = [walk(m, p.gaussians, path) for m, p in zip(models, predictions, strict=True)]
+    anchors = anchors_on(models[1], predictions[1], walks[1], path, sample.inputs)
+    photos = stacked([rgb_picture(image) for image in sample.inputs.images[0]])
+    titles = ("2 photos", "TokenGS", "LocusGS", "its anchors")
+    frames = [titled([photos, *row], titles) for row in zip(*walks, anchors, strict=True)]
+    write_webp(frames, IMAGES / "first_sight.webp")
+    write_png(layers_picture(models[1], sample.inputs), IMAGES / "anchors.png")
+    for path_ in (IMAGES / "first_sight.webp", IMAGES / "anchors.png"):
+        print(f"{path_.relative_to(ROOT)}: {path_.stat().st_size / 1000:.0f} kB")
+
+
+def layers_picture(model: QueryGaussianModel, views: Views) -> Picture:
+    """The anchors on the first photo: as learned, and after every layer."""
+    prediction = model(views)
+    with qgs.trace(model) as trace:
+        model(views)
+    states = [trace.layers[1].before, *(layer.after for layer in trace.layers.values())]
+    tokens = notable_tokens(model, prediction.gaussians, views.cameras, OUTLINED)
+    colors = {token.query: token.color for token in tokens}
+    photo = enlarged(rgb_picture(views.images[0, 0]), SIDE)
+    pictures = []
+    for state in states:
+        assert state is not None
+        support = model.queries.support(state)
+        assert support is not None
+        pictures.append(support_picture(photo, support, views.cameras[:, :1], colors))
+    titles = ["as learned", *(f"after layer {number}" for number in trace.layers)]
+    return titled(pictures, titles)
+
+
+if __name__ == "__main__":
+    main()
