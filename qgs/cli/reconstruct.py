@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qgs.cli.options import Device, Size, parse_size
+from qgs.cli.options import Checkpoint, Device, Size, parse_size
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def reconstruct(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint file, or the run folder.")],
+    checkpoint: Checkpoint,
     photos: Annotated[
         str, typer.Argument(help="Folder of photos and cameras, chunks or archives, or its URL.")
     ],

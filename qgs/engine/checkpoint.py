@@ -319,7 +319,7 @@ _QUERIES = "queries."
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """Give `model`, freshly built from `recipe`, the weights that `recipe.init_from` names, if any.
 
-    `init_from` is a checkpoint or the folder of a run, relative to the working directory. Queries
+    `init_from` is a checkpoint, the folder of a run, a shipped model or a URL. Queries
     grow or shrink by their own rule (`Queries.resized`) with random numbers of the recipe's seed;
     everything else must have the same names and shapes.
 
@@ -328,9 +328,9 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """
     if recipe.init_from is None:
         return []
-    path = checkpoint_of(Path(recipe.init_from).expanduser())
+    path = checkpoint_of(recipe.init_from)
     learned_by = load_recipe(path)
-    learned = read_tensors(path)
+    learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()

@@ -12,7 +12,13 @@ from torch import Tensor
 from qgs.composer import Recipe, resolve
 from qgs.contracts import WeightLayout
 from qgs.contracts.weights import Shapes
-from qgs.io.checkpoint import CheckpointError, load_recipe, read_tensors, write_checkpoint
+from qgs.io.checkpoint import (
+    CheckpointError,
+    load_extra,
+    load_recipe,
+    read_tensors,
+    write_checkpoint,
+)
 from qgs.io.differences import options_beside_weights, shapes_of
 from qgs.io.files import refuse_existing, replacing, write_text
 from qgs.io.published import (
@@ -110,6 +116,27 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Transfer:
         save_file(published, temporary, {"format": "pt"})
     settings = _settings(recipe, names.layout, shapes_of(published))
     return Transfer(names.layout, recipe, len(published), names.unused, settings)
+
+
+def export_half(checkpoint: str | Path, out: str | Path) -> None:
+    """Write a checkpoint again with its real numbers as float16; all else stays as it is.
+
+    Raises as `export_weights` does, and CheckpointError where float16 cannot hold a weight.
+    """
+    out = _new_safetensors(out)
+    recipe, extra, stored = (
+        load_recipe(checkpoint),
+        load_extra(checkpoint),
+        read_tensors(checkpoint),
+    )
+    halved = {n: t.half() if t.is_floating_point() else t for n, t in stored.items()}
+    broken = [name for name, tensor in halved.items() if not tensor.isfinite().all()]
+    if broken:
+        raise CheckpointError(
+            f"{checkpoint} has weights that float16 cannot hold (infinite, or beyond 65504): "
+            f"{listed(broken)}; ship it as it is"
+        )
+    write_checkpoint(out, halved, recipe.tree, extra)
 
 
 def _new_safetensors(path: str | Path) -> Path:
