@@ -12,6 +12,7 @@ from torch import Tensor
 from qgs.composer import Recipe, resolve
 from qgs.contracts import WeightLayout
 from qgs.contracts.weights import Shapes
+from qgs.data.domain import KEY, trained_domain
 from qgs.io.checkpoint import (
     CheckpointError,
     load_extra,
@@ -121,7 +122,9 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Transfer:
 def export_half(checkpoint: str | Path, out: str | Path) -> None:
     """Write a checkpoint again with its real numbers as float16; all else stays as it is.
 
-    Raises as `export_weights` does, and CheckpointError where float16 cannot hold a weight.
+    Where it does not tell on what views it was trained (`qgs.data.domain`), its data is asked.
+    Raises what opening the data does, as `export_weights` does, and CheckpointError where float16
+    cannot hold a weight.
     """
     out = _new_safetensors(out)
     recipe, extra, stored = (
@@ -136,6 +139,9 @@ def export_half(checkpoint: str | Path, out: str | Path) -> None:
             f"{checkpoint} has weights that float16 cannot hold (infinite, or beyond 65504): "
             f"{listed(broken)}; ship it as it is"
         )
+    if KEY not in extra and ("data",) in recipe.parts:
+        domain = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
+        extra = {**extra, KEY: domain.text}
     write_checkpoint(out, halved, recipe.tree, extra)
 
 
