@@ -13,7 +13,10 @@ from qgs.composer import resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
-OVERLAYS = tuple(f"finetune/dl3dv_{views}views.yaml" for views in (2, 4, 6))
+OVERLAYS = (
+    *(f"finetune/dl3dv_{views}views.yaml" for views in (2, 4, 6)),
+    "rooms/budget_64.yaml",
+)
 """Laid over recipes with data; they say nothing of its type."""
 
 FILES = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))

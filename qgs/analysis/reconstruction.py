@@ -141,6 +141,7 @@ class Reconstruction:
     """Gaussians (1, G) of a sample, and what its cameras see of them.
 
     world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, None without.
+    likeness: how the views lie to those that the model was trained on, in words.
     """
 
     sample: Sample
@@ -149,6 +150,7 @@ class Reconstruction:
     scores: list[ViewScore]
     world: tuple[Tensor, Tensor]
     tuning: Mapping[str, Any] | None = None
+    likeness: str = ""
 
 
 @torch.no_grad()
@@ -236,6 +238,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
         "tuning": reconstruction.tuning,
+        "likeness": reconstruction.likeness,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),

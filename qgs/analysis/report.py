@@ -38,15 +38,18 @@ from qgs.types import Prediction
 
 @dataclass(frozen=True)
 class Contender:
-    """A trained model. scores: means of `Report.columns`. seconds: of training. recipe: YAML."""
+    """A trained model. scores: means of `Report.columns`. recipe: YAML.
+
+    seconds, curves: of its training; None for a model that was trained before.
+    """
 
     name: str
     model: QueryGaussianModel
     scores: Mapping[str, float | None]
     gaussians: int
     parameters: int
-    seconds: float
-    curves: Curves
+    seconds: float | None
+    curves: Curves | None
     recipe: str
 
 
@@ -56,7 +59,7 @@ class Report:
 
     baselines: by name, their scores on the same views. samples: the unseen scenes to picture.
     depths: for each the true depth (T, 1, H, W) of its targets in the model's units, where known.
-    facts: what was run where.
+    facts: what was run where. lede: what it shows, in a sentence or two.
     """
 
     columns: Mapping[str, Column]
@@ -66,6 +69,7 @@ class Report:
     samples: Sequence[Sample]
     depths: Sequence[Tensor | None]
     facts: Mapping[str, str]
+    lede: str = ""
 
 
 SIDE = 256  # pixels on the longer side of pictures that models render for show
@@ -109,7 +113,10 @@ def report_html(report: Report) -> str:
     ]
     environment = page_environment(uri=data_uri, hex=hex_color)
     return environment.get_template("report.html").render(
-        report=report, scenes=scenes, sections=sections
+        report=report,
+        scenes=scenes,
+        sections=sections,
+        timed=all(contender.seconds is not None for contender in report.contenders),
     )
 
 
@@ -249,7 +256,9 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
 
 
 def training_curves(shown: Shown, sample: Sample) -> ReportSection:
-    """Loss and PSNR against seconds for every model."""
-    curves = {contender.name: contender.curves for contender, _ in shown}
+    """Loss and PSNR against seconds for every model that was trained for this."""
+    curves = {contender.name: contender.curves for contender, _ in shown if contender.curves}
+    if not curves:
+        return ReportSection("Training", "", {})
     picture = figure_picture(curves_figure(curves), dpi=144)
     return ReportSection("Training", "", {"": [Tile(picture)]}, width=600)

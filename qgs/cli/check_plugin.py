@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import groupby
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -49,8 +50,26 @@ def check_plugin(
         fix = "list a Config of it in `examples` of the Plugin"
         console.print(f"not checked: {label}: {why}; {fix}")
     console.print(_total(results))
-    if unchecked or any(result.leaves_unchecked or not result.ok for result in results):
+    models = [_model_loads(console, name, file) for name, file in installed.models.items()]
+    if (
+        unchecked
+        or not all(models)
+        or any(result.leaves_unchecked or not result.ok for result in results)
+    ):
         raise SystemExit(1)
+
+
+def _model_loads(console: Console, name: str, file: Path) -> bool:
+    """One line for a model that the plugin ships."""
+    from qgs.io.checkpoint import load
+
+    try:
+        load(file)
+    except (OSError, ValueError) as error:
+        console.print(f"FAILED model {name}: {error}")
+        return False
+    console.print(f"ok     model {name}: {file.stat().st_size / 1e6:.1f} MB")
+    return True
 
 
 def _summarise(console: Console, results: list[CheckResult]) -> None:

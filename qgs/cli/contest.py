@@ -3,7 +3,7 @@
 import os
 import platform
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +22,12 @@ from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
 from qgs.io.ply import write_ply
 from qgs.metrics.baselines import BASELINES
+from qgs.model import QueryGaussianModel
 
 PICTURED_SCENES = 3
-SAME = ("data", "views", "evaluation", "metrics", "optimizer", "training")
-"""Parts of the recipes that must be equal, so that only the models differ."""
+JUDGED = ("data", "views", "evaluation", "metrics")
+TRAINED = ("optimizer", "training")
+"""Parts of recipes that must be equal, so that only the models differ."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,19 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
         raise ValueError(f"recipes are told apart by file name, got {[f.name for f in files]}")
     first = next(iter(recipes))
     for name, recipe in recipes.items():
-        unequal = [part for part in SAME if recipe.tree[part] != recipes[first].tree[part]]
-        if unequal:
-            raise ValueError(
-                f"{name} and {first} differ in {', '.join(unequal)}, so their figures could not be "
-                "compared; make these parts equal, or train them with `qgs train`"
-            )
+        refuse_unequal(name, recipe, first, recipes[first], (*JUDGED, *TRAINED))
     return recipes
+
+
+def refuse_unequal(
+    name: str, recipe: Recipe, other: str, others: Recipe, parts: Sequence[str]
+) -> None:
+    """Raise ValueError where two recipes differ in one of `parts`."""
+    if unequal := [part for part in parts if recipe.tree[part] != others.tree[part]]:
+        raise ValueError(
+            f"{name} and {other} differ in {', '.join(unequal)}, so their figures could not be "
+            "compared; make these parts equal, or take one at a time"
+        )
 
 
 def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry:
@@ -65,14 +73,27 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
+    curves = curves_of(result.folder)
+    return entry_of(name, recipe, evaluation, result.model, result.seconds, curves)
+
+
+def entry_of(
+    name: str,
+    recipe: Recipe,
+    evaluation: Evaluation,
+    model: QueryGaussianModel,
+    seconds: float | None = None,
+    curves: Curves | None = None,
+) -> Entry:
+    """A judged model, which moves to the CPU. seconds, curves: see `Contender`."""
     contender = Contender(
         name=name,
-        model=result.model.cpu(),
+        model=model.cpu(),
         scores=evaluation.means(),
         gaussians=evaluation.gaussians,
-        parameters=sum(p.numel() for p in result.model.parameters()),
-        seconds=result.seconds,
-        curves=curves_of(result.folder),
+        parameters=sum(p.numel() for p in model.parameters()),
+        seconds=seconds,
+        curves=curves,
         recipe=yaml.safe_dump(dict(recipe.tree), sort_keys=False, allow_unicode=True),
     )
     return Entry(recipe, contender, evaluation)
@@ -98,7 +119,8 @@ def table_of(entries: Sequence[Entry]) -> Table:
     table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
     headings = [column.title for column in columns.values()]
-    for heading in (*headings, "Gaussians", "parameters", "seconds"):
+    timed = all(c.seconds is not None for c in rows)
+    for heading in (*headings, "Gaussians", "parameters", *["seconds"] * timed):
         table.add_column(heading, justify="right")
     best = {name: column.best(c.scores[name] for c in rows) for name, column in columns.items()}
     for c in rows:
@@ -107,17 +129,18 @@ def table_of(entries: Sequence[Entry]) -> Table:
             score, cell = c.scores[name], column.shown(c.scores[name])
             is_best = score is not None and score == best[name]
             cells.append(f"[green]{cell}[/green]" if is_best else cell)
-        sizes = (f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M", f"{c.seconds:.0f}")
+        sizes = [f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M"]
+        sizes += [] if c.seconds is None else [f"{c.seconds:.0f}"]
         table.add_row(c.name, *cells, *sizes)
     table.add_section()
     for baseline, scores in baselines(entries[0]).items():
         cells = [column.shown(scores[name]) for name, column in columns.items()]
-        table.add_row(baseline, *cells, *["–"] * 3, style="dim")
+        table.add_row(baseline, *cells, *["–"] * (2 + timed), style="dim")
     return table
 
 
-def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
-    """The comparison, pictured on the first PICTURED_SCENES test scenes."""
+def report_of(entries: Sequence[Entry], title: str, lede: str, facts: Mapping[str, str]) -> Report:
+    """The comparison, pictured on the first PICTURED_SCENES test scenes; facts: more of them."""
     recipe = entries[0].recipe
     few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
     source = recipe.build_data()
@@ -130,7 +153,8 @@ def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
         device = torch.cuda.get_device_name()
     return Report(
         columns=entries[0].evaluation.columns,
-        title=f"{' and '.join(e.contender.name for e in entries)}, {seconds:g} seconds each",
+        title=f"{' and '.join(entry.contender.name for entry in entries)}{title}",
+        lede=lede,
         contenders=[entry.contender for entry in entries],
         baselines=baselines(entries[0]),
         samples=samples,
@@ -138,7 +162,7 @@ def report_of(entries: Sequence[Entry], seconds: float, seed: int) -> Report:
         facts={
             "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
             "Views": f"{recipe.views.inputs} inputs, judged on the views between them",
-            "Budget": f"{seconds:g} seconds of training each, seed {seed}",
+            **facts,
             "Machine": f"{device}, {torch.get_num_threads()} threads, {platform.system()}",
             "Software": ", ".join(f"{name} {version}" for name, version in software.items()),
         },

@@ -1,43 +1,99 @@
-"""`qgs demo`: train recipes side by side, compare them on unseen views, write a report."""
+"""`qgs demo`: trained models on rooms they never saw, or on photos; or a training of two."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-import qgs
 from qgs.cli.options import Device
 
-DEFAULT_RECIPES = ("tokengs.yaml", "locus.yaml")
+if TYPE_CHECKING:
+    from qgs.analysis.report import Report
+    from qgs.cli.contest import Entry
+
+MODELS = ("rooms/tokengs-64", "rooms/locus-64")
+RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
 
 def demo(
-    recipes: Annotated[
-        list[Path] | None, typer.Argument(help="Recipe files to compare; default: the tiny two.")
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[PHOTOS]",
+            help="Folder of your own photos and cameras; with --train, recipe files to compare.",
+        ),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Training time of each recipe.")] = 120,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of every recipe.")] = 0,
+    models: Annotated[
+        list[str] | None,
+        typer.Option("--model", help="Trained model, as in qgs eval; repeatable; default: two."),
+    ] = None,
+    train: Annotated[
+        bool, typer.Option("--train", help="Train and compare recipes instead, the tiny two.")
+    ] = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=1, help="With --train: time of each recipe; default 120.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="With --train: seed of every recipe; default 0.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="New folder for everything; default: demo, demo-2, ...")
     ] = None,
-    folder: Annotated[
-        Path | None, typer.Option("--recipe-folder", help="Folder of the tiny recipes.")
-    ] = None,
     device: Device = "auto",
 ) -> None:
-    """Train the tiny TokenGS and LocusGS on the same rooms, compare them, write report.html."""
-    files = recipes or default_recipes(folder)
-    target = new_folder(out)
+    """Trained models on rooms that none has seen, or on photos of yours; writes report.html.
 
-    from qgs.analysis.report import report_html
+    With --train: the tiny TokenGS and LocusGS, or the recipes that are named, trained on the same
+    rooms and compared.
+    """
+    if train and models:
+        raise ValueError("--model names trained models; leave out --train, or name recipes")
+    if not train and (seconds is not None or seed is not None):
+        raise ValueError("--seconds and --seed are for training: add --train")
+    if not train and len(given or ()) > 1:
+        raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
+    target, console = new_folder(out), Console()
+    if train:
+        _contest(given or RECIPES, 120 if seconds is None else seconds, seed or 0, target, device)
+    else:
+        _show_trained(models or MODELS, given[0] if given else None, target, console, device)
+
+
+def _show_trained(
+    models: Sequence[str], photos: str | None, target: Path, console: Console, device: str
+) -> None:
+    from qgs.cli import contest, trained
+
+    console.print("Reconstructing scenes that no model has seen", style="dim")
+    try:
+        entries = trained.judge(models, photos, device)
+    except FileNotFoundError as error:
+        error.add_note("without trained models: qgs demo --train, which takes some minutes")
+        raise
+    lede = "These trained models come with qgs, and none has seen the scenes below."
+    if photos is not None:
+        lede = "Trained models on your photos, judged on those between their inputs."
+    report = contest.report_of(entries, " on your photos" if photos else "", lede, {})
+    console.print(contest.table_of(entries))
+    if photos is not None:
+        told = trained.likeness(models, report.samples)
+        report = replace(report, facts={**report.facts, "Likeness": "; ".join(told)})
+        console.print("\n".join(told), soft_wrap=True, highlight=False, markup=False)
+    _write(report, entries, target, console)
+
+
+def _contest(recipes: Sequence[str], seconds: float, seed: int, target: Path, device: str) -> None:
     from qgs.cli import contest
     from qgs.engine.guard import TrainingError
-    from qgs.io.files import write_text
 
     console = Console()
-    resolved = contest.resolve_fairly(files, seconds, seed)
+    resolved = contest.resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
     entries = []
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
@@ -47,32 +103,32 @@ def demo(
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
     console.print(contest.table_of(entries))
+    facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}
+    lede = (
+        "Every model below was trained by the same command on the same scenes and is judged on "
+        "scenes that it never saw."
+    )
+    report = contest.report_of(entries, f", {seconds:g} seconds each", lede, facts)
+    _write(report, entries, target, console)
+
+
+def _write(report: Report, entries: Sequence[Entry], target: Path, console: Console) -> None:
+    """The report and an example of every model, and where they are."""
+    from qgs.analysis.report import report_html
+    from qgs.cli import contest
+    from qgs.io.files import write_text
+
     console.print("Writing the report", style="dim")
-    report = contest.report_of(entries, seconds, seed)
     page = target / "report.html"
     write_text(page, report_html(report))
     contest.write_examples(report, target)
     console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)
     for entry in entries:
         run = target / entry.contender.name
-        console.print(f"{run.name}: {run}/checkpoint.safetensors, {run}/example.ply")
-
-
-def default_recipes(folder: Path | None) -> list[Path]:
-    """The tiny recipes in `folder`, else in ./recipes/tiny, else in the clone that qgs runs from.
-
-    Raises FileNotFoundError that names every place where they were looked for.
-    """
-    clone = Path(qgs.__file__).parents[1]
-    places = [folder] if folder else [Path("recipes/tiny"), clone / "recipes" / "tiny"]
-    for place in places:
-        files = [place / name for name in DEFAULT_RECIPES]
-        if all(file.is_file() for file in files):
-            return files
-    raise FileNotFoundError(
-        f"found no {' and '.join(DEFAULT_RECIPES)} in {', '.join(map(str, places))}; run this in a "
-        "clone of the repository, or give --recipe-folder FOLDER or the recipe files themselves"
-    )
+        files = [f"{run}/example.ply"]
+        if entry.contender.seconds is not None:
+            files.insert(0, f"{run}/checkpoint.safetensors")
+        console.print(f"{run.name}: {', '.join(files)}")
 
 
 def new_folder(out: Path | None) -> Path:

@@ -22,8 +22,11 @@ if TYPE_CHECKING:
 
 def evaluate(
     runs: Annotated[
-        list[Path],
-        typer.Argument(metavar="RUN", help="Run folder or checkpoint; several with --compare."),
+        list[str],
+        typer.Argument(
+            metavar="RUN",
+            help="Run folder, checkpoint, its URL, or a shipped model; several with --compare.",
+        ),
     ],
     overrides: Overrides = None,
     index: Annotated[
@@ -35,7 +38,10 @@ def evaluate(
     batch: Annotated[int, typer.Option(min=1, help="Scenes passed through the model at once.")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings."),
+        typer.Option(
+            help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings; "
+            "evaluation_NAME here for a shipped model or a URL."
+        ),
     ] = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Compare the first RUN's results with the others'.")
@@ -71,6 +77,7 @@ def evaluate(
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
     from qgs.io.checkpoint import load, load_extra, load_recipe
+    from qgs.io.models import is_own_path
 
     use_threads(threads)
     for setting in settings:
@@ -84,7 +91,7 @@ def evaluate(
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
-    folder = out or evaluation_folder(checkpoint, bool(settings))
+    folder = out or evaluation_folder(checkpoint, bool(settings), is_own_path(runs[0]))
     step = load_extra(checkpoint).get("step")
     evaluation = evaluate_into(model, recipe, int(step) if step else None, folder, console, batch)
     run = RunFolder(checkpoint.parent)
@@ -96,7 +103,7 @@ def evaluate(
 
 
 def _compare(
-    runs: list[Path], across: bool, out: Path | None, idle: list[str], console: Console
+    runs: list[str], across: bool, out: Path | None, idle: list[str], console: Console
 ) -> None:
     """Show the results in `runs` side by side. Raises ValueError for `idle` options."""
     if idle:
@@ -115,14 +122,17 @@ def _compare(
     console.print(end, soft_wrap=True)
 
 
-def evaluation_folder(checkpoint: Path, other: bool) -> Path:
+def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
     """RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema, ...
 
-    For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ...
+    For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ... A
+    checkpoint that is not the user's `own` is judged into the working directory, and nothing there
+    is used again.
     """
+    checkpoint = checkpoint if own else Path(checkpoint.name)
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")
     folder = checkpoint.with_name(f"evaluation_{label}" if label else "evaluation")
-    if not other:
+    if not other and (own or not folder.exists()):
         return folder
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in count(2))
     return next(folder for folder in numbered if not folder.exists())

@@ -13,10 +13,12 @@ from qgs.cli.options import Overrides
 def list_components(
     name: Annotated[
         str | None,
-        typer.Argument(help="A slot, a component such as qgs/latent, or a section of settings."),
+        typer.Argument(
+            help="A slot, a component such as qgs/latent, a trained model, a section of settings."
+        ),
     ] = None,
 ) -> None:
-    """Installed components by slot; with NAME all options and what they mean."""
+    """Installed components by slot, and trained models; with NAME all options and meanings."""
     from qgs.cli.listing import details, overview
     from qgs.composer.registry import load_sound_plugins
 
@@ -25,6 +27,12 @@ def list_components(
         Console().print(part, highlight=False)
     for message in broken:
         Console(stderr=True).print(f"plugin left out: {message}", markup=False)
+    for installed in registry.plugins.values():
+        for model, file in installed.models.items():
+            if not file.is_file():
+                fix = f"install {installed.released_as} again"
+                message = f"the file of the model {model} is missing: {file}; {fix}"
+                Console(stderr=True).print(message, markup=False, soft_wrap=True)
 
 
 def compose(

@@ -1,6 +1,7 @@
 """What `qgs list` shows: installed components, and every option with its meaning."""
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from rich.console import Group
@@ -13,7 +14,7 @@ from qgs.composer.registry import Registry, default_config
 from qgs.composer.schema import recipe_schema
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
 from qgs.composer.yaml_text import inline
-from qgs.contracts import Component
+from qgs.contracts import Component, ShippedModel
 
 Schema = Mapping[str, Any]
 
@@ -32,10 +33,28 @@ def overview(registry: Registry) -> Iterator[Table]:
         for kind, schema in _by_type(definitions[name]).items():
             table.add_row(*map(escape, (kind, schema["description"], _release(kind, registry))))
         yield table
+    table = Table("name", "meaning", "origin", title="trained models", title_justify="left")
+    table.columns[1].overflow = "fold"
+    for name, (model, file, release) in _models(registry).items():
+        gone = "" if file.is_file() else " (its file is missing)"
+        table.add_row(*map(escape, (name, model.summary + gone, release)))
+    if table.row_count:
+        yield table
+
+
+def _models(registry: Registry) -> dict[str, tuple[ShippedModel, Path, str]]:
+    """By PLUGIN/NAME: every shipped model, its file, and what it came with."""
+    return {
+        f"{plugin}/{name}": (model, installed.models[f"{plugin}/{name}"], installed.released_as)
+        for plugin, installed in registry.plugins.items()
+        for name, model in installed.plugin.models.items()
+    }
 
 
 def details(name: str, registry: Registry) -> Iterator[Group]:
     """The options of a component (`qgs/latent`), of all in a slot, or of a section of settings.
+
+    Of a trained model what it is and its file.
 
     `recipe` stands for the settings at the top of a recipe. Raises ValueError for other names.
     """
@@ -48,6 +67,12 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
         about = schema.get("description", "")
         yield Group(f"[bold]{name}[/bold]", escape(about), _options(options))
         return
+    if name in (models := _models(registry)):
+        model, file, release = models[name]
+        there = f"{file.stat().st_size / 1e6:.1f} MB" if file.is_file() else "MISSING"
+        yield Group(f"[bold]{name}[/bold], {escape(release)}", escape(model.summary))
+        yield Group(escape(f"{file}: {there}"))
+        return
     slot = name.removeprefix("model.").removeprefix("decoder.")
     shown = [
         (place, kind, component)
@@ -56,7 +81,7 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
         if name == kind or slot == place
     ]
     if not shown:
-        known = [*SLOTS, *settings, *(k for place in SLOTS for k in registry.components(place))]
+        known = [*SLOTS, *settings, *models, *(k for p in SLOTS for k in registry.components(p))]
         raise ValueError(
             f"there is no slot, component or section `{name}`; {did_you_mean(name, known, 'names')}"
         )

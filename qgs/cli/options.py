@@ -5,6 +5,9 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+Checkpoint: TypeAlias = Annotated[
+    str, typer.Argument(help="Run folder, checkpoint, its URL, or a shipped model: PLUGIN/NAME.")
+]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override, such as model.queries.count=128; repeatable."),

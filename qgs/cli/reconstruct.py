@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from qgs.cli.options import Device, Size, parse_size
+from qgs.cli.options import Checkpoint, Device, Size, parse_size
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def reconstruct(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint file, or the run folder.")],
+    checkpoint: Checkpoint,
     photos: Annotated[
         str, typer.Argument(help="Folder of photos and cameras, chunks or archives, or its URL.")
     ],
@@ -66,11 +66,12 @@ def reconstruct(
     from qgs.analysis.reconstruction import choose_sample, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.composer.registry import load_sound_plugins
+    from qgs.data.domain import KEY, Domain, verdict
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.engine.tuning import tune as fit
     from qgs.engine.tuning import tuning_loss
-    from qgs.io.checkpoint import load, load_recipe
+    from qgs.io.checkpoint import load, load_extra, load_recipe
 
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
@@ -91,7 +92,12 @@ def reconstruct(
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, gaussians, record)
+    found = Domain()
+    found.see(sample.inputs.cameras, sample.targets.cameras)
+    sentence = verdict(load_extra(file).get(KEY), found)
+    result = replace(result, likeness=sentence)
     console.print(score_table(result))
+    console.print(sentence, soft_wrap=True, highlight=False)
     for path in write_reconstruction(model, result, out):
         console.print(f"wrote {path}", soft_wrap=True)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from qgs.cli.options import Overrides
+from qgs.cli.options import Checkpoint, Overrides
 
 
 class Layout(StrEnum):
@@ -56,14 +56,25 @@ def import_(
 
 
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint, or the folder of a run.")],
+    checkpoint: Checkpoint,
     out: Annotated[Path, typer.Option(help="New .safetensors file; never overwritten.")],
-    layout: Annotated[Layout, typer.Option(help="Whose names the weights get.")],
+    layout: Annotated[
+        Layout | None, typer.Option(help="Whose names the weights get; a file for other code.")
+    ] = None,
+    half: Annotated[
+        bool, typer.Option("--half", help="A checkpoint with weights of half precision.")
+    ] = False,
 ) -> None:
-    """Write a checkpoint's weights as the published code names them."""
+    """Write a checkpoint's weights as the published code names them, or at half the size."""
     from qgs.engine.folder import checkpoint_of
-    from qgs.io.transfer import export_weights
+    from qgs.io.transfer import export_half, export_weights
 
+    if half == (layout is not None):
+        raise ValueError("give one of --layout published and --half")
+    if half:
+        export_half(checkpoint_of(checkpoint), out)
+        typer.echo(f"wrote {out}: {out.stat().st_size / 1e6:.1f} MB; qgs.load gives float32")
+        return
     done = export_weights(checkpoint_of(checkpoint), out)
     name = done.layout.name
     lines = [f"{name} ({done.layout.source}): {done.count} tensors written"]

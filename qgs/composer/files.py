@@ -6,6 +6,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import qgs
 from qgs.composer.errors import Problems, nearest
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, Node, Origin, from_plain
 from qgs.composer.slots import type_at
@@ -39,10 +40,30 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     return merged
 
 
+def recipe_folder() -> Path:
+    """The recipes that come with qgs: in its wheel, else in the repository that it runs from."""
+    package = Path(qgs.__file__).parent
+    inside = package / "recipes"
+    return inside if inside.is_dir() else package.parent / "recipes"
+
+
+def found_recipe(file: Path, name: str | Path) -> Path:
+    """`file` where it exists, else the recipe called `name`, if there is one, of `recipe_folder`.
+
+    name: such as tiny/locus.yaml, or recipes/tiny/locus.yaml.
+    """
+    home = recipe_folder()
+    for folder in (home, home.parent):
+        shipped = Path(os.path.normpath(folder / name))
+        if not file.exists() and shipped.is_relative_to(home) and shipped.is_file():
+            return shipped
+    return file
+
+
 def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
     """The merged tree of `recipe`, without its `extends`."""
     if not isinstance(recipe, Mapping):
-        return _read_file(Path(recipe), (), None, problems)
+        return _read_file(found_recipe(Path(recipe), recipe), (), None, problems)
     origin = Origin("<mapping>")
     try:
         node = from_plain(recipe, origin)
@@ -70,7 +91,11 @@ def _read_file(
             stems = [path.stem for path in file.parent.glob("*.yaml") if path not in chain]
             near = nearest(file.stem, stems)
             reason = f"{file} does not exist"
-            fix = f"did you mean `{file.parent / near}.yaml`?" if near else "check the path"
+            fix = (
+                f"did you mean `{file.parent / near}.yaml`?"
+                if near
+                else "check the path, or take one of `qgs recipes`"
+            )
         if extended_at:
             home = "the file it stands in" if chain else "the working directory"
             fix += f" (`extends` is relative to {home})"
@@ -94,7 +119,7 @@ def _with_bases(
             fix = "write `extends: base.yaml`, relative to this file"
             problems.stop(at, "extends", reason, fix)
             continue
-        file = Path(os.path.normpath(folder / name))
+        file = found_recipe(Path(os.path.normpath(folder / name)), name)
         visited = [path.resolve() for path in chain]
         if file.resolve() not in visited:
             layers.append(_read_file(file, chain, origin, problems))

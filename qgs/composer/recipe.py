@@ -80,8 +80,9 @@ def resolve(
 ) -> Recipe:
     """Read, merge and check a recipe.
 
-    recipe: path of a YAML file, or a mapping of the same form, whose `extends` is relative to the
-        working directory. overrides: such as "model.queries.count=128", laid over it in order.
+    recipe: path of a YAML file, else the name of one that comes with qgs (tiny/locus.yaml); or a
+        mapping of the same form, whose `extends` is relative to the working directory.
+    overrides: such as "model.queries.count=128", laid over it in order.
     plugins: what it may name besides the installed plugins, such as one under test.
     Raises RecipeError with every problem that was found.
     """

@@ -23,7 +23,7 @@ from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
 from qgs.composer.slots import SLOTS
 from qgs.contracts import Component, ComponentConfig, Metric, OptionError, Renderer, WeightLayout
-from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
+from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin, ShippedModel
 
 BUILTIN = Plugin(
     name="qgs",
@@ -55,18 +55,25 @@ class PluginError(OptionError):
 class InstalledPlugin:
     """A sound plugin and its distribution, "" for none.
 
-    editable: installed by its author, with `pip -e`.
+    editable: installed by its author, with `pip -e`. folder: of the module that holds the Plugin.
     """
 
     plugin: Plugin
     distribution: str = ""
     version: str = "0"
     editable: bool = False
+    folder: Path = Path()
 
     @property
     def released_as(self) -> str:
         """Name and version of the distribution, as messages give them; "" for none."""
         return f"{self.distribution} {self.version}" if self.distribution else ""
+
+    @property
+    def models(self) -> dict[str, Path]:
+        """`PLUGIN/NAME` of every model that it ships to its file, which may be missing."""
+        models = self.plugin.models.items()
+        return {f"{self.plugin.name}/{name}": self.folder / model.file for name, model in models}
 
     def repair(self, place: str) -> str:
         """What its user can do about a fault. place: FILE:LINE of it."""
@@ -192,7 +199,12 @@ def load_plugin(name: str) -> InstalledPlugin:
         newer = type(version) is int and version > CONTRACT_VERSION
         fix = "update qgs" if newer else installed.repair(f"`{entry.value}`")
         raise PluginError(f"{named} {fault}", f"{fix}, or do without the plugin")
-    return replace(installed, plugin=plugin)
+    return replace(installed, plugin=plugin, folder=_folder_of(entry.module))
+
+
+def _folder_of(module: str) -> Path:
+    file = sys.modules[module].__file__
+    return Path(file).parent if file else Path()
 
 
 def _release(entry: EntryPoint) -> str:
@@ -219,10 +231,16 @@ def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
             comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
             yield f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}"
             return
-    if not plugin.components and not plugin.layouts:
-        yield "is empty: it lists neither `components` nor `layouts`"
-    if not isinstance(plugin.exemptions, Mapping):
-        yield f"must give `exemptions` as a mapping, not {plugin.exemptions!r}"
+    for attribute in ("models", "exemptions"):
+        value = getattr(plugin, attribute)
+        if not isinstance(value, Mapping):
+            yield f"must give `{attribute}` as a mapping, not {value!r}"
+            return
+    if not plugin.components and not plugin.layouts and not plugin.models:
+        yield "is empty: it lists no `components`, `layouts` or `models`"
+    for name, model in plugin.models.items():
+        if not isinstance(model, ShippedModel) or not re.fullmatch(r"[^\s/]+", str(name)):
+            yield f"ships {name!r}: {model!r}; models are ShippedModel by names without / and blank"
     taken: set[tuple[str, str]] = set()
     for component in plugin.components:
         fault = component_fault(component)

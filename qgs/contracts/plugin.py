@@ -30,6 +30,18 @@ Expected: TypeAlias = str | ExpectedError
 
 
 @dataclass(frozen=True)
+class ShippedModel:
+    """A trained model that travels with a plugin.
+
+    file: the checkpoint, relative to the folder of the module that the entry point names, such as
+    models/mine.safetensors. summary: what it was trained on and for, in a sentence.
+    """
+
+    file: str
+    summary: str
+
+
+@dataclass(frozen=True)
 class Plugin:
     """Components under one name. Importing it has no side effect.
 
@@ -38,6 +50,7 @@ class Plugin:
     components: component classes; a `name` is unique within its slot.
     layouts: weights that other codebases publish and these components can load.
     examples: options that `qgs check-plugin` tries besides the defaults of every component.
+    models: trained models by name; PLUGIN/NAME stands for the checkpoint's path in every command.
     exemptions: checks of `qgs.testing` that a component is known to fail, and why; by class, or by
         options where it passes with others.
     """
@@ -47,6 +60,7 @@ class Plugin:
     components: Sequence[type[Component]]
     layouts: Sequence[WeightLayout] = ()
     examples: Sequence[ComponentConfig] = ()
+    models: Mapping[str, ShippedModel] = field(default_factory=dict)
     exemptions: Mapping[type[Component] | ComponentConfig, Mapping[str, Expected]] = field(
         default_factory=dict
     )

@@ -18,7 +18,7 @@ _PROTOCOLS = {  # the packages that file systems of fsspec need: the protocols t
     "s3fs": ("s3", "s3a"),
     "gcsfs": ("gs", "gcs"),
     "adlfs": ("az", "abfs", "abfss"),
-    "huggingface_hub": ("hf",),
+    '"query-gaussians[hub]"': ("hf",),
     "paramiko": ("sftp", "ssh"),
     "smbprotocol": ("smb",),
     "webdav4": ("webdav",),

@@ -3,7 +3,7 @@
 import json
 import os
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -18,10 +18,13 @@ import qgs
 from qgs.composer import Recipe, resolve
 from qgs.composer.recipe import flat
 from qgs.composer.slots import with_moved
+from qgs.data.domain import KEY, SAMPLES, Domain
+from qgs.data.sampling import Batch
 from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.io.checkpoint import (
     CheckpointError,
+    load_extra,
     load_recipe,
     load_weights,
     opened_tensors,
@@ -107,6 +110,7 @@ class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
     parts: everything that continues the run, by name; checkpoints hold "weights" and "ema".
+    domain: of the first samples of the training, which checkpoints tell too.
     Each file appears whole or not at all; the state, complete by itself, comes last. All processes
     must call each method together.
     """
@@ -116,6 +120,13 @@ class Saver:
     ) -> None:
         self._accelerator, self.folder, self.model = accelerator, folder, model
         self.parts: dict[str, Stateful] = {"weights": Weights(model)}
+        self.domain = Domain()
+
+    def see(self, batches: Sequence[Batch]) -> None:
+        """Count the cameras of a step's batches into `domain`, until it has enough."""
+        for batch in batches:
+            if self.domain.samples < SAMPLES:
+                self.domain.see(batch.inputs.cameras, batch.targets.cameras)
 
     def save(self, step: int, state_only: bool = False) -> None:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
@@ -124,7 +135,7 @@ class Saver:
             if not state_only:
                 if not self.folder.state.exists():
                     self._write_state(parts)  # a checkpoint alone cannot be continued
-                extra = {"step": str(step)}
+                extra = self._extra(step)
                 save(self.model, self.folder.checkpoint, extra=extra, weights=parts["weights"])
                 if "ema" in parts:
                     save(self.model, self.folder.checkpoint_ema, extra=extra, weights=parts["ema"])
@@ -134,7 +145,7 @@ class Saver:
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
         """Save a checkpoint of other weights than the present ones."""
         if self._accelerator.is_main_process:
-            save(self.model, self.folder.checkpoint, extra={"step": str(step)}, weights=weights)
+            save(self.model, self.folder.checkpoint, extra=self._extra(step), weights=weights)
         self._accelerator.wait_for_everyone()
 
     def whole_model(self) -> QueryGaussianModel:
@@ -156,6 +167,12 @@ class Saver:
             )
         for name, part in self.parts.items():
             part.load_state(saved.parts[name])
+        if self.folder.checkpoint.is_file():
+            known = load_extra(self.folder.checkpoint).get(KEY)
+            self.domain = Domain.read(known) if known else Domain()
+
+    def _extra(self, step: int) -> dict[str, str]:
+        return {"step": str(step), KEY: self.domain.text}
 
     def _write_state(self, parts: Mapping[str, State]) -> None:
         self.folder.flush(to_disk=True)
@@ -319,7 +336,7 @@ _QUERIES = "queries."
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """Give `model`, freshly built from `recipe`, the weights that `recipe.init_from` names, if any.
 
-    `init_from` is a checkpoint or the folder of a run, relative to the working directory. Queries
+    `init_from` is a checkpoint, the folder of a run, a shipped model or a URL. Queries
     grow or shrink by their own rule (`Queries.resized`) with random numbers of the recipe's seed;
     everything else must have the same names and shapes.
 
@@ -328,9 +345,9 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """
     if recipe.init_from is None:
         return []
-    path = checkpoint_of(Path(recipe.init_from).expanduser())
+    path = checkpoint_of(recipe.init_from)
     learned_by = load_recipe(path)
-    learned = read_tensors(path)
+    learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TextIO
 
 from qgs.io.files import is_leftover, read_records, write_text
+from qgs.io.models import checkpoint_path
 
 
 class RunFolder:
@@ -108,11 +109,13 @@ class RunFolder:
         self._history = self._lock = None
 
 
-def checkpoint_of(path: str | Path) -> Path:
-    """The checkpoint of `path`, a run folder or the file itself; raises FileNotFoundError."""
-    file = RunFolder(path).checkpoint if Path(path).is_dir() else Path(path)
+def checkpoint_of(name: str | Path) -> Path:
+    """The checkpoint of a run folder, or what `checkpoint_path` finds; raises as that does."""
+    path = checkpoint_path(name)
+    file = RunFolder(path).checkpoint if path.is_dir() else path
     if not file.is_file():
         raise FileNotFoundError(
-            f"no checkpoint at {file}; give a run folder of `qgs train` or a .safetensors file"
+            f"no checkpoint at {file}; give a run folder of `qgs train`, a .safetensors file, its "
+            "URL, or PLUGIN/NAME of a model that `qgs list` shows"
         )
     return file

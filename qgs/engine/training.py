@@ -220,6 +220,7 @@ class Trainer:
                 if self.average:
                     self.average.update()
                 self.guard.passed(numbers)
+            self.saver.see(batches)
             self.step += 1
             self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
             self._tick()

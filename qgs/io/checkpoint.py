@@ -21,6 +21,7 @@ from qgs.composer.slots import with_moved
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, shapes_of
 from qgs.io.files import replacing
+from qgs.io.models import checkpoint_path
 from qgs.model import QueryGaussianModel
 
 FORMAT_VERSION = 2
@@ -142,9 +143,12 @@ def load(
 ) -> QueryGaussianModel:
     """Rebuild the model that `save` wrote, on `device` (default: CPU), in evaluation mode.
 
+    path: also PLUGIN/NAME of a shipped model, or a URL, see `checkpoint_path`. Weights of half
+    precision become float32.
     Raises FileNotFoundError, or CheckpointError, which names the releases that wrote the file
     where a plugin is missing or another release of it cannot stand for it.
     """
+    path = checkpoint_path(path)
     model = load_recipe(path).build_model()
     load_weights(model, read_tensors(path), str(path))
     return (model if device is None else model.to(device)).eval()
@@ -204,7 +208,10 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
 
 def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
     if not Path(path).is_file():
-        raise FileNotFoundError(f"no checkpoint at {path}")
+        raise FileNotFoundError(
+            f"no checkpoint at {path}; give a .safetensors file, its URL, or PLUGIN/NAME of a "
+            "trained model that `qgs list` shows"
+        )
     kind = pickle_kind(path)
     if kind:
         raise CheckpointError(

@@ -1,0 +1,77 @@
+"""`qgs recipes`: the recipes that come with qgs, and copies of them to change."""
+
+from collections.abc import Iterator
+from itertools import takewhile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def recipes(
+    name: Annotated[
+        str | None, typer.Argument(help="One of them, such as tiny/locus.yaml; shows its text.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to copy it to, with what it extends; never overwrites."),
+    ] = None,
+) -> None:
+    """The recipes that come with qgs; every command takes their names.
+
+    A file of that name in the working directory comes first.
+    """
+    from qgs.composer.errors import did_you_mean
+    from qgs.composer.files import recipe_folder
+
+    home = recipe_folder()
+    known = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
+    if name is None and out is None:
+        width = max(map(len, known), default=0)
+        for label, path in known.items():
+            typer.echo(f"{label:<{width}}  {_first_comment(path)}".rstrip())
+        return
+    if name not in known:
+        hint = did_you_mean(name, known, "recipes") if name else "give its name before --out"
+        raise ValueError(f"there is no recipe `{name}` in {home}; {hint}" if name else hint)
+    if out is None:
+        typer.echo(known[name].read_text(encoding="utf-8"), nl=False)
+        return
+    copies = {out / path.relative_to(home): path for path in _with_bases(known[name])}
+    _copy(copies)
+
+
+def _first_comment(path: Path) -> str:
+    """The first sentence of the comment that a recipe begins with."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comment = takewhile(lambda line: line.startswith("#"), lines)
+    return " ".join(line.lstrip("# ") for line in comment).partition(". ")[0].rstrip(".")
+
+
+def _with_bases(path: Path) -> Iterator[Path]:
+    """A recipe and the files that it extends, each once."""
+    import yaml
+
+    from qgs.composer.files import found_recipe
+
+    seen, waiting = set[Path](), [path]
+    while waiting:
+        file = waiting.pop()
+        if file in seen:
+            continue
+        seen.add(file)
+        yield file
+        bases = yaml.safe_load(file.read_text(encoding="utf-8")).get("extends") or []
+        names = [bases] if isinstance(bases, str) else bases
+        waiting += [found_recipe((file.parent / name).resolve(), name).resolve() for name in names]
+
+
+def _copy(copies: dict[Path, Path]) -> None:
+    """Copy files, by their targets; all of them or, where something lies, none."""
+    from qgs.io.files import refuse_existing, write_text
+
+    for target in copies:
+        refuse_existing(target)
+    for target, path in copies.items():
+        write_text(target, path.read_text(encoding="utf-8"))
+        typer.echo(f"wrote {target}")

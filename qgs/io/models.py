@@ -1,0 +1,85 @@
+"""Checkpoints by name: a path, a model that an installed plugin ships, or any URL of fsspec."""
+
+import hashlib
+import os
+import shutil
+import sys
+from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
+
+from safetensors import safe_open
+
+from qgs import DISTRIBUTIONS
+from qgs.composer.errors import did_you_mean
+from qgs.composer.registry import available_plugins, load_plugin
+from qgs.contracts.plugin import ENTRY_POINT_GROUP
+from qgs.data.paths import opened_path
+from qgs.io.files import replacing
+
+
+def checkpoint_path(name: str | os.PathLike[str]) -> Path:
+    """The local path that `name` stands for; anything that exists under that name comes first.
+
+    name: a path, PLUGIN/NAME of a model that an installed plugin ships (`qgs list`), or a URL that
+    fsspec opens, whose file is kept in `cache_folder` and its SHA-256 told on standard error.
+    Raises FileNotFoundError for a model that a plugin does not ship, PluginError for a plugin that
+    cannot be used, OSError for a download that fails; a path that does not exist is returned.
+    """
+    text = os.fspath(name)
+    path = Path(text).expanduser()
+    if path.exists():
+        return path
+    if "://" in text:
+        return _downloaded(text)
+    plugin, slash, model = text.partition("/")
+    known = available_plugins().keys() | DISTRIBUTIONS[ENTRY_POINT_GROUP].keys()
+    if plugin not in known or not slash or "/" in model or path.suffix:
+        return path
+    installed = load_plugin(plugin)
+    if text not in installed.models:
+        hint = did_you_mean(text, installed.models, "models") if installed.models else "it has none"
+        raise FileNotFoundError(
+            f"there is no file {text}, and {installed.released_as} ships no model of that name; "
+            f"{hint}"
+        )
+    file = installed.models[text]
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"{installed.released_as} should ship the model {text}, but {file} is not there; "
+            f"install {installed.released_as} again"
+        )
+    return file
+
+
+def is_own_path(name: str | os.PathLike[str]) -> bool:
+    """Whether `name` is a path of the user's, so that results may be written beside it."""
+    return Path(name).expanduser().exists()
+
+
+def cache_folder() -> Path:
+    """Where downloaded checkpoints are kept: the environment's QGS_CACHE, else ~/.cache/qgs."""
+    return Path(os.environ.get("QGS_CACHE") or "~/.cache/qgs").expanduser()
+
+
+def _downloaded(url: str) -> Path:
+    """The file of a URL, downloaded unless it was before; only a whole safetensors file is kept."""
+    source = opened_path(url)
+    key = hashlib.sha256(url.encode()).hexdigest()[:16]
+    file = cache_folder() / key / (PurePosixPath(urlsplit(url).path).name or "checkpoint")
+    if not file.is_file():
+        try:
+            with replacing(file) as temporary:
+                with source.open("rb") as remote, temporary.open("wb") as local:
+                    shutil.copyfileobj(remote, local, 2**20)
+                with safe_open(temporary, "pt"):
+                    pass  # its header tells the size, so one that is cut off is refused
+        except Exception as error:  # whatever the file system of the URL raises
+            reason = str(error) or type(error).__name__
+            raise OSError(
+                f"{url} could not be downloaded as a whole safetensors file ({reason}); nothing of "
+                "it was kept. Check the URL and the connection, then try again"
+            ) from error
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    print(f"{url}: sha256 {digest}, kept as {file}", file=sys.stderr)
+    return file

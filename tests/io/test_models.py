@@ -1,0 +1,148 @@
+"""Models by name: those that plugins ship, and those at URLs."""
+
+import hashlib
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from commands import MODEL, run_qgs
+from safetensors.torch import load_file
+from upath import UPath
+
+import qgs
+from qgs.composer import resolve
+from qgs.composer.registry import load_sound_plugins
+from qgs.engine.checkpoint import initialise
+from qgs.io.checkpoint import load_extra, save
+from qgs.io.models import checkpoint_path
+from qgs.io.transfer import export_half
+
+RECIPE = {
+    "recipe": 1,
+    "model": MODEL,
+    "plugins": ["rooms"],
+    "data": {"type": "rooms/procedural", "image_size": [16, 16], "test_scenes": 2},
+    "views": {"inputs": 2, "targets": 2, "gap": [2, 4]},
+}
+PLUGIN = """
+from qgs.contracts import Plugin, ShippedModel
+plugin = Plugin("box", 1, (), models={
+    "small": ShippedModel("models/small.safetensors", "Tiny rooms."),
+    "gone": ShippedModel("models/gone.safetensors", "Lost on the way."),
+})
+"""
+
+
+@pytest.fixture
+def shipped(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file of the model box/small; the working directory is empty."""
+    install("qgs-box", "box", PLUGIN)
+    file = Path(sys.path[0]) / "models" / "small.safetensors"
+    save(qgs.compose(RECIPE), file, extra={"step": "7"})
+    monkeypatch.chdir(tmp_path)
+    return file
+
+
+def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped: Path) -> None:
+    assert checkpoint_path("box/small") == shipped
+    assert qgs.load("box/small").recipe == qgs.load(shipped).recipe
+    result = run_qgs("eval", "box/small")
+    assert result.exit_code == 0, result.output
+    assert Path("evaluation_small/summary.json").is_file()
+    run_qgs("eval", "box/small")
+    assert Path("evaluation_small-2/summary.json").is_file()
+    assert sorted(path.name for path in shipped.parent.iterdir()) == ["small.safetensors"]
+    started = resolve({**RECIPE, "init_from": "box/small"})
+    assert "weights start from" in initialise(started.build_model(), started)[0]
+
+
+def test_an_existing_file_of_that_name_wins(shipped: Path) -> None:
+    Path("box").mkdir()
+    Path("box/small").write_bytes(shipped.read_bytes())
+    assert checkpoint_path("box/small") == Path("box/small")
+
+
+def test_what_is_not_there_is_told(shipped: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="ships no model of that name; did you mean `box/s"):
+        qgs.load("box/smal")
+    with pytest.raises(
+        FileNotFoundError, match=r"qgs-box 1\.2 should ship the model box/gone, but"
+    ):
+        qgs.load("box/gone")
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint at runs/mine; give .* PLUGIN/NAME"):
+        qgs.load("runs/mine")
+
+
+def test_models_are_listed_and_checked(shipped: Path) -> None:
+    result = run_qgs("list")
+    assert "box/small" in result.stdout
+    assert "the file of the model box/gone is missing:" in result.stderr
+    assert f"{shipped}: 0.1 MB" in run_qgs("list", "box/small").output.replace("\n", "")
+    checked = run_qgs("check-plugin", "box", "--core")
+    assert checked.exit_code == 1
+    assert "ok     model box/small" in checked.output
+    assert "FAILED model box/gone: no checkpoint at" in checked.output
+
+
+@pytest.mark.parametrize("models", ["['a']", "{'a/b': ShippedModel('f', '')}", "{'a': 'file'}"])
+def test_models_of_another_form_are_refused(install, models: str) -> None:
+    source = "from qgs.contracts import Plugin, ShippedModel\n"
+    install("qgs-bad", "bad", f"{source}plugin = Plugin('bad', 1, (), models={models})")
+    assert any("models" in message for message in load_sound_plugins()[1])
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("QGS_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_a_url_is_downloaded_once_and_its_hash_told(
+    shipped: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    remote = UPath("memory://models/a.safetensors")
+    remote.write_bytes(shipped.read_bytes())
+    digest = hashlib.sha256(shipped.read_bytes()).hexdigest()
+    assert qgs.load(str(remote)).recipe == qgs.load(shipped).recipe
+    assert f"memory://models/a.safetensors: sha256 {digest}, kept as" in capsys.readouterr().err
+    remote.unlink()
+    assert qgs.load(str(remote)).recipe == qgs.load(shipped).recipe
+    assert digest in capsys.readouterr().err
+    assert [file.name for file in cache.rglob("*") if file.is_file()] == ["a.safetensors"]
+
+
+def test_a_part_of_a_file_is_never_kept(shipped: Path, cache: Path) -> None:
+    remote = UPath("memory://models/b.safetensors")
+    remote.write_bytes(shipped.read_bytes()[:-9])
+    with pytest.raises(OSError, match=r"as a whole safetensors file .*nothing of it was kept"):
+        qgs.load(str(remote))
+    remote.write_bytes(shipped.read_bytes())
+    assert qgs.load(str(remote)).depth == 1
+
+
+def test_half_precision_halves_the_file_and_loads_as_float32(shipped: Path) -> None:
+    result = run_qgs("export", "box/small", "--half", "--out", "half.safetensors")
+    assert result.exit_code == 0, result.output
+    half, whole = load_file("half.safetensors"), load_file(shipped)
+    floats = {name for name, tensor in whole.items() if tensor.is_floating_point()}
+    assert {name for name, tensor in half.items() if tensor.dtype == torch.float16} == floats
+    model = qgs.load("half.safetensors")
+    assert {tensor.dtype for tensor in model.parameters()} == {torch.float32}
+    for name, tensor in model.named_parameters():
+        torch.testing.assert_close(tensor, whole[name].half().float(), rtol=0, atol=0)
+    assert load_extra("half.safetensors")["step"] == "7"
+    assert os.path.getsize("half.safetensors") < os.path.getsize(shipped)
+
+
+def test_weights_beyond_half_precision_are_refused(shipped: Path) -> None:
+    model = qgs.load(shipped)
+    with torch.no_grad():
+        model.queries.features.fill_(1e6)
+    save(model, "large.safetensors")
+    with pytest.raises(ValueError, match=r"float16 cannot hold .*: queries\.features"):
+        export_half("large.safetensors", "half.safetensors")
+    assert not Path("half.safetensors").exists()
+    with pytest.raises(ValueError, match="one of --layout published and --half"):
+        raise run_qgs("export", "large.safetensors", "--out", "x.safetensors").exception
