@@ -118,7 +118,7 @@ def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
     assert result.exit_code == 0, result.output
     assert result.output.count("few, more: the photos lie outside what this model was trained") == 1
     assert re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: 0\.", result.output)
-    assert "what they look at is infinitely far away (trained: " in result.output
+    assert "their axes meet at no point before them (trained: " in result.output
     assert "lie outside what this model" in (tmp_path / "demo" / "report.html").read_text()
 
 
