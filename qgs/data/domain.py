@@ -40,7 +40,7 @@ WORDS = {
 
 @dataclass
 class Domain:
-    """Least and largest value of each of WORDS over `samples` samples."""
+    """Least and largest value of each of WORDS over `samples` samples, in four digits."""
 
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     samples: int = 0
@@ -48,8 +48,9 @@ class Domain:
     def see(self, inputs: Cameras, targets: Cameras) -> None:
         """Count samples in: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
-            low, high = self.ranges.get(name, (math.inf, -math.inf))
-            self.ranges[name] = min(low, float(values.min())), max(high, float(values.max()))
+            known = self.ranges.get(name, ())
+            ends = [float(f"{float(value):.4g}") for value in (values.min(), values.max())]
+            self.ranges[name] = min(*known, *ends), max(*known, *ends)
         self.samples += len(inputs.c2w)
 
     @property
@@ -67,11 +68,14 @@ class Domain:
 
     def differences(self, found: Domain) -> list[str]:
         """In what `found` leaves these ranges, in words."""
-        return [
-            f"{WORDS[name].format(_shown(found.ranges[name]))} (trained: {_shown(trained)})"
-            for name, trained in self.ranges.items()
-            if name in found.ranges and not _inside(found.ranges[name], trained)
-        ]
+        told = []
+        for name, trained in self.ranges.items():
+            if name in found.ranges and not _inside(found.ranges[name], trained):
+                words = WORDS[name].format(_shown(found.ranges[name]))
+                if found.ranges[name][0] == math.inf:
+                    words = "their axes meet at no point before them"
+                told.append(f"{words} (trained: {_shown(trained)})")
+        return told
 
 
 def verdict(trained: str | None, found: Domain) -> str:

@@ -1,13 +1,19 @@
+import json
 import re
 
+import numpy as np
 import pytest
 import yaml
 from commands import MODEL, run_qgs
+from photo_formats import row_of_frames
+from PIL import Image
 from plyfile import PlyData
 
 import qgs
 from qgs.cli.contest import resolve_fairly
-from qgs.cli.demo import default_recipes, new_folder
+from qgs.cli.demo import new_folder
+from qgs.composer import resolve
+from qgs.data.domain import KEY, trained_domain
 from qgs.engine.guard import CollapseError
 
 RECIPE = {
@@ -33,7 +39,7 @@ def recipes(tmp_path):
 
 def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
     out = tmp_path / "demo"
-    result = run_qgs("demo", *recipes, "--seconds", 1, "--out", out)
+    result = run_qgs("demo", "--train", *recipes, "--seconds", 1, "--out", out)
     assert result.exception is None
     for name, queries in (("few", 8), ("more", 12)):
         assert (out / name / "checkpoint.safetensors").is_file()
@@ -61,20 +67,83 @@ def test_budget_and_seed_are_those_asked_for(recipes):
         assert recipe.tree["seed"] == 3
 
 
-def test_recipes_beside_the_user_come_first_and_missing_ones_say_where_they_were_looked_for(
-    tmp_path, monkeypatch
-):
+@pytest.fixture
+def models(tmp_path, monkeypatch):
+    """Two stand-ins for trained models that know on what views they were trained."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(qgs, "__file__", str(tmp_path / "site-packages" / "qgs" / "__init__.py"))
-    with pytest.raises(FileNotFoundError, match=r"recipes/tiny.*--recipe-folder FOLDER"):
-        default_recipes(None)
-    with pytest.raises(FileNotFoundError, match="elsewhere"):
-        default_recipes(tmp_path / "elsewhere")
-    files = [tmp_path / "recipes" / "tiny" / name for name in ("tokengs.yaml", "locus.yaml")]
-    files[0].parent.mkdir(parents=True)
-    for file in files:
-        file.touch()
-    assert [path.resolve() for path in default_recipes(None)] == files
+    files = []
+    for name, queries in (("few", 8), ("more", 12)):
+        recipe = resolve(RECIPE, [f"model.queries.count={queries}"])
+        domain = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
+        file = tmp_path / "models" / f"{name}.safetensors"
+        qgs.save(recipe.build_model(), file, extra={KEY: domain.text})
+        files += ["--model", f"models/{name}.safetensors"]
+    return files
+
+
+def photos_in(folder, count, step):
+    """Photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for index in range(count):
+        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
+    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
+    (folder / "transforms.json").write_text(
+        json.dumps(row_of_frames(count, step=step, **camera)), encoding="utf-8"
+    )
+    return folder
+
+
+def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
+    result = run_qgs("demo", *models)
+    assert result.exit_code == 0, result.output
+    for name, queries in (("few", 8), ("more", 12)):
+        ply = tmp_path / "demo" / name / "example.ply"
+        assert PlyData.read(ply)["vertex"].count == 4 * queries
+        assert not (ply.parent / "checkpoint.safetensors").exists()
+    for word in ("PSNR", "Nearest input", "Mean colour"):
+        assert word in result.output
+    assert "seconds" not in result.output
+    page = (tmp_path / "demo" / "report.html").read_text()
+    assert "test/000001" in page
+    assert "These trained models come with qgs" in page
+    assert "<h2>Training</h2>" not in page
+    assert "<small>seconds</small>" not in page
+
+
+@pytest.mark.parametrize("count", [3, 20])
+def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
+    result = run_qgs("demo", photos_in(tmp_path / "mine", count, step=5.0), *models)
+    assert result.exit_code == 0, result.output
+    assert result.output.count("few, more: the photos lie outside what this model was trained") == 1
+    assert re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: 0\.", result.output)
+    assert "their axes meet at no point before them (trained: " in result.output
+    assert "lie outside what this model" in (tmp_path / "demo" / "report.html").read_text()
+
+
+def test_an_own_folder_of_recipes_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert resolve("recipes/tiny/locus.yaml").tree["model"]["queries"]["count"] == 256
+    mine = tmp_path / "recipes" / "tiny" / "locus.yaml"
+    mine.parent.mkdir(parents=True)
+    mine.write_text(yaml.safe_dump(RECIPE))
+    assert resolve("recipes/tiny/locus.yaml").tree["model"]["queries"]["count"] == 8
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--seconds", 3], "are for training: add --train"),
+        (["--train", "--model", "rooms/locus-64"], "--model names trained models"),
+        (["one", "two"], "one folder of photos is shown at a time, got one, two"),
+        (["--model", "none.safetensors"], "no checkpoint at none.safetensors"),
+    ],
+)
+def test_words_without_meaning_are_refused(words, told, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert told in str(run_qgs("demo", *words).exception)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
@@ -93,6 +162,6 @@ def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch
 
     monkeypatch.setattr("qgs.cli.contest.compete", collapse)
     out = tmp_path / "demo"
-    result = run_qgs("demo", recipes[0], "--out", out)
+    result = run_qgs("demo", "--train", recipes[0], "--out", out)
     assert result.exit_code == 1
     assert "collapsed at step 7" in result.stderr

@@ -1,0 +1,96 @@
+"""What views a model was trained on: measured, stored, and told of others."""
+
+import math
+
+import pytest
+import torch
+from commands import MODEL
+
+from qgs.composer import resolve
+from qgs.data.domain import KEY, Domain, look_at_depth, trained_domain, verdict
+from qgs.engine.training import train
+from qgs.geometry.poses import look_at
+from qgs.io.checkpoint import load_extra
+from qgs.types import Cameras
+
+RECIPE = {
+    "recipe": 1,
+    "model": MODEL,
+    "plugins": ["rooms"],
+    "data": {"type": "rooms/procedural", "image_size": [16, 16], "scenes": 4, "test_scenes": 1},
+    "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
+    "training": {"steps": 6, "batch_size": 2, "precision": "float32", "save_every": 0},
+    "optimizer": {"warmup": 1},
+}
+
+
+def around(target: list[float], eyes: list[list[float]], focal: float = 16.0) -> Cameras:
+    """Cameras (1, V) of 32 x 32 pixels at `eyes` that look at `target`."""
+    places, goal = torch.tensor(eyes).float(), torch.tensor(target).float()
+    down = torch.tensor([0.0, 1.0, 0.0]).expand_as(places)
+    intrinsics = torch.tensor([focal, focal, 16.0, 16.0]).expand(1, len(eyes), 4)
+    return Cameras(look_at(places, goal - places, down)[None], intrinsics, (32, 32))
+
+
+def domain(*cameras: Cameras) -> Domain:
+    found = Domain()
+    for both in cameras:
+        found.see(both, both)
+    return found
+
+
+def test_what_is_measured() -> None:
+    found = domain(around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])).ranges
+    assert found["views"] == (2, 2)
+    assert found["baseline"] == pytest.approx((1, 1))
+    assert found["turn"] == pytest.approx([2 * math.degrees(math.atan(0.25))] * 2, rel=1e-3)
+    assert found["depth"] == pytest.approx([math.sqrt(4.25)] * 2, rel=1e-3)
+    assert found["fov"] == pytest.approx((90, 90))
+
+
+def test_axes_that_do_not_meet_before_the_cameras_look_infinitely_far() -> None:
+    apart = around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])
+    away = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    parallel = torch.eye(4).repeat(1, 2, 1, 1)
+    parallel[0, 1, 0, 3] = 1
+    for poses in (apart.c2w @ away, parallel):
+        assert look_at_depth(poses).tolist() == [math.inf]
+    assert look_at_depth(apart.c2w).tolist() == pytest.approx([math.sqrt(4.25)], rel=1e-5)
+
+
+def test_a_domain_is_read_as_it_was_written() -> None:
+    found = domain(around([0, 0, 2], [[0, 0, 0]]))
+    assert found.ranges["depth"] == (math.inf, math.inf)
+    assert "baseline" not in found.ranges
+    assert Domain.read(found.text) == found
+
+
+def test_the_sentence() -> None:
+    near, far = [[-0.1, 0, 0], [0.1, 0, 0]], [[-0.2, 0, 0], [0.2, 0, 0]]
+    trained = domain(around([0, 0, 1], near), around([0, 0, 2], far)).text
+    within = domain(around([0, 0, 1.5], [[-0.15, 0, 0], [0.15, 0, 0]]))
+    assert verdict(trained, within).startswith("the cameras lie within what this model was trained")
+    wide = domain(around([0, 0, 1.5], [[-1.5, 0, 0], [1.5, 0, 0], [0, 0, 0]], focal=4.0))
+    assert verdict(trained, wide).startswith(
+        "the photos lie outside what this model was trained on: there are 3 input views "
+        "(trained: 2), the input cameras stand 3 apart (trained: 0.2 to 0.4), their axes differ by "
+        "90 degrees (trained: 11.4), their field of view is 152 degrees wide (trained: 90). Expect"
+    )
+    assert "is not known: its checkpoint does not tell" in verdict(None, within)
+
+
+def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:
+    recipe = resolve(RECIPE)
+    whole = train(recipe, tmp_path / "whole").folder
+    half = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "half").folder
+    told = load_extra(half.checkpoint)[KEY]
+    assert Domain.read(told).samples == 6
+    train(recipe, tmp_path / "half", resume=True)
+    assert load_extra(half.checkpoint)[KEY] == load_extra(whole.checkpoint)[KEY] != told
+    found, first = (
+        Domain.read(load_extra(whole.checkpoint)[KEY]),
+        trained_domain(recipe.build_data(), recipe.views, recipe.seed),
+    )
+    assert found.samples == 12
+    assert first.samples == 256
+    assert not first.differences(found)
