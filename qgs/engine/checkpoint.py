@@ -1,9 +1,10 @@
 """What a run saves and continues from; starting from the weights of another one."""
 
 import json
+import math
 import os
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -30,14 +31,20 @@ from qgs.io.checkpoint import (
     unique_tensors,
     write_tensors,
 )
-from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
+from qgs.io.differences import (
+    differing_tensors,
+    differing_types,
+    options_beside_weights,
+    shapes_of,
+)
 from qgs.model import QueryGaussianModel
+from qgs.wording import listed
 
 FORMAT_VERSION = 1
 """Raised when the format of the file changes."""
 
 _PARTS, _RECIPE = "qgs.state", "qgs.recipe"
-_FORMAT, _VERSION = "qgs.state_version", "qgs.version"
+_FORMAT, _VERSION, _TENSORS = "qgs.state_version", "qgs.version", "qgs.tensors"
 
 State: TypeAlias = Mapping[str, Any]
 """Tensors and JSON values by name."""
@@ -76,6 +83,7 @@ def write_state(
                 tensors[f"{part}/{key}"] = tensor.cpu().clone(memory_format=torch.contiguous_format)
     metadata = {
         _PARTS: json.dumps(values),
+        _TENSORS: json.dumps(_kinds(tensors)),
         _RECIPE: json.dumps(recipe),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
@@ -97,10 +105,33 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
             f"this is qgs {qgs.__version__}, which knows {FORMAT_VERSION}: install the newer qgs"
         )
     parts: dict[str, dict[str, Any]] = json.loads(metadata[_PARTS])
-    for name, tensor in read_tensors(path).items():
+    tensors = read_tensors(path)
+    _refuse_others(tensors, metadata.get(_TENSORS), path)
+    for name, tensor in tensors.items():
         part, key = name.split("/", 1)
         parts[part][key] = tensor
     return SavedState(resolve(with_moved(json.loads(metadata[_RECIPE]))), parts)
+
+
+def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
+    return {name: [str(t.dtype).removeprefix("torch."), *t.shape] for name, t in tensors.items()}
+
+
+def _refuse_others(tensors: Mapping[str, Tensor], listing: str | None, path: object) -> None:
+    """Raise CheckpointError unless `tensors` are those of a `_TENSORS`, absent in old files."""
+    found, wanted = _kinds(tensors), json.loads(listing) if listing else _kinds(tensors)
+    if not isinstance(wanted, dict):
+        raise CheckpointError(f"{path}: the list of its tensors, {_TENSORS}, is damaged")
+    differing = [
+        f"{name}: {found.get(name, 'absent')} instead of {wanted.get(name, 'nothing')}"
+        for name in dict.fromkeys([*wanted, *found])
+        if found.get(name) != wanted.get(name)
+    ]
+    if differing:
+        raise CheckpointError(
+            f"{path} does not hold the tensors that were written into it, but "
+            f"{listed(differing, between='; ')}: bring back a copy of the file"
+        )
 
 
 class Saver:
@@ -155,7 +186,19 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            part.load_state(saved.parts[name])
+            own = part.state()
+            try:
+                refuse_damaged(saved.parts[name], own)
+                part.load_state(saved.parts[name])
+            except OtherRunError:
+                raise
+            except Exception as error:  # whatever a part, or a plugin's, raises about its state
+                known = isinstance(error, CheckpointError)
+                raise CheckpointError(
+                    f"{self.folder.state} cannot be continued: its part {name!r} is damaged, or "
+                    f"other code wrote it: {error if known else repr(error)}. No file was changed; "
+                    f"bring back a copy of it, or start a new run with init_from: {self.folder.path}"
+                ) from error
 
     def _write_state(self, parts: Mapping[str, State]) -> None:
         self.folder.flush(to_disk=True)
@@ -174,8 +217,37 @@ class Weights:
 
     @torch.no_grad()
     def load_state(self, state: State) -> None:
-        for name, tensor in unique_tensors(self._module).items():
+        tensors = unique_tensors(self._module)
+        refuse_other_tensors(state, tensors)
+        for name, tensor in tensors.items():
             tensor.copy_(placed_like(state[name], tensor))
+
+
+def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:
+    """Raise CheckpointError unless `saved` has the names, shapes and types of `wanted` alone."""
+    differences = differing_tensors(shapes_of(saved), shapes_of(wanted))
+    if found := differences + differing_types(saved, wanted):
+        raise CheckpointError(f"{len(found)} differences: {listed(found, between='; ')}")
+
+
+def refuse_damaged(state: State, own: State) -> None:
+    """Raise CheckpointError for NaN, and for plain values of another kind than in `own`."""
+    names = [k for k, v in state.items() if isinstance(v, Tensor) and bool(torch.isnan(v).any())]
+    if broken := [*names, *_unlike(state, own)]:
+        raise CheckpointError(f"not what it must be: {listed(broken)}")
+
+
+def _unlike(value: Any, own: Any, path: str = "") -> Iterator[str]:
+    """Paths of plain values of another kind than in `own`, where None stands for any; of NaN."""
+    if isinstance(value, float) and math.isnan(value):
+        yield f"{path} (nan)"
+    elif isinstance(value, Mapping) and isinstance(own, Mapping):
+        for key in value.keys() & own.keys():
+            yield from _unlike(value[key], own[key], f"{path}/{key}".lstrip("/"))
+    elif value is not None and own is not None:
+        numbers = (int, float) if type(own) is float else type(own)
+        if not isinstance(value, numbers) or (isinstance(value, bool) and own is not bool(own)):
+            yield f"{path} ({type(value).__name__} instead of {type(own).__name__})"
 
 
 class OptimizerState:
@@ -194,6 +266,9 @@ class OptimizerState:
 
     def load_state(self, state: State) -> None:
         self._optimizer.state.clear()
+        unknown = [path for path in state if path.rpartition("/")[0] not in self._parameters]
+        if unknown:
+            raise CheckpointError(f"of no parameter of the model: {listed(unknown)}")
         for path, value in state.items():
             name, key = path.rsplit("/", 1)
             parameter = self._parameters[name]

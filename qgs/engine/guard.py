@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from qgs.contracts import TrainingConfig
 from qgs.data.sampling import Batch
-from qgs.engine.checkpoint import Saver, Weights
+from qgs.engine.checkpoint import Saver, Weights, refuse_other_tensors
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
@@ -296,10 +296,11 @@ class GoodWeights:
         return {"steps": [step for step, _ in self._copies], **tensors}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self._copies = [
-            (step, {name: state[f"{i}/{name}"] for name in self.tensors})
-            for i, step in enumerate(state["steps"])
-        ]
+        self._copies = []
+        for i, step in enumerate(state["steps"]):
+            copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
+            refuse_other_tensors(copy, self._weights.state() if self._keep else copy)
+            self._copies.append((step, copy if self._keep else {}))
         self.step, self.tensors = self._copies[0]
 
 

@@ -19,9 +19,10 @@ from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.composer.slots import with_moved
 from qgs.contracts import CONTRACT_VERSION
-from qgs.io.differences import differing_tensors, shapes_of
+from qgs.io.differences import differing_tensors, differing_types, shapes_of
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
+from qgs.wording import listed
 
 FORMAT_VERSION = 2
 """Raised when what a checkpoint holds changes."""
@@ -145,8 +146,10 @@ def load(
     Raises FileNotFoundError, or CheckpointError, which names the releases that wrote the file
     where a plugin is missing or another release of it cannot stand for it.
     """
-    model = load_recipe(path).build_model()
-    load_weights(model, read_tensors(path), str(path))
+    recipe, tensors = load_recipe(path), read_tensors(path)
+    _refuse_misfit(recipe.build_model("meta"), tensors, str(path))  # before anything is allocated
+    model = recipe.build_model()
+    load_weights(model, tensors, str(path))
     return (model if device is None else model.to(device)).eval()
 
 
@@ -185,21 +188,27 @@ def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
 
 
 def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
-    """Copy `tensors` into `model`; names and shapes must match exactly.
+    """Copy `tensors` into `model`; names, shapes and types must match exactly.
 
-    Raises CheckpointError that lists all differences; `origin` names the source in it.
+    Raises CheckpointError that lists the differences; `origin` names the source in it.
     """
+    _refuse_misfit(model, tensors, origin)
+    with torch.no_grad():
+        for name, tensor in unique_tensors(model).items():
+            tensor.copy_(tensors[name])
+
+
+def _refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))
+    differences += differing_types(tensors, own)
     if differences:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
-            + "\n  ".join(differences)
-            + "\nInstall the versions of qgs and of its plugins that wrote the file."
+            + listed(differences, 20, "\n  ")
+            + "\nInstall the versions of qgs and of its plugins that wrote the file; if they are, "
+            "it is damaged: copy it again."
         )
-    with torch.no_grad():
-        for name, tensor in own.items():
-            tensor.copy_(tensors[name])
 
 
 def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:

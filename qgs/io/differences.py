@@ -35,6 +35,15 @@ def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()
     ]
 
 
+def differing_types(file: Mapping[str, Tensor], recipe: Mapping[str, Tensor]) -> list[str]:
+    """The types of numbers in which tensors of both differ, one line each."""
+    return [
+        f"type of {name}: {file[name].dtype} in the file, {tensor.dtype} in the recipe"
+        for name, tensor in recipe.items()
+        if name in file and file[name].dtype != tensor.dtype
+    ]
+
+
 def differing_options(
     a: Mapping[str, Any], b: Mapping[str, Any]
 ) -> dict[str, tuple[str | None, str | None]]:
