@@ -6,13 +6,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-OUT_OF_MEMORY = (
-    "lower training.batch_size (raise training.accumulate for the same step), "
-    "training.render_views, views.inputs, views.targets, the size of the images, or "
-    "model.queries.count"
-)
-"""What takes less memory, of a training."""
-
 
 class TooLargeError(ValueError):
     """What was asked for does not fit into memory; the message has the numbers."""
@@ -70,8 +63,6 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def in_words(size: int) -> str:
     """Bytes as people write them: 1.5 GB."""
-    for unit in ("bytes", "kB", "MB", "GB", "TB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} PB"
+    units = ("bytes", "kB", "MB", "GB", "TB", "PB")
+    power = min((len(str(abs(size))) - 1) // 3, len(units) - 1)
+    return f"{size / 1000**power:.3g} {units[power]}"

@@ -152,6 +152,7 @@ class Saver:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
         parts = {name: part.state() for name, part in self.parts.items()}
         if self._accelerator.is_main_process:
+            self.folder.refuse_gone()
             if not state_only:
                 if not self.folder.state.exists():
                     self._write_state(parts)  # a checkpoint alone cannot be continued
@@ -165,6 +166,7 @@ class Saver:
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
         """Save a checkpoint of other weights than the present ones."""
         if self._accelerator.is_main_process:
+            self.folder.refuse_gone()
             save(self.model, self.folder.checkpoint, extra={"step": str(step)}, weights=weights)
         self._accelerator.wait_for_everyone()
 
@@ -196,8 +198,9 @@ class Saver:
                 known = isinstance(error, CheckpointError)
                 raise CheckpointError(
                     f"{self.folder.state} cannot be continued: its part {name!r} is damaged, or "
-                    f"other code wrote it: {error if known else repr(error)}. No file was changed; "
-                    f"bring back a copy of it, or start a new run with init_from: {self.folder.path}"
+                    f"other code wrote it: {error if known else repr(error)}. No file was changed: "
+                    "bring back a copy of this one, or start a new run with "
+                    f"init_from: {self.folder.checkpoint}"
                 ) from error
 
     def _write_state(self, parts: Mapping[str, State]) -> None:
@@ -323,6 +326,7 @@ FREE = (
     "training.workers",
     "training.render_views",
     "training.on_nonfinite",
+    "training.on_bad_sample",
     "training.evaluate_every",
     "training.trackers",
     "evaluation",

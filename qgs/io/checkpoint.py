@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,14 +19,13 @@ from qgs.composer.registry import available_plugins, load_registry
 from qgs.composer.slots import with_moved
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, differing_types, shapes_of
-from qgs.io.files import replacing
+from qgs.io.files import replacing, told_where_full
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
 FORMAT_VERSION = 2
 """Raised when what a checkpoint holds changes."""
 
-_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _RECIPE, _CONTRACT = "qgs.recipe", "qgs.contract_version"
 _PLUGINS, _DISTRIBUTIONS = "qgs.plugins", "qgs.distributions"
 _FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
@@ -46,19 +44,13 @@ def write_tensors(
     Raises OSError that tells the space needed and the space there is; what `path` held before is
     then still there.
     """
-    try:
-        with replacing(path) as temporary:
+    needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+    told = f" It takes {needed / 1e6:.1f} MB beside the file that it replaces, and"
+    with replacing(path) as temporary, told_where_full(Path(path), told):
+        try:
             save_file(dict(tensors), temporary, dict(metadata))
-    except (SafetensorError, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in _DISK_IS_FULL:
-            raise
-        needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
-        free = shutil.disk_usage(Path(path).parent).free
-        raise OSError(
-            f"{path} could not be written ({error}). It takes {needed / 1e6:.1f} MB beside the "
-            f"file that it replaces, and {free / 1e6:.1f} MB are free there. What was saved before "
-            "is whole: free space and save again; a training run goes on with --resume"
-        ) from error
+        except SafetensorError as error:  # which tells the reason in words alone
+            raise OSError(errno.ENOSPC, str(error)) from error
 
 
 @contextmanager
