@@ -6,6 +6,7 @@ import os
 import random
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -247,6 +248,11 @@ def _unlike(value: Any, own: Any, path: str = "") -> Iterator[str]:
     elif isinstance(value, Mapping) and isinstance(own, Mapping):
         for key in value.keys() & own.keys():
             yield from _unlike(value[key], own[key], f"{path}/{key}".lstrip("/"))
+    elif isinstance(value, list) and isinstance(own, list) and len(value) >= len(own) > 0:
+        for place, (inner, ours) in enumerate(zip_longest(value, own, fillvalue=own[-1])):
+            yield from _unlike(inner, ours, f"{path}/{place}")
+    elif isinstance(value, int) and value.bit_length() > 64 and type(own) is not dict:
+        yield f"{path} (an integer of {value.bit_length()} bits)"
     elif value is not None and own is not None:
         numbers = (int, float) if type(own) is float else type(own)
         if not isinstance(value, numbers) or (isinstance(value, bool) and own is not bool(own)):

@@ -110,7 +110,7 @@ class Guard:
     def load_state(self, state: Mapping[str, Any]) -> None:
         self.incidents, self.skipped = state["incidents"], state["skipped"]
         self.detector.load_state(state["detector"])
-        self._alive = dict(state.get("alive", {}))
+        self._alive = {name: float(n) for name, n in state.get("alive", {}).items()}
 
     def passed(self, numbers: Mapping[str, float]) -> None:
         """Take note of a finite step."""
@@ -331,7 +331,9 @@ class GoodWeights:
         return {"steps": [step for step, _ in self._copies], **quality, **tensors}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self._copies, self._psnr, self._best = [], state.get("psnr"), state.get("best")
+        self._copies = []
+        quality = (state.get(name) for name in ("psnr", "best"))
+        self._psnr, self._best = (None if value is None else float(value) for value in quality)
         for i, step in enumerate(state["steps"]):
             copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
             refuse_other_tensors(copy, self._weights.state() if self._keep else copy)

@@ -312,8 +312,10 @@ class Trainer:
         """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
         refuse_other_data(state, self._conditions, self.folder)
         self.step, self.samples, self.seconds = state["step"], state["samples"], state["seconds"]
+        if not (0 <= self.step <= self.samples and 0 <= self.seconds < math.inf):
+            raise ValueError(f"{self.step} steps of {self.samples} samples in {self.seconds} s")
         if self.accelerator.is_main_process:
-            self.left_out = Counter(state.get("left_out", {}))
+            self.left_out = Counter({key: int(n) for key, n in state.get("left_out", {}).items()})
 
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""
