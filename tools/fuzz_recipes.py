@@ -31,7 +31,7 @@ import torch
 import yaml
 
 from qgs.cli.recipe_tables import difference_tables, parameter_counts
-from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer import PluginError, Recipe, RecipeError, resolve
 from qgs.composer.recipe import annotated, flat
 from qgs.composer.registry import load_sound_plugins
 from qgs.composer.slots import SLOTS
@@ -386,7 +386,7 @@ def refusal_fault(error: RecipeError) -> str:
     if not str(error).replace("\n", "").isprintable():
         return f"a message that no terminal prints as it is: {str(error)[:500]!r}"
     for problem in error.problems:
-        if problem.cause:
+        if problem.cause and not isinstance(problem.cause, PluginError):
             return "".join(traceback.format_exception(problem.cause))
         if not problem.file:
             return f"a problem without a place: {problem}"

@@ -1,6 +1,7 @@
 """What a run saves and continues from; starting from the weights of another one."""
 
 import json
+import math
 import os
 import random
 from collections.abc import Callable, Mapping
@@ -17,7 +18,6 @@ from torch import Tensor, nn
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.composer.recipe import flat
-from qgs.composer.slots import with_moved
 from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.io.checkpoint import (
@@ -31,6 +31,7 @@ from qgs.io.checkpoint import (
     write_tensors,
 )
 from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
+from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
 from qgs.model import QueryGaussianModel
 
 FORMAT_VERSION = 1
@@ -91,16 +92,14 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         metadata = file.metadata() or {}
     if _PARTS not in metadata:
         raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
-    if int(metadata[_FORMAT]) > FORMAT_VERSION:
-        raise CheckpointError(
-            f"{path} was written by qgs {metadata[_VERSION]} with {_FORMAT} {metadata[_FORMAT]}; "
-            f"this is qgs {qgs.__version__}, which knows {FORMAT_VERSION}: install the newer qgs"
-        )
-    parts: dict[str, dict[str, Any]] = json.loads(metadata[_PARTS])
+    refuse_newer(metadata, {_FORMAT: FORMAT_VERSION}, _VERSION, path)
+    parts = mapping_in(metadata, _PARTS, path)
     for name, tensor in read_tensors(path).items():
-        part, key = name.split("/", 1)
+        part, slash, key = name.partition("/")
+        if not slash or not isinstance(parts.get(part), dict):
+            raise damaged(path, f"the tensor `{name[:200]}` belongs to no part of a run")
         parts[part][key] = tensor
-    return SavedState(resolve(with_moved(json.loads(metadata[_RECIPE]))), parts)
+    return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
 
 
 class Saver:
@@ -155,12 +154,43 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            part.load_state(saved.parts[name])
+            fault = unlike(part.state(), saved.parts[name])
+            try:
+                if not fault:
+                    part.load_state(saved.parts[name])
+            except (CheckpointError, OtherRunError):
+                raise
+            except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+                fault = f"{type(error).__name__}: {error}"
+            if fault:
+                raise damaged(self.folder.state, f"its part `{name}` cannot be restored ({fault})")
 
     def _write_state(self, parts: Mapping[str, State]) -> None:
         self.folder.flush(to_disk=True)
         assert self.model.recipe is not None
         write_state(self.folder.state, self.model.recipe, parts)
+
+
+def unlike(now: Any, saved: Any, name: str = "") -> str:
+    """Where JSON values that were saved are of another kind than those of today; "" if nowhere.
+
+    Numbers and mappings are compared; a text may have been null, a list of another length.
+    """
+    if isinstance(now, Mapping):
+        if not isinstance(saved, Mapping):
+            return f"{name or 'it'} is no mapping"
+        found = (
+            unlike(value, saved[key], f"{name}.{key}".removeprefix("."))
+            for key, value in now.items()
+            if not isinstance(value, Tensor)
+            if key in saved
+        )
+        return next(filter(None, found), "")
+    if isinstance(now, int | float):
+        sound = type(saved) is type(now) or (type(now), type(saved)) == (float, int)
+        if not sound or not (0 if type(now) is int else -math.inf) <= saved < math.inf:
+            return f"{name} is {str(saved)[:100]!r}"
+    return ""
 
 
 class Weights:
