@@ -20,7 +20,7 @@ from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, shapes_of
 from qgs.io.files import replacing
-from qgs.io.metadata import CheckpointError, mapping_in, refuse_newer, stored_recipe
+from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
 from qgs.model import QueryGaussianModel
 
 FORMAT_VERSION = 2
