@@ -70,7 +70,7 @@ def evaluate(
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
-    from qgs.io.checkpoint import load, load_extra, load_recipe
+    from qgs.io.checkpoint import load, load_recipe, load_step
 
     use_threads(threads)
     for setting in settings:
@@ -85,8 +85,8 @@ def evaluate(
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
     folder = out or evaluation_folder(checkpoint, bool(settings))
-    step = load_extra(checkpoint).get("step")
-    evaluation = evaluate_into(model, recipe, int(step) if step else None, folder, console, batch)
+    step = load_step(checkpoint)
+    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
     run = RunFolder(checkpoint.parent)
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"

@@ -14,7 +14,7 @@ from qgs.composer.decode import Chosen, check_tree, decode_place, decode_setting
 from qgs.composer.errors import Problems
 from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import check_flow, check_options
-from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, from_plain
+from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.rates import rate_factors
 from qgs.composer.registry import Registry, load_plugins
@@ -97,7 +97,8 @@ def resolve(
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
-    tree = apply_overrides(read_recipe(recipe, problems), overrides, problems)
+    count = Count()
+    tree = apply_overrides(read_recipe(recipe, problems, count), overrides, problems, count)
     tree = check_tree(tree, problems)
     problems.raise_if_stopped()
     tree = _with_defaults(tree)
@@ -141,7 +142,7 @@ def _with_defaults(tree: MapNode) -> MapNode:
         for name, section in SECTIONS.items()
         if section.named and (section.defaults_stay or name not in tree)
     }
-    defaults = from_plain(missing, Origin("default"))
+    defaults = from_plain(missing, Origin("default"), Count())
     assert isinstance(defaults, MapNode)
     return merge(defaults, tree)
 

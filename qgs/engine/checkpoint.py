@@ -4,9 +4,8 @@ import json
 import math
 import os
 import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -19,7 +18,6 @@ from torch import Tensor, nn
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.composer.recipe import flat
-from qgs.composer.slots import with_moved
 from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.io.checkpoint import (
@@ -38,6 +36,7 @@ from qgs.io.differences import (
     options_beside_weights,
     shapes_of,
 )
+from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
@@ -100,39 +99,32 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         metadata = file.metadata() or {}
     if _PARTS not in metadata:
         raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
-    if int(metadata[_FORMAT]) > FORMAT_VERSION:
-        raise CheckpointError(
-            f"{path} was written by qgs {metadata[_VERSION]} with {_FORMAT} {metadata[_FORMAT]}; "
-            f"this is qgs {qgs.__version__}, which knows {FORMAT_VERSION}: install the newer qgs"
-        )
-    parts: dict[str, dict[str, Any]] = json.loads(metadata[_PARTS])
-    tensors = read_tensors(path)
-    _refuse_others(tensors, metadata.get(_TENSORS), path)
+    refuse_newer(metadata, {_FORMAT: FORMAT_VERSION}, _VERSION, path)
+    parts, tensors = mapping_in(metadata, _PARTS, path), read_tensors(path)
+    _refuse_others(tensors, metadata, path)
     for name, tensor in tensors.items():
-        part, key = name.split("/", 1)
+        part, slash, key = name.partition("/")
+        if not slash or not isinstance(parts.get(part), dict):
+            raise damaged(path, f"the tensor `{name[:200]}` belongs to no part of a run")
         parts[part][key] = tensor
-    return SavedState(resolve(with_moved(json.loads(metadata[_RECIPE]))), parts)
+    return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
 
 
 def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
     return {name: [str(t.dtype).removeprefix("torch."), *t.shape] for name, t in tensors.items()}
 
 
-def _refuse_others(tensors: Mapping[str, Tensor], listing: str | None, path: object) -> None:
-    """Raise CheckpointError unless `tensors` are those of a `_TENSORS`, absent in old files."""
-    found, wanted = _kinds(tensors), json.loads(listing) if listing else _kinds(tensors)
-    if not isinstance(wanted, dict):
-        raise CheckpointError(f"{path}: the list of its tensors, {_TENSORS}, is damaged")
+def _refuse_others(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], path: Any) -> None:
+    """Raise CheckpointError unless `tensors` are those that were written; old files do not tell."""
+    found = _kinds(tensors)
+    wanted = mapping_in(metadata, _TENSORS, path) if _TENSORS in metadata else found
     differing = [
-        f"{name}: {found.get(name, 'absent')} instead of {wanted.get(name, 'nothing')}"
+        f"{name[:200]}: {found.get(name, 'absent')} instead of {str(wanted.get(name))[:200]}"
         for name in dict.fromkeys([*wanted, *found])
         if found.get(name) != wanted.get(name)
     ]
     if differing:
-        raise CheckpointError(
-            f"{path} does not hold the tensors that were written into it, but "
-            f"{listed(differing, between='; ')}: bring back a copy of the file"
-        )
+        raise damaged(path, f"not the tensors that were written: {listed(differing, between='; ')}")
 
 
 class Saver:
@@ -189,25 +181,44 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            own = part.state()
+            fault = unlike(part.state(), saved.parts[name]) or _nan_in(saved.parts[name])
             try:
-                refuse_damaged(saved.parts[name], own)
-                part.load_state(saved.parts[name])
+                if not fault:
+                    part.load_state(saved.parts[name])
             except OtherRunError:
                 raise
             except Exception as error:  # whatever a part, or a plugin's, raises about its state
                 known = isinstance(error, CheckpointError)
-                raise CheckpointError(
-                    f"{self.folder.state} cannot be continued: its part {name!r} is damaged, or "
-                    f"other code wrote it: {error if known else repr(error)}. No file was changed: "
-                    "bring back a copy of this one, or start a new run with "
-                    f"init_from: {self.folder.checkpoint}"
-                ) from error
+                fault = str(error) if known else f"{type(error).__name__}: {error}"
+            if fault:
+                raise damaged(self.folder.state, f"its part `{name}` cannot be restored ({fault})")
 
     def _write_state(self, parts: Mapping[str, State]) -> None:
         self.folder.flush(to_disk=True)
         assert self.model.recipe is not None
         write_state(self.folder.state, self.model.recipe, parts)
+
+
+def unlike(now: Any, saved: Any, name: str = "") -> str:
+    """Where JSON values that were saved are of another kind than those of today; "" if nowhere.
+
+    Numbers and mappings are compared; a text may have been null, a list of another length.
+    """
+    if isinstance(now, Mapping):
+        if not isinstance(saved, Mapping):
+            return f"{name or 'it'} is no mapping"
+        found = (
+            unlike(value, saved[key], f"{name}.{key}".removeprefix("."))
+            for key, value in now.items()
+            if not isinstance(value, Tensor)
+            if key in saved
+        )
+        return next(filter(None, found), "")
+    if isinstance(now, int | float):
+        sound = type(saved) is type(now) or (type(now), type(saved)) == (float, int)
+        if not sound or not (0 if type(now) is int else -math.inf) <= saved < math.inf:
+            return f"{name} is {str(saved)[:100]!r}"
+    return ""
 
 
 class Weights:
@@ -234,29 +245,10 @@ def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:
         raise CheckpointError(f"{len(found)} differences: {listed(found, between='; ')}")
 
 
-def refuse_damaged(state: State, own: State) -> None:
-    """Raise CheckpointError for NaN, and for plain values of another kind than in `own`."""
-    names = [k for k, v in state.items() if isinstance(v, Tensor) and bool(torch.isnan(v).any())]
-    if broken := [*names, *_unlike(state, own)]:
-        raise CheckpointError(f"not what it must be: {listed(broken)}")
-
-
-def _unlike(value: Any, own: Any, path: str = "") -> Iterator[str]:
-    """Paths of plain values of another kind than in `own`, where None stands for any; of NaN."""
-    if isinstance(value, float) and math.isnan(value):
-        yield f"{path} (nan)"
-    elif isinstance(value, Mapping) and isinstance(own, Mapping):
-        for key in value.keys() & own.keys():
-            yield from _unlike(value[key], own[key], f"{path}/{key}".lstrip("/"))
-    elif isinstance(value, list) and isinstance(own, list) and len(value) >= len(own) > 0:
-        for place, (inner, ours) in enumerate(zip_longest(value, own, fillvalue=own[-1])):
-            yield from _unlike(inner, ours, f"{path}/{place}")
-    elif isinstance(value, int) and value.bit_length() > 64 and type(own) is not dict:
-        yield f"{path} (an integer of {value.bit_length()} bits)"
-    elif value is not None and own is not None:
-        numbers = (int, float) if type(own) is float else type(own)
-        if not isinstance(value, numbers) or (isinstance(value, bool) and own is not bool(own)):
-            yield f"{path} ({type(value).__name__} instead of {type(own).__name__})"
+def _nan_in(state: State) -> str:
+    """The tensors of `state` with NaN, of which nothing good can come; "" if none has."""
+    broken = [k for k, v in state.items() if isinstance(v, Tensor) and bool(torch.isnan(v).any())]
+    return f"NaN in {listed(broken)}" if broken else ""
 
 
 class OptimizerState:

@@ -337,7 +337,7 @@ class GoodWeights:
         for i, step in enumerate(state["steps"]):
             copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
             refuse_other_tensors(copy, self._weights.state() if self._keep else copy)
-            self._copies.append((step, copy if self._keep else {}))
+            self._copies.append((int(step), copy if self._keep else {}))
         self.step, self.tensors = self._copies[0]
 
 

@@ -14,12 +14,12 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 import qgs
-from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
-from qgs.composer.slots import with_moved
 from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, differing_types, shapes_of
 from qgs.io.files import replacing, told_where_full
+from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
@@ -30,10 +30,6 @@ _RECIPE, _CONTRACT = "qgs.recipe", "qgs.contract_version"
 _PLUGINS, _DISTRIBUTIONS = "qgs.plugins", "qgs.distributions"
 _FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
-
-
-class CheckpointError(ValueError):
-    """A file that holds no weights that can be used; the message says why and what to do."""
 
 
 def write_tensors(
@@ -149,12 +145,13 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """The recipe that a checkpoint carries. Raises as `load` does."""
     metadata = _read_metadata(path)
     try:
-        return resolve(with_moved(json.loads(metadata[_RECIPE])))
+        return stored_recipe(metadata, _RECIPE, path)
     except RecipeError as error:
-        names = {**json.loads(metadata.get(_DISTRIBUTIONS, "{}")), "qgs": "query-gaussians"}
+        written = {_PLUGINS: "{}", _DISTRIBUTIONS: "{}"} | metadata
+        names = {**mapping_in(written, _DISTRIBUTIONS, path), "qgs": "query-gaussians"}
         releases = {
             plugin: f"{names.get(plugin) or f'the plugin `{plugin}`'} {version}"
-            for plugin, version in json.loads(metadata.get(_PLUGINS, "{}")).items()
+            for plugin, version in mapping_in(written, _PLUGINS, path).items()
         }
         available = {"qgs", *available_plugins()}
         absent = [release for plugin, release in releases.items() if plugin not in available]
@@ -168,6 +165,13 @@ def load_extra(path: str | os.PathLike[str]) -> dict[str, str]:
     """The `extra` metadata that `save` was given. Raises as `load` does."""
     metadata = _read_metadata(path)
     return {k.removeprefix(_EXTRA): v for k, v in metadata.items() if k.startswith(_EXTRA)}
+
+
+def load_step(path: str | os.PathLike[str]) -> int | None:
+    """The training step that `save` was given as `extra`, None without. Raises as `load` does."""
+    step = load_extra(path).get("step")
+    with reading(path, _EXTRA + "step"):
+        return int(step) if step else None
 
 
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
@@ -193,7 +197,7 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
 def _refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))
-    differences += differing_types(tensors, own)
+    differences += differing_types(tensors, own, widened=True)
     if differences:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
@@ -220,11 +224,6 @@ def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
             "or `qgs train` can be loaded. If it holds published weights, turn them into a "
             f"checkpoint: `qgs import {path} --recipe auto --out CHECKPOINT.safetensors`"
         )
-    for key, known in ((_CONTRACT, CONTRACT_VERSION), (_FORMAT, FORMAT_VERSION)):
-        written = int(metadata.get(key, 0))
-        if written > known:
-            raise CheckpointError(
-                f"{path} was written by qgs {metadata.get(_VERSION, '?')} with {key} {written}; "
-                f"this is qgs {qgs.__version__}, which knows {known}: install the newer qgs"
-            )
+    known = {_CONTRACT: CONTRACT_VERSION, _FORMAT: FORMAT_VERSION}
+    refuse_newer(dict.fromkeys(known, "0") | metadata, known, _VERSION, path)
     return metadata
