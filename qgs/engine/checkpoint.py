@@ -16,7 +16,7 @@ from accelerate.utils import gather_object
 from torch import Tensor, nn
 
 import qgs
-from qgs.composer import Recipe, resolve
+from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import flat
 from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder, checkpoint_of
@@ -107,7 +107,10 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         if not slash or not isinstance(parts.get(part), dict):
             raise damaged(path, f"the tensor `{name[:200]}` belongs to no part of a run")
         parts[part][key] = tensor
-    return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
+    try:
+        return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
+    except RecipeError as error:
+        raise damaged(path, f"its recipe fails here, or needs other plugins: {error}") from error
 
 
 def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
@@ -181,7 +184,7 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            fault = unlike(part.state(), saved.parts[name]) or _nan_in(saved.parts[name])
+            fault = unlike(part.state(), saved.parts[name]) or broken(saved.parts[name], name)
             try:
                 if not fault:
                     part.load_state(saved.parts[name])
@@ -245,10 +248,11 @@ def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:
         raise CheckpointError(f"{len(found)} differences: {listed(found, between='; ')}")
 
 
-def _nan_in(state: State) -> str:
-    """The tensors of `state` with NaN, of which nothing good can come; "" if none has."""
-    broken = [k for k, v in state.items() if isinstance(v, Tensor) and bool(torch.isnan(v).any())]
-    return f"NaN in {listed(broken)}" if broken else ""
+def broken(state: State, part: str) -> str:
+    """The tensors of `state` with NaN, of weights infinity too; "" if none has."""
+    sound = (lambda t: ~torch.isnan(t)) if part == "moments" else torch.isfinite
+    names = [k for k, v in state.items() if isinstance(v, Tensor) and not bool(sound(v).all())]
+    return f"not finite: {listed(names)}" if names else ""
 
 
 class OptimizerState:

@@ -20,6 +20,7 @@ from qgs.contracts import CONTRACT_VERSION
 from qgs.io.differences import differing_tensors, differing_types, shapes_of
 from qgs.io.files import replacing, told_where_full
 from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
+from qgs.memory import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
@@ -135,8 +136,13 @@ def load(
     where a plugin is missing or another release of it cannot stand for it.
     """
     recipe, tensors = load_recipe(path), read_tensors(path)
-    _refuse_misfit(recipe.build_model("meta"), tensors, str(path))  # before anything is allocated
-    model = recipe.build_model()
+    try:
+        _refuse_misfit(recipe.build_model("meta"), tensors, str(path))  # takes no memory
+        model = recipe.build_model()
+    except (RecipeError, TooLargeError) as error:
+        raise CheckpointError(
+            f"{path}: the model of its recipe cannot be built: {error}"
+        ) from error
     load_weights(model, tensors, str(path))
     return (model if device is None else model.to(device)).eval()
 
