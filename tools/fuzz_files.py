@@ -3,8 +3,8 @@
     python tools/fuzz_files.py --count 3000 --seed 0
 
 Each case, in a process of its own, ends in success or in one error of ours that names the file,
-within SECONDS of its processor and BYTES of memory. Prints a line for every case that does
-not, with its number, and a line of counts; ends with 1 if there was any. `--only NUMBER` repeats a case.
+within SECONDS of its processor and BYTES of memory. Prints every case that does not,
+with its number, and a line of counts; ends with 1 if there was any. `--only NUMBER` repeats one.
 """
 
 import argparse

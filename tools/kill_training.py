@@ -130,7 +130,7 @@ def kill_training(options: argparse.Namespace) -> int:
 def evaluate_run(run: Path, out: Path) -> None:
     """As `qgs eval` does."""
     recipe = load_recipe(run / "checkpoint.safetensors")
-    evaluate(qgs.load(run), recipe).write(out)
+    evaluate(qgs.load(run / "checkpoint.safetensors"), recipe).write(out)
 
 
 def pack_rooms(recipe: Recipe, out: Path) -> None:
@@ -138,7 +138,7 @@ def pack_rooms(recipe: Recipe, out: Path) -> None:
     source = recipe.build_data()
     splits = packing.own_splits(source)
     packing.pack(
-        source, splits, opened_path(str(out)), {}, Encoding(False, None), chunk_bytes=40_000
+        source, splits, opened_path(str(out)), {}, Encoding(False, None), chunk_bytes=4_000
     )
 
 
@@ -168,10 +168,10 @@ def kill_command(options: argparse.Namespace) -> int:
             os.kill(child, signal.SIGKILL)
             kills += os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
             found = files_of(out)
-            inside += found.keys() < whole.keys()
+            inside += 0 < len(found.keys() & whole.keys()) < len(whole)
             parts = [name for name in found.keys() & whole.keys() if found[name] != whole[name]]
             damaged += bool(parts) or files_of(run) != before
-            if found == whole:
+            if out.exists() and found == whole:
                 shutil.rmtree(out)
         os.waitpid(in_child(command, subject, out), 0)
         equal = files_of(out) == whole
