@@ -166,7 +166,11 @@ def kill_command(options: argparse.Namespace) -> int:
             child = in_child(command, subject, out)
             time.sleep(random.uniform(0, longest))
             os.kill(child, signal.SIGKILL)
-            kills += os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+            code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            if code not in (0, -signal.SIGKILL):
+                print(f"called again after {kills} kills, {options.what} ended with {code}")
+                return 1
+            kills += code == -signal.SIGKILL
             found = files_of(out)
             inside += 0 < len(found.keys() & whole.keys()) < len(whole)
             parts = [name for name in found.keys() & whole.keys() if found[name] != whole[name]]

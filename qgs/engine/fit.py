@@ -1,7 +1,7 @@
 """Whether a training fits into memory, told before anything is allocated; what to do where not."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import torch
 from accelerate import Accelerator
@@ -69,30 +69,28 @@ def refuse_unfit(recipe: Recipe, accelerator: Accelerator) -> None:
 
 
 @contextmanager
-def explained(step: int, save: Callable[[], None]) -> Iterator[None]:
+def explained(step: int, save: Callable[[int], None] | None = None) -> Iterator[None]:
     """Raise OutOfMemoryError where the `with` block, a step after `step` others, finds no memory.
 
-    save: saves the run as it is.
+    save: saves the run as it is; None where it cannot be saved.
     """
     try:
         yield
     except Exception as error:
         if not is_out_of_memory(error):
             raise
-        what = f"out of memory in step {step + 1} ({in_words(available_bytes())} are available"
-        cause, kept = f"{what} in main memory): {str(error).strip().splitlines()[0]}", ""
-        if step:
-            try:
-                save()
+        kept = "What was saved before stays. " if step else ""
+        if step and save:
+            with suppress(Exception):  # most likely the same; the earlier state is whole
+                save(step)
                 kept = f"The run is saved at step {step}. "
-            except Exception as failure:  # most likely the same
-                kept = (
-                    f"The run could not be saved at step {step} ({failure}): the last save stays. "
-                )
+        if step:
             kept += (
                 "With --resume, training.batch_size may be lowered where training.accumulate is "
+                "raised as much, and training.render_views and training.workers be set. "
             )
-            kept += "raised as much, and training.render_views and training.workers be set. "
         raise OutOfMemoryError(
-            f"{cause}. {kept}A new run takes less when you {LESS_MEMORY}."
+            f"out of memory in step {step + 1} ({in_words(available_bytes())} of main memory are "
+            f"available): {str(error).strip().splitlines()[0]}. {kept}A new run takes less when "
+            f"you {LESS_MEMORY}."
         ) from error

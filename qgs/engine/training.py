@@ -45,7 +45,7 @@ from qgs.engine.distributed import (
 )
 from qgs.engine.fit import explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
-from qgs.engine.guard import Guard, TrainingError, not_finite
+from qgs.engine.guard import Guard, not_finite
 from qgs.engine.objective import Objective, Outcome
 from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
@@ -217,7 +217,7 @@ class Trainer:
             if not self.folder.checkpoint.exists():
                 self.guard.save(self.step)
             return self._result(None)
-        stopped_by = None
+        stopped_by, alone = None, self.accelerator.num_processes == 1
         while self.used < 1 and not stopped_by:
             # Gradients of this step's batches; those of the next step are fetched meanwhile.
             rate = self.optimizer.learning_rate(self.step, self.seconds)
@@ -225,7 +225,7 @@ class Trainer:
                 group["lr"] = rate * group["factor"]
             self.torch_optimizer.zero_grad(set_to_none=True)
             batches = self.feed.batches
-            with explained(self.step, self._save_after_failure):
+            with explained(self.step, self.guard.save_to_go_on if alone else None):
                 measured = self._gradients(batches)
             for bad in (bad for batch in batches for bad in batch.left_out):
                 if not self.left_out[bad]:
@@ -241,7 +241,7 @@ class Trainer:
                 self._open_folder()
                 self.guard.leave_out(self.step, batches, symptom)
             else:
-                with explained(self.step, self._cannot_save):
+                with explained(self.step):
                     self.torch_optimizer.step()
                 if self.average:
                     self.average.update()
@@ -320,16 +320,6 @@ class Trainer:
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""
         self._resources.close()
-
-    def _save_after_failure(self) -> None:
-        """Save the run as it was before this step, unless others are in the midst of it."""
-        if self.accelerator.num_processes > 1:
-            self._cannot_save()
-        self.torch_optimizer.zero_grad(set_to_none=True)
-        self.guard.save_to_go_on(self.step)
-
-    def _cannot_save(self) -> None:
-        raise TrainingError("some weights, or other processes, are in the midst of the step")
 
     def _means(
         self, measured: Mapping[str, Tensor], stop: StopRequest
