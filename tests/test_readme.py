@@ -25,7 +25,9 @@ def test_overlay_is_the_recipe() -> None:
 
 
 def test_slots_and_their_defaults() -> None:
-    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", page("recipes.md").split("\n## ")[1], re.MULTILINE)
+    rows = re.findall(
+        r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", page("recipes.md").split("\n## ")[1], re.MULTILINE
+    )
     shown = {name.rpartition(".")[2]: re.findall(r"`([^`]+)`", types) for name, types in rows}
     defaults = {name: [slot.default] if slot.default else [] for name, slot in SLOTS.items()}
     defaults |= {name: list(s.defaults.values()) for name, s in SECTIONS.items() if s.named}

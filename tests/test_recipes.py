@@ -112,7 +112,9 @@ def _structure(node: Any) -> Any:
 
 def test_every_recipe_has_its_place_in_the_documents() -> None:
     named = set(re.findall(r"[\w-]+/[\w-]+\.yaml", document("docs/experiments.md")))
-    tiny = set(re.findall(r"recipes/([\w/-]+\.yaml)", document("README.md") + document("docs/photos.md")))
+    tiny = set(
+        re.findall(r"recipes/([\w/-]+\.yaml)", document("README.md") + document("docs/photos.md"))
+    )
     assert [file for file in FILES if file not in named | tiny] == []
     assert sorted(named - set(FILES)) == []
 

@@ -1,28 +1,41 @@
-"""Kill a training process again and again, many times inside a save, and see that nothing is lost.
+"""Kill a process again and again, many times while it writes, and see that nothing is lost.
 
-    python tools/kill_training.py --kills 50
+    python tools/kill_training.py --kills 50 --seed 0
+    python tools/kill_training.py --what evaluation --kills 50
+    python tools/kill_training.py --what packing --kills 50
 
-After each kill -9 the state and the checkpoint must be whole, and the run must go on from there; at
-the end its weights must equal, to the bit, those of the same run without a kill. Prints one line
-and ends with 1 if anything is lost.
+After each kill -9 of a training the state and the checkpoint must be whole, and the run must go on
+from there; at the end its weights must equal, to the bit, those of the same run without a kill.
+Killed evaluations and packings leave whole files alone and the run as it was, and in the end,
+called again, what they leave without a kill. Prints one line and ends with 1 if anything is lost.
 """
 
 import argparse
 import os
 import random
+import shutil
 import signal
 import tempfile
 import time
+import traceback
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
+from qgs_datatools import packing
+from qgs_datatools.entries import Encoding
 from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe, resolve
+from qgs.data.paths import opened_path
 from qgs.engine.checkpoint import read_state
+from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
+from qgs.io.checkpoint import load_recipe
 from qgs.io.files import is_leftover
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
@@ -47,11 +60,21 @@ def recipe_of(width: int, steps: int, save_every: int) -> Recipe:
 
 def start(recipe: Recipe, run: Path) -> int:
     """Train in a process of its own; its number."""
+    quiet = Console(quiet=True)
+    return in_child(partial(train, console=quiet, device="cpu", resume=True), recipe, run)
+
+
+def in_child(work: Callable[..., Any], *arguments: Any) -> int:
+    """Do `work` in a process of its own; its number."""
     child = os.fork()
     if child:
         return child
     torch.set_num_threads(1)
-    train(recipe, run, console=Console(quiet=True), device="cpu", resume=True)
+    try:
+        work(*arguments)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
     os._exit(0)
 
 
@@ -76,16 +99,8 @@ def saved_step(run: Path) -> int:
     return read_state(folder.state).parts["counters"]["step"] if folder.state.exists() else 0
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--width", type=int, default=256)
-    parser.add_argument("--longest", type=float, default=1.0, help="seconds until a kill")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    random.seed(options.seed)
-    torch.set_num_threads(1)
+def kill_training(options: argparse.Namespace) -> int:
+    """Kill trainings; 0 if nothing was lost."""
     recipe = recipe_of(options.width, options.steps, save_every=1)
     with tempfile.TemporaryDirectory() as scratch:
         run = Path(scratch, "run")
@@ -110,6 +125,79 @@ def main() -> int:
         + " those without kills"
     )
     return 0 if equal and not lost and kills == options.kills else 1
+
+
+def evaluate_run(run: Path, out: Path) -> None:
+    """As `qgs eval` does."""
+    recipe = load_recipe(run / "checkpoint.safetensors")
+    evaluate(qgs.load(run / "checkpoint.safetensors"), recipe).write(out)
+
+
+def pack_rooms(recipe: Recipe, out: Path) -> None:
+    """As `qgs data pack` does, in chunks of a few scenes."""
+    source = recipe.build_data()
+    splits = packing.own_splits(source)
+    packing.pack(
+        source, splits, opened_path(str(out)), {}, Encoding(False, None), chunk_bytes=4_000
+    )
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """What `folder` holds, by name, but for what killed processes left."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not is_leftover(path))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def kill_command(options: argparse.Namespace) -> int:
+    """Kill evaluations or packings; 0 if nothing was lost."""
+    settings = ("data.scenes=12", "data.test_scenes=6", "evaluation.scenes=6")
+    recipe = resolve(recipe_of(64, 3, 0).tree, settings)
+    with tempfile.TemporaryDirectory() as scratch:
+        run, out, through = (Path(scratch, name) for name in ("run", "out", "through"))
+        os.waitpid(start(recipe, run), 0)
+        before = files_of(run)
+        of_kind = {"evaluation": (evaluate_run, run), "packing": (pack_rooms, recipe)}
+        command, subject = of_kind[options.what]
+        began = time.monotonic()
+        os.waitpid(in_child(command, subject, through), 0)
+        longest, whole = time.monotonic() - began, files_of(through)
+        kills = inside = damaged = 0
+        while kills < options.kills:
+            child = in_child(command, subject, out)
+            time.sleep(random.uniform(0, longest))
+            os.kill(child, signal.SIGKILL)
+            code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            if code not in (0, -signal.SIGKILL):
+                print(f"called again after {kills} kills, {options.what} ended with {code}")
+                return 1
+            kills += code == -signal.SIGKILL
+            found = files_of(out)
+            inside += 0 < len(found.keys() & whole.keys()) < len(whole)
+            parts = [name for name in found.keys() & whole.keys() if found[name] != whole[name]]
+            damaged += bool(parts) or files_of(run) != before
+            if out.exists() and found == whole:
+                shutil.rmtree(out)
+        os.waitpid(in_child(command, subject, out), 0)
+        equal = files_of(out) == whole
+    print(
+        f"{kills} kills of {options.what}, {inside} amid its files; {damaged} times "
+        f"a file was damaged; in the end {'equal to' if equal else 'UNLIKE'} one without kills"
+    )
+    return 0 if equal and not damaged else 1
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--what", choices=("training", "evaluation", "packing"), default="training")
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--width", type=int, default=256)
+    parser.add_argument("--longest", type=float, default=1.0, help="seconds until a kill")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    random.seed(options.seed)
+    torch.set_num_threads(1)
+    return (kill_training if options.what == "training" else kill_command)(options)
 
 
 if __name__ == "__main__":

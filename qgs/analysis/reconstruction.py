@@ -26,16 +26,21 @@ from qgs.drawing.images import (
 from qgs.geometry.poses import look_at
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
+from qgs.memory import refuse_beyond_memory
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering
+from qgs.wording import listed
 
 ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
 FRAMES_PER_SECOND = 16
 OVERVIEW_COLUMNS = 8
 NOVEL, SWAY = 6, 0.12
+
+_PIXEL_BYTES = 5 * 4
+"""Of a rendering: RGB, alpha and depth in float32."""
 
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
@@ -65,18 +70,23 @@ def choose_frames(
         span = min(max(span, inputs), len(usable))
         first = (len(usable) - span) // 2
         frames = _evenly(usable[first : first + span], inputs)
+    _refuse_missing(frames, total)
     if compare is None:
         between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
         compare = _evenly(between, min(NOVEL, len(between)))
+    _refuse_missing(compare, total)
     every = [*frames, *compare]
-    missing = [frame for frame in every if not 0 <= frame < total]
-    if missing:
-        raise ValueError(f"frames {missing} do not exist; the photos are 0..{total - 1}")
     twice = sorted({frame for frame in every if every.count(frame) > 1})
     if twice:
         raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
     return tuple(frames), tuple(compare)
+
+
+def _refuse_missing(frames: Sequence[int], total: int) -> None:
+    missing = [frame for frame in frames if not 0 <= frame < total]
+    if missing:
+        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
 
 
 def choose_sample(
@@ -89,6 +99,18 @@ def choose_sample(
     """The views of `scene` that `choose_frames` picks, and their world as of `own_world`."""
     wanted, span = inputs or views.inputs, views.gap[1] + 1
     picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
+    (height, width), shown = scene.cameras.size, len(picked[0]) + len(picked[1])
+    finer_by = max(1, round(ORBIT_SIDE / max(height, width))) ** 2
+    refuse_beyond_memory(
+        f"a reconstruction of {shown} photos of {height} x {width}",
+        {
+            "photos and their renderings": shown * _PIXEL_BYTES * 2 * height * width,
+            f"the orbit's {ORBIT_FRAMES} renderings": (
+                ORBIT_FRAMES * _PIXEL_BYTES * height * width * finer_by
+            ),
+        },
+        "Take smaller photos (--size) or fewer of them (--inputs, --frames, --holdout).",
+    )
     sample = make_sample(scene, *picked, views, mirror=False)
     return sample, own_world(scene.cameras[list(picked[0])].c2w, views, scene.name)
 

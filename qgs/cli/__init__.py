@@ -55,10 +55,14 @@ def main() -> None:
     """
     try:
         app()
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
         from qgs.contracts.component import MissingExtraError
+        from qgs.memory import is_out_of_memory
 
-        theirs = isinstance(error, MissingExtraError) or not isinstance(error, RuntimeError)
+        if is_out_of_memory(error):
+            error.add_note("Out of memory: take fewer or smaller images, a smaller batch or model")
+        theirs = not isinstance(error, RuntimeError)
+        theirs |= isinstance(error, MissingExtraError) or is_out_of_memory(error)
         if os.environ.get("QGS_DEBUG") or not theirs:
             raise
         # A note of several lines is the traceback of another process.

@@ -76,7 +76,8 @@ def evaluate(
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
-    from qgs.io.checkpoint import load, load_extra, load_recipe
+    from qgs.engine.guard import refuse_broken
+    from qgs.io.checkpoint import load, load_recipe, load_step
     from qgs.io.models import is_own_path
 
     use_threads(threads)
@@ -91,9 +92,10 @@ def evaluate(
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
+    refuse_broken(model, checkpoint)
     folder = out or evaluation_folder(checkpoint, bool(settings), is_own_path(runs[0]))
-    step = load_extra(checkpoint).get("step")
-    evaluation = evaluate_into(model, recipe, int(step) if step else None, folder, console, batch)
+    step = load_step(checkpoint)
+    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
     run = RunFolder(checkpoint.parent)
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"

@@ -1,5 +1,7 @@
 """`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
 
+import importlib.util
+import keyword
 import re
 import shlex
 import unicodedata
@@ -64,6 +66,13 @@ def check_name(name: str) -> None:
         raise ValueError(
             f"`{name}` is the name of a device on Windows, where no file can have it; choose "
             f"another, such as `{name}-things`"
+        )
+    if keyword.iskeyword(name) or keyword.issoftkeyword(name):
+        raise ValueError(f"`{name}` is a word of Python; choose another, such as `{name}-things`")
+    if importlib.util.find_spec(name.replace("-", "_")):
+        raise ValueError(
+            f"`{name}` is a package that Python finds here, so `type: {name}/...` and qgs-{name} "
+            f"would pass for a part of it; choose another, such as `{name}-things`"
         )
     (value,) = load_mapping(f"name: {name}", name, Problems()).values()
     if value != name:

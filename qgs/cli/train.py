@@ -12,6 +12,7 @@ from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
 from qgs.cli.options import Device, Overrides, Threads, use_threads
+from qgs.wording import listed
 
 if TYPE_CHECKING:
     from qgs.composer import Recipe
@@ -51,6 +52,11 @@ def train(
     if result.main:
         before = "was already finished: " if finished and not result.stopped_by else ""
         console.print(f"{before}{result.steps} steps in {result.seconds:.0f} s, {run.checkpoint}")
+        if bad := result.left_out:
+            lines = [f"{count} x {reason}" for reason, count in bad.items()]
+            first = f"{sum(bad.values())} samples were left out (training.on_bad_sample: skip):"
+            text = "\n  ".join([first, listed(lines, 20, "\n  ")])
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
         if result.stopped_by:
             console.print(f"stopped early by {result.stopped_by}; not evaluated")
             console.print("continue with the same command and --resume", highlight=False)

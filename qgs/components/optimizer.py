@@ -82,7 +82,8 @@ class OneCycleAdamW(Optimizer):
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self._descent_starts = state["descent_starts"]
+        start = state["descent_starts"]
+        self._descent_starts = None if start is None else float(start)
 
 
 def _cosine(start: float, end: float, part: float) -> float:

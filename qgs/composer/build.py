@@ -16,6 +16,7 @@ from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
 from qgs.contracts import ModelComponent, ModelDims, Optimizer, Queries, Refinement, SceneSource
 from qgs.contracts.component import MissingExtraError
+from qgs.memory import is_out_of_memory
 from qgs.model import DecoderLayer, QueryGaussianModel
 from qgs.types import QueryState
 
@@ -124,10 +125,14 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         users_mistake = isinstance(error, ValueError | OSError) and issubclass(
             component, SceneSource | Optimizer
         )
+        where = chosen.place.origin.file, chosen.place.origin.line
+        if is_out_of_memory(error) or "overflow" in str(error).lower():
+            why = f"`{chosen.type}` cannot be made in this size: {error}"
+            problem = RecipeProblem(chosen.path, why, "lower the numbers of its options", *where)
+            raise RecipeError([problem]) from error
         if chosen.installed.plugin is BUILTIN or users_mistake:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
-        where = chosen.place.origin.file, chosen.place.origin.line
         problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
         raise RecipeError([problem]) from error
     if issubclass(component, Queries | Refinement):

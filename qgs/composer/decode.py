@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
-from qgs.composer.errors import Problems, did_you_mean, nearest
+from qgs.composer.errors import Problems, RecipeError, did_you_mean, nearest
 from qgs.composer.nodes import KeyPath, ListNode, MapNode, find, kind_of
 from qgs.composer.places import Place
 from qgs.composer.registry import InstalledPlugin, Registry, available_plugins, component_failure
@@ -123,6 +123,8 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
     installed = registry.plugins[name.partition("/")[0]]
     try:
         config = decode_config(component.Config, node.without("type"), place.source, problems)
+    except RecipeError:
+        raise
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
         problems.add(origin, path, failure.reason, failure.fix, error)

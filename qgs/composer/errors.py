@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 
-from qgs.composer.nodes import Origin
+from qgs.composer.nodes import Origin, shortened
 from qgs.contracts import Problem
 
 
@@ -25,21 +25,26 @@ class RecipeProblem(Problem):
         return f"{place}\n  why: {self.reason}\n  fix: {self.fix}"
 
 
+MAX_PROBLEMS = 50
+"""After so many a recipe is not read further: nobody reads more at once."""
+
+
 class RecipeError(ValueError):
-    """A recipe that cannot work. `problems` holds all that were found, by file and line."""
+    """A recipe that cannot work. `problems` holds what was found, by file and line."""
 
     def __init__(self, problems: Iterable[RecipeProblem]) -> None:
         ordered = sorted(set(problems), key=lambda p: (p.file, p.line, p.option, p.reason, p.fix))
         self.problems = tuple(ordered)
         title = "1 problem" if len(ordered) == 1 else f"{len(ordered)} problems"
-        super().__init__("\n".join([f"{title} in the recipe", *map(str, ordered)]))
+        more = ", and perhaps more: mend these first" if len(ordered) == MAX_PROBLEMS else ""
+        super().__init__("\n".join([f"{title} in the recipe{more}", *map(str, ordered)]))
 
 
 class Problems:
     """Collects problems while a recipe is read, so that all are reported at once."""
 
     def __init__(self) -> None:
-        self._found: list[RecipeProblem] = []
+        self._found: dict[RecipeProblem, None] = {}
         self._stopped = False
 
     def stop(self, origin: Origin, path: str, reason: str, fix: str) -> None:
@@ -50,8 +55,11 @@ class Problems:
     def add(
         self, origin: Origin, path: str, reason: str, fix: str, cause: Exception | None = None
     ) -> None:
-        """Note a mistake and go on."""
-        self._found.append(RecipeProblem(path, reason, fix, origin.file, origin.line, cause))
+        """Note a mistake and go on; raises RecipeError when there are MAX_PROBLEMS."""
+        place = shortened(path), shortened(reason, 2000), shortened(fix, 2000)
+        self._found[RecipeProblem(*place, shortened(origin.file, 1000), origin.line, cause)] = None
+        if len(self._found) == MAX_PROBLEMS:
+            self.raise_any()
 
     def raise_if_stopped(self) -> None:
         """Raise RecipeError if part of the recipe could not be read."""

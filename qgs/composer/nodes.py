@@ -2,10 +2,48 @@
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias, cast
 
 KeyPath: TypeAlias = tuple[str, ...]
+
+MAX_NESTING = 64
+MAX_VALUES = 20_000
+LARGEST = 2**63 - 1
+"""Integers beyond +- this are refused: pydantic and JSON readers elsewhere would fail on them."""
+
+
+class RecipeSizeError(ValueError):
+    """A recipe with more in it, or deeper in each other, than any recipe needs."""
+
+    fix = "write the recipe flatter and shorter, with fewer aliases"
+
+
+class UnfitValueError(ValueError):
+    """A value that no recipe holds. path: where it stands. fix: what to do."""
+
+    def __init__(self, path: KeyPath, reason: str, fix: str) -> None:
+        super().__init__(reason)
+        self.path, self.fix = path, fix
+
+
+@dataclass
+class Count:
+    """Counts the values of a recipe over all its files, those of aliases each time."""
+
+    values: int = field(default=0, init=False)
+
+    def one(self, depth: int) -> None:
+        """Count a value that stands inside `depth` others; raises RecipeSizeError."""
+        self.values += 1
+        if self.values > MAX_VALUES:
+            raise RecipeSizeError(
+                f"there are more than {MAX_VALUES:,} values, those of aliases counted each time"
+            )
+        if depth > MAX_NESTING:
+            raise RecipeSizeError(
+                f"mappings and lists stand more than {MAX_NESTING} deep in each other"
+            )
 
 
 @dataclass(frozen=True)
@@ -59,21 +97,54 @@ class ListNode(list[Any]):
 Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
-def from_plain(value: Any, origin: Origin) -> Node:
-    """A tree of a plain Python value; raises ValueError for one that YAML could not hold."""
+def from_plain(value: Any, origin: Origin, count: Count, path: KeyPath = ()) -> Node:
+    """A tree of a plain Python value, which stands at `path`.
+
+    Raises UnfitValueError for a value that YAML could not hold, RecipeSizeError.
+    """
+    count.one(len(path))
     if isinstance(value, Mapping):
-        entries = ((str(key), from_plain(item, origin), origin) for key, item in value.items())
+        keys = [(_checked(str(key), path), item) for key, item in value.items()]
+        entries = ((k, from_plain(item, origin, count, (*path, k)), origin) for k, item in keys)
         return MapNode(origin, entries)
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return ListNode(origin, ((from_plain(item, origin), origin) for item in value))
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
+        items = (from_plain(x, origin, count, (*path, str(i))) for i, x in enumerate(value))
+        return ListNode(origin, ((item, origin) for item in items))
+    value = os.fspath(value) if isinstance(value, os.PathLike) else value
     if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise ValueError(
-        f"a recipe holds mappings, lists, strings, numbers, truth values and None; got {value!r} "
-        f"({type(value).__name__})"
-    )
+        return _checked(value, path)
+    kind = type(value).__name__
+    reason = f"a recipe holds no {kind}, got {value!r}"
+    raise UnfitValueError(path, reason, "give mappings, lists, strings, numbers, bools, None")
+
+
+def _checked(value: Any, path: KeyPath) -> Any:
+    """`value`, a scalar or a key at `path`; raises UnfitValueError."""
+    if isinstance(value, str):
+        fault = text_fault(value)
+        if fault:
+            raise UnfitValueError(path, f"{shortened(repr(value))} {fault}", "remove it")
+    elif isinstance(value, int) and abs(value) > LARGEST:
+        raise UnfitValueError(path, "an integer does not fit into 64 bits", "give a smaller one")
+    return value
+
+
+def text_fault(text: str) -> str:
+    """What neither a path nor a text in UTF-8 can hold, of all that a string can; "" if nothing."""
+    if "\0" in text:
+        return "holds a NUL character"
+    lone = any("\ud800" <= character <= "\udfff" for character in text)
+    return "holds half of a surrogate pair, which is no character" if lone else ""
+
+
+def shortened(text: str, most: int = 120) -> str:
+    """`text` for a message: its middle left out beyond `most` characters, no control characters."""
+    if len(text) > most:
+        half = most // 2
+        text = f"{text[:half]} ... {text[-half:]} ({len(text):,} characters)"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 def kind_of(value: Any) -> str:
@@ -84,7 +155,7 @@ def kind_of(value: Any) -> str:
         return "nothing (null)"
     if isinstance(value, bool):
         return f"the truth value {str(value).lower()}"
-    return f"the {'string' if isinstance(value, str) else 'number'} {value!r}"
+    return f"the {'string' if isinstance(value, str) else 'number'} {shortened(repr(value))}"
 
 
 def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:

@@ -14,13 +14,16 @@ from qgs.composer.decode import Chosen, check_tree, decode_place, decode_setting
 from qgs.composer.errors import Problems
 from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import check_flow, check_options
-from qgs.composer.nodes import KeyPath, ListNode, MapNode, Origin, from_plain
+from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.rates import rate_factors
 from qgs.composer.registry import Registry, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import inline
+from qgs.memory import refuse_beyond_memory
 from qgs.model import QueryGaussianModel
+
+SMALLER_MODEL = "Lower the option of the model that makes the largest of them."
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,16 @@ class Recipe:
     plugin_versions: Mapping[str, str]
 
     def build_model(self, device: torch.device | str | None = None) -> QueryGaussianModel:
-        """The model with its initial parameters; on "meta" it takes no memory."""
-        return build_model(self.parts, self.dims, self.layer_scale, self.seed, self.tree, device)
+        """The model with its initial parameters; on "meta" it takes no memory.
+
+        Raises TooLargeError for weights that do not fit into memory, before any is made.
+        """
+        arguments = self.parts, self.dims, self.layer_scale, self.seed, self.tree
+        if device is None or torch.device(device).type != "meta":
+            state = build_model(*arguments, "meta").state_dict()
+            sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
+            refuse_beyond_memory("the model with its weights", sizes, SMALLER_MODEL)
+        return build_model(*arguments, device)
 
     def build_losses(self) -> dict[str, contracts.Loss]:
         """Losses by the names that the recipe gives; without any, training refuses to start."""
@@ -87,7 +98,8 @@ def resolve(
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
-    tree = apply_overrides(read_recipe(recipe, problems), overrides, problems)
+    count = Count()
+    tree = apply_overrides(read_recipe(recipe, problems, count), overrides, problems, count)
     tree = check_tree(tree, problems)
     problems.raise_if_stopped()
     tree = _with_defaults(tree)
@@ -131,7 +143,7 @@ def _with_defaults(tree: MapNode) -> MapNode:
         for name, section in SECTIONS.items()
         if section.named and (section.defaults_stay or name not in tree)
     }
-    defaults = from_plain(missing, Origin("default"))
+    defaults = from_plain(missing, Origin("default"), Count())
     assert isinstance(defaults, MapNode)
     return merge(defaults, tree)
 

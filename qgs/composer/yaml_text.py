@@ -1,17 +1,27 @@
 """YAML text to nodes, as YAML 1.2 reads scalars, and values to YAML text."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import yaml
 
 from qgs.composer.errors import Problems
-from qgs.composer.nodes import KeyPath, ListNode, MapNode, Node, Origin, kind_of
+from qgs.composer.nodes import (
+    LARGEST,
+    Count,
+    KeyPath,
+    ListNode,
+    MapNode,
+    Node,
+    Origin,
+    RecipeSizeError,
+    kind_of,
+    shortened,
+    text_fault,
+)
 
-MAX_NESTING = 64
-MAX_VALUES = 100_000
-"""Values of one file, aliases written out: a few aliases of aliases make billions of them."""
-_LARGEST = 2**63 - 1
 _STANDARD = "tag:yaml.org,2002:"
 _TAGS = {_STANDARD + name for name in ("null", "bool", "int", "float", "str", "map", "seq")}
 _RESOLVERS = (
@@ -23,22 +33,20 @@ _RESOLVERS = (
 )
 
 
-class SizeError(yaml.MarkedYAMLError):
-    """More values, or more of them inside each other, than any recipe needs."""
-
-
 class Yaml12Loader(yaml.SafeLoader):
     """Composes nodes with YAML 1.2 tags; `scalar_value` reads their values."""
 
     yaml_implicit_resolvers: dict = {}  # noqa: RUF012
-    _nesting = 0
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._nesting, self._count = 0, Count()
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """PyYAML's, refusing what would overflow the stack of whoever walks the tree."""
+        with sized(self.peek_event().start_mark):
+            self._count.one(self._nesting)
         self._nesting += 1
-        if self._nesting > MAX_NESTING:
-            text = f"mappings and lists stand more than {MAX_NESTING} deep in each other"
-            raise SizeError(problem=text, problem_mark=self.peek_event().start_mark)
         node = super().compose_node(parent, index)
         self._nesting -= 1
         return node
@@ -52,6 +60,19 @@ class Yaml12Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         """Write repeated values out."""
         return True
+
+
+class SizeError(yaml.MarkedYAMLError):
+    """A RecipeSizeError, and where."""
+
+
+@contextmanager
+def sized(mark: yaml.Mark) -> Iterator[None]:
+    """Raise a RecipeSizeError of the block as a SizeError at `mark`."""
+    try:
+        yield
+    except RecipeSizeError as error:
+        raise SizeError(problem=str(error), problem_mark=mark) from None
 
 
 for _kind, _pattern, _first in _RESOLVERS:
@@ -72,7 +93,7 @@ def scalar_value(tag: str, text: str) -> Any:
         return text.lower() == "true"
     if kind == "int":
         base = {"0o": 8, "0x": 16}.get(text[:2], 10)
-        if len(text) > 100 or abs(value := int(text, base)) > _LARGEST:
+        if len(text) > 100 or abs(value := int(text, base)) > LARGEST:
             raise OverflowError(f"an integer of {len(text)} digits does not fit into 64 bits")
         return value
     if kind == "float":
@@ -91,9 +112,9 @@ def inline(value: Any) -> str:
     return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
 
 
-def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
+def load_mapping(text: str, file: str, problems: Problems, count: Count | None = None) -> MapNode:
     """The mapping in `text`; an empty one, and a problem, where there is something else."""
-    node = load_text(text, file, problems)
+    node = load_text(text, file, problems, count=count)
     if isinstance(node, MapNode):
         return node
     origin = node.origin if isinstance(node, ListNode) else Origin(file, 1)
@@ -106,18 +127,29 @@ def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
 
 
 def load_text(
-    text: str, file: str, problems: Problems, line: int | None = None, path: KeyPath = ()
+    text: str,
+    file: str,
+    problems: Problems,
+    line: int | None = None,
+    path: KeyPath = (),
+    count: Count | None = None,
 ) -> Node:
     """The value of `text`; an empty mapping, and a problem, where it is no YAML.
 
-    line: given to every node in place of its own line. path: where the text belongs.
+    line: given to every node in place of its own line. path: where the text belongs. count: of the
+    values of the recipe so far.
     """
     try:
         root = yaml.compose(text, Loader=Yaml12Loader)
-        return None if root is None else _Reader(file, problems, line).read(root, path)
+        return (
+            None
+            if root is None
+            else _Reader(file, problems, line, count or Count()).read(root, path)
+        )
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-        number = mark.line + 1 if mark else 1
+        before = getattr(error, "position", 0)  # of a ReaderError, which has no mark
+        number = 1 + (mark.line if mark else text.count("\n", 0, before))
         origin = Origin(file, number if line is None else line)
         reason, fix = _explain(error, "".join(text.splitlines()[number - 1 : number]))
         problems.stop(origin, ".".join(path), reason, fix)
@@ -127,9 +159,11 @@ def load_text(
 def _explain(error: yaml.YAMLError, written: str) -> tuple[str, str]:
     """Reason and fix. written: the line that the parser complains about."""
     if isinstance(error, SizeError):
-        return str(error.problem), "write the recipe flatter, with fewer aliases"
+        return str(error.problem), RecipeSizeError.fix
     if "\t" in written[: len(written) - len(written.lstrip())] or "'\\t'" in str(error):
         return "a tab stands where YAML wants spaces", "indent with spaces"
+    if isinstance(error, yaml.reader.ReaderError):
+        return f"the character {chr(error.character)!r} is not allowed in YAML", "remove it"
     reason = f"this is no valid YAML: {getattr(error, 'problem', None) or error}"
     return reason, "correct the line; check indentation, brackets, quotes and `: ` before it"
 
@@ -137,32 +171,33 @@ def _explain(error: yaml.YAMLError, written: str) -> tuple[str, str]:
 class _Reader:
     """Turns PyYAML's nodes into ours. line: see `load_text`."""
 
-    def __init__(self, file: str, problems: Problems, line: int | None) -> None:
-        self.file, self.problems, self.line = file, problems, line
+    def __init__(self, file: str, problems: Problems, line: int | None, count: Count) -> None:
+        self.file, self.problems, self.line, self.count = file, problems, line, count
         self.open: list[yaml.Node] = []
-        self.count = 0
 
     def origin(self, node: yaml.Node) -> Origin:
         return Origin(self.file, node.start_mark.line + 1 if self.line is None else self.line)
 
     def read(self, node: yaml.Node, path: KeyPath) -> Node:
-        self.count += 1
-        if self.count > MAX_VALUES:
-            text = f"there are more than {MAX_VALUES:,} values, those of aliases counted each time"
-            raise SizeError(problem=text, problem_mark=node.start_mark)
         if any(node is parent for parent in self.open):
             return self.stop(node, path, "an alias stands inside its own anchor", "remove it")
+        with sized(node.start_mark):
+            self.count.one(len(path))
         if node.tag not in _TAGS:
             fix = "remove the tag; components are named with `type`"
             return self.stop(node, path, f"the tag {node.tag!r} is not allowed in a recipe", fix)
         if isinstance(node, yaml.ScalarNode):
             try:
-                return scalar_value(node.tag, node.value)
+                value = scalar_value(node.tag, node.value)
+                fault = text_fault(value) if isinstance(value, str) else ""
+                text = f"{shortened(repr(value))} {fault}"
+                return self.stop(node, path, text, "remove it") if fault else value
             except OverflowError as error:
                 return self.stop(node, path, str(error), "write a smaller number")
             except ValueError:
                 kind = node.tag.removeprefix(_STANDARD)
-                return self.stop(node, path, f"{node.value!r} is no {kind}", "remove the tag")
+                text = f"{shortened(repr(node.value))} is no {kind}"
+                return self.stop(node, path, text, "remove the tag")
         self.open.append(node)
         try:
             if isinstance(node, yaml.MappingNode):
@@ -183,6 +218,8 @@ class _Reader:
             elif key == "<<" and key_node.style is None:
                 reason = "merge keys (`<<`) are not part of YAML 1.2"
                 fix = "write the keys out, or share them between files with `extends`"
+            elif text_fault(key):
+                reason, fix = f"the key {shortened(repr(key))} {text_fault(key)}", "remove it"
             elif key in read:
                 reason = f"the key `{key}` is already given at {read[key][2]}"
                 fix = "keep one of the two"

@@ -66,6 +66,9 @@ class TrainingConfig(ComponentConfig):
     """Decay of a moving average of the weights, saved and evaluated beside them; null for none."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """What a step with a NaN or infinite loss or gradient does; its batch and weights are saved."""
+    on_bad_sample: Literal["stop", "skip"] = "stop"
+    """What a sample that cannot be made does, of a damaged image for example; "skip" takes one of
+    the next scenes instead, counts it, and names it in the end."""
     evaluate_every: int = Field(default=0, ge=0)
     """Steps between evaluations with pictures; 0 for none."""
     trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()

@@ -23,6 +23,7 @@ from qgs.geometry.poses import (
     relative_to,
     scaled,
 )
+from qgs.memory import refuse_beyond_memory
 from qgs.types import Cameras, Views, map_tensors
 
 Frames: TypeAlias = tuple[int, ...]
@@ -48,6 +49,8 @@ class Batch:
     scenes: tuple[str, ...]
     input_frames: tuple[Frames, ...]
     target_frames: tuple[Frames, ...]
+    left_out: tuple[str, ...] = ()
+    """What was to be in it and could not be made: scene, frame and reason."""
 
 
 def training_frames(scene: Scene) -> list[int]:
@@ -78,6 +81,22 @@ def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
     return max(min(low, high), views.inputs - 1), high
 
 
+def image_bytes(frames: int, size: tuple[int, int]) -> int:
+    """What RGB images of (H, W) `size` take in float32."""
+    return frames * 3 * size[0] * size[1] * torch.float32.itemsize
+
+
+def refuse_too_many(frames: int, scene: Scene) -> None:
+    """Raise TooLargeError when so many images of `scene` do not fit into memory."""
+    height, width = scene.cameras.size
+    refuse_beyond_memory(
+        f"a sample of {frames} images of {height} x {width}",
+        {"images": image_bytes(frames, (height, width))},
+        "Ask for fewer views (views.inputs, views.targets, --inputs, --holdout) or smaller images "
+        "(data.image_size, --size).",
+    )
+
+
 def draw_frames(
     scene: Scene, views: ViewsConfig, rng: np.random.Generator
 ) -> tuple[Frames, Frames]:
@@ -85,6 +104,7 @@ def draw_frames(
 
     Targets are no inputs, where there are enough frames; then inputs join, then frames repeat.
     """
+    refuse_too_many(views.inputs + views.targets, scene)
     usable = training_frames(scene)
     low, high = gap_range(len(usable), views, scene.name)
     gap = int(rng.integers(low, high + 1))
@@ -107,6 +127,7 @@ def make_sample(
 ) -> Sample:
     """Decode frames, normalise poses in the scene's precision, mirror if asked; float32."""
     frames = (*input_frames, *target_frames)
+    refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
     order = [place[frame] for frame in frames]

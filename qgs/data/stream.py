@@ -6,10 +6,11 @@ import logging
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count, islice
 from typing import Any
@@ -19,7 +20,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import Scene, SceneSource, ViewsConfig
+from qgs.data.evaluation import one_line
+from qgs.data.paths import is_local, opened_path
 from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
+from qgs.memory import is_out_of_memory
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,15 @@ class Share:
 
     rank: int = 0
     processes: int = 1
+
+
+MAX_REPLACED = 10
+"""Samples that may take the place of one that cannot be made; then training stops."""
+
+PAUSES = (1.0, 4.0)
+"""Seconds before a remote store is asked again for a sample."""
+
+_log = logging.getLogger(__name__)
 
 
 class SampleError(ValueError):
@@ -47,16 +60,17 @@ def training_batches(
     *,
     share: Share = Share(),
     workers: int = 0,
+    skips: bool = False,
 ) -> Generator[Batch, None, None]:
     """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
     Sample k depends on (seed, k) alone. Global batch n is the samples from n * batch_size *
     processes on, of which every process gets its slice: `start` resumes exactly, and processes and
     workers change nothing. workers: processes that decode; 0 decodes in a thread. Closing ends
-    them.
+    them. skips: see `SampleStream`.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
-    batches = _Batches(source, views, seed, batch_size, share)
+    batches = _Batches(source, views, seed, batch_size, share, skips)
     return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
 
 
@@ -98,10 +112,19 @@ class SceneOrder:
 
 
 class SampleStream:
-    """Samples by number, each of (seed, number) alone. Raises ValueError without scenes."""
+    """Samples by number, each of (seed, number) alone. Raises ValueError without scenes.
 
-    def __init__(self, source: SceneSource, views: ViewsConfig, seed: int) -> None:
-        self._views, self._seed = views, seed
+    skips: a sample that cannot be made gives way to one of the next scene, the first of
+    MAX_REPLACED that can be made. Reading from a remote store is tried again after PAUSES.
+    """
+
+    def __init__(
+        self, source: SceneSource, views: ViewsConfig, seed: int, skips: bool = False
+    ) -> None:
+        self._views, self._seed, self._skips = views, seed, skips
+        path = getattr(source.config, "path", None)
+        remote = isinstance(path, str) and not is_local(opened_path(path))
+        self._pauses = PAUSES if remote else ()
         self._scenes = source.scenes("train")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
@@ -109,17 +132,38 @@ class SampleStream:
 
     def batch(self, numbers: Sequence[int]) -> Batch:
         """Samples by number. Raises ValueError for too few frames in a scene, else SampleError."""
-        return collate([self._sample(number) for number in numbers])
+        left_out: list[str] = []
+        batch = collate([self._sample(number, left_out) for number in numbers])
+        return replace(batch, left_out=tuple(left_out))
 
-    def _sample(self, number: int) -> Sample:
-        rng = np.random.default_rng([self._seed, 1, number])
-        scene = self._scenes[self.order.scene(number)]
+    def _sample(self, number: int, left_out: list[str]) -> Sample:
+        for attempt in range(MAX_REPLACED + 1):
+            try:
+                return self._made(number, attempt)
+            except Exception as error:
+                if not self._skips:
+                    raise
+                left_out.append(one_line(error))
+        raise SampleError(
+            f"{MAX_REPLACED + 1} samples in a row cannot be made, the last: {left_out[-1]}"
+        )
+
+    def _made(self, number: int, attempt: int) -> Sample:
+        """Sample `number`, or what takes its place after so many failed attempts."""
+        rng = np.random.default_rng([self._seed, 1, number, *[attempt] * bool(attempt)])
+        scene = self._scenes[self.order.scene(number + attempt)]
         mirror = bool(rng.random() < self._views.mirror)
         inputs, targets = draw_frames(scene, self._views, rng)
-        try:
-            return make_sample(scene, inputs, targets, self._views, mirror)
-        except Exception as error:
-            raise SampleError(_what_failed(scene, (*inputs, *targets), error)) from error
+        for pause in (*self._pauses, None):
+            try:
+                return make_sample(scene, inputs, targets, self._views, mirror)
+            except Exception as error:
+                failure = SampleError(_what_failed(scene, (*inputs, *targets), error))
+                if pause is None or is_out_of_memory(error):
+                    raise failure from error
+                _log.warning("%s; the store is asked again in %g s", failure, pause)
+                time.sleep(pause)
+        raise AssertionError
 
 
 def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
@@ -145,10 +189,16 @@ class _Batches(Dataset[Batch | _Failure]):
     """The batches of one process; a copy in a worker opens the data itself when first used."""
 
     def __init__(
-        self, source: SceneSource, views: ViewsConfig, seed: int, batch_size: int, share: Share
+        self,
+        source: SceneSource,
+        views: ViewsConfig,
+        seed: int,
+        batch_size: int,
+        share: Share,
+        skips: bool,
     ) -> None:
-        self._stream: SampleStream | None = SampleStream(source, views, seed)
-        self._source, self._settings = (type(source), source.config), (views, seed)
+        self._source, self._settings = (type(source), source.config), (views, seed, skips)
+        self._stream: SampleStream | None = SampleStream(source, *self._settings)
         self._size, self._share = batch_size, share
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """What a run saves and continues from; starting from the weights of another one."""
 
 import json
+import math
 import os
 import random
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +16,8 @@ from accelerate.utils import gather_object
 from torch import Tensor, nn
 
 import qgs
-from qgs.composer import Recipe, resolve
+from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import flat
-from qgs.composer.slots import with_moved
 from qgs.data.domain import KEY, SAMPLES, Domain
 from qgs.data.sampling import Batch
 from qgs.engine.distributed import placed_like, sharded, whole
@@ -33,14 +33,21 @@ from qgs.io.checkpoint import (
     unique_tensors,
     write_tensors,
 )
-from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
+from qgs.io.differences import (
+    differing_tensors,
+    differing_types,
+    options_beside_weights,
+    shapes_of,
+)
+from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
 from qgs.model import QueryGaussianModel
+from qgs.wording import listed
 
 FORMAT_VERSION = 1
 """Raised when the format of the file changes."""
 
 _PARTS, _RECIPE = "qgs.state", "qgs.recipe"
-_FORMAT, _VERSION = "qgs.state_version", "qgs.version"
+_FORMAT, _VERSION, _TENSORS = "qgs.state_version", "qgs.version", "qgs.tensors"
 
 State: TypeAlias = Mapping[str, Any]
 """Tensors and JSON values by name."""
@@ -79,6 +86,7 @@ def write_state(
                 tensors[f"{part}/{key}"] = tensor.cpu().clone(memory_format=torch.contiguous_format)
     metadata = {
         _PARTS: json.dumps(values),
+        _TENSORS: json.dumps(_kinds(tensors)),
         _RECIPE: json.dumps(recipe),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
@@ -94,16 +102,35 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         metadata = file.metadata() or {}
     if _PARTS not in metadata:
         raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
-    if int(metadata[_FORMAT]) > FORMAT_VERSION:
-        raise CheckpointError(
-            f"{path} was written by qgs {metadata[_VERSION]} with {_FORMAT} {metadata[_FORMAT]}; "
-            f"this is qgs {qgs.__version__}, which knows {FORMAT_VERSION}: install the newer qgs"
-        )
-    parts: dict[str, dict[str, Any]] = json.loads(metadata[_PARTS])
-    for name, tensor in read_tensors(path).items():
-        part, key = name.split("/", 1)
+    refuse_newer(metadata, {_FORMAT: FORMAT_VERSION}, _VERSION, path)
+    parts, tensors = mapping_in(metadata, _PARTS, path), read_tensors(path)
+    _refuse_others(tensors, metadata, path)
+    for name, tensor in tensors.items():
+        part, slash, key = name.partition("/")
+        if not slash or not isinstance(parts.get(part), dict):
+            raise damaged(path, f"the tensor `{name[:200]}` belongs to no part of a run")
         parts[part][key] = tensor
-    return SavedState(resolve(with_moved(json.loads(metadata[_RECIPE]))), parts)
+    try:
+        return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
+    except RecipeError as error:
+        raise damaged(path, f"its recipe fails here, or needs other plugins: {error}") from error
+
+
+def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
+    return {name: [str(t.dtype).removeprefix("torch."), *t.shape] for name, t in tensors.items()}
+
+
+def _refuse_others(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], path: Any) -> None:
+    """Raise CheckpointError unless `tensors` are those that were written; old files do not tell."""
+    found = _kinds(tensors)
+    wanted = mapping_in(metadata, _TENSORS, path) if _TENSORS in metadata else found
+    differing = [
+        f"{name[:200]}: {found.get(name, 'absent')} instead of {str(wanted.get(name))[:200]}"
+        for name in dict.fromkeys([*wanted, *found])
+        if found.get(name) != wanted.get(name)
+    ]
+    if differing:
+        raise damaged(path, f"not the tensors that were written: {listed(differing, between='; ')}")
 
 
 class Saver:
@@ -132,6 +159,7 @@ class Saver:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
         parts = {name: part.state() for name, part in self.parts.items()}
         if self._accelerator.is_main_process:
+            self.folder.refuse_gone()
             if not state_only:
                 if not self.folder.state.exists():
                     self._write_state(parts)  # a checkpoint alone cannot be continued
@@ -145,6 +173,7 @@ class Saver:
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
         """Save a checkpoint of other weights than the present ones."""
         if self._accelerator.is_main_process:
+            self.folder.refuse_gone()
             save(self.model, self.folder.checkpoint, extra=self._extra(step), weights=weights)
         self._accelerator.wait_for_everyone()
 
@@ -166,7 +195,17 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            part.load_state(saved.parts[name])
+            fault = unlike(part.state(), saved.parts[name]) or broken(saved.parts[name], name)
+            try:
+                if not fault:
+                    part.load_state(saved.parts[name])
+            except OtherRunError:
+                raise
+            except Exception as error:  # whatever a part, or a plugin's, raises about its state
+                known = isinstance(error, CheckpointError)
+                fault = str(error) if known else f"{type(error).__name__}: {error}"
+            if fault:
+                raise damaged(self.folder.state, f"its part `{name}` cannot be restored ({fault})")
         if self.folder.checkpoint.is_file():
             known = load_extra(self.folder.checkpoint).get(KEY)
             self.domain = Domain.read(known) if known else Domain()
@@ -180,6 +219,28 @@ class Saver:
         write_state(self.folder.state, self.model.recipe, parts)
 
 
+def unlike(now: Any, saved: Any, name: str = "") -> str:
+    """Where JSON values that were saved are of another kind than those of today; "" if nowhere.
+
+    Numbers and mappings are compared; a text may have been null, a list of another length.
+    """
+    if isinstance(now, Mapping):
+        if not isinstance(saved, Mapping):
+            return f"{name or 'it'} is no mapping"
+        found = (
+            unlike(value, saved[key], f"{name}.{key}".removeprefix("."))
+            for key, value in now.items()
+            if not isinstance(value, Tensor)
+            if key in saved
+        )
+        return next(filter(None, found), "")
+    if isinstance(now, int | float):
+        sound = type(saved) is type(now) or (type(now), type(saved)) == (float, int)
+        if not sound or not (0 if type(now) is int else -math.inf) <= saved < math.inf:
+            return f"{name} is {str(saved)[:100]!r}"
+    return ""
+
+
 class Weights:
     """Parameters and persistent buffers of a module, by name."""
 
@@ -191,8 +252,24 @@ class Weights:
 
     @torch.no_grad()
     def load_state(self, state: State) -> None:
-        for name, tensor in unique_tensors(self._module).items():
+        tensors = unique_tensors(self._module)
+        refuse_other_tensors(state, tensors)
+        for name, tensor in tensors.items():
             tensor.copy_(placed_like(state[name], tensor))
+
+
+def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:
+    """Raise CheckpointError unless `saved` has the names, shapes and types of `wanted` alone."""
+    differences = differing_tensors(shapes_of(saved), shapes_of(wanted))
+    if found := differences + differing_types(saved, wanted):
+        raise CheckpointError(f"{len(found)} differences: {listed(found, between='; ')}")
+
+
+def broken(state: State, part: str) -> str:
+    """The tensors of `state` with NaN, of weights infinity too; "" if none has."""
+    sound = (lambda t: ~torch.isnan(t)) if part == "moments" else torch.isfinite
+    names = [k for k, v in state.items() if isinstance(v, Tensor) and not bool(sound(v).all())]
+    return f"not finite: {listed(names)}" if names else ""
 
 
 class OptimizerState:
@@ -211,6 +288,9 @@ class OptimizerState:
 
     def load_state(self, state: State) -> None:
         self._optimizer.state.clear()
+        unknown = [path for path in state if path.rpartition("/")[0] not in self._parameters]
+        if unknown:
+            raise CheckpointError(f"of no parameter of the model: {listed(unknown)}")
         for path, value in state.items():
             name, key = path.rsplit("/", 1)
             parameter = self._parameters[name]
@@ -265,6 +345,7 @@ FREE = (
     "training.workers",
     "training.render_views",
     "training.on_nonfinite",
+    "training.on_bad_sample",
     "training.evaluate_every",
     "training.trackers",
     "evaluation",

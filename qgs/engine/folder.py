@@ -4,11 +4,16 @@ import fcntl
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
-from qgs.io.files import is_leftover, read_records, write_text
+from qgs.io.files import is_leftover, read_records, told_where_full, write_text
 from qgs.io.models import checkpoint_path
+
+
+class FolderGoneError(OSError):
+    """The folder of a run is not there any more; the message says what becomes of the run."""
 
 
 class RunFolder:
@@ -28,6 +33,7 @@ class RunFolder:
         self._history_file = self.path / "history.jsonl"
         self._history: TextIO | None = None
         self._lock: int | None = None
+        self._taken: tuple[int, int] | None = None
 
     @property
     def is_new(self) -> bool:
@@ -73,21 +79,37 @@ class RunFolder:
                 ) from None
             except OSError:
                 self.close()  # this file system knows no locks
+        self._taken = (found := self.path.stat()).st_dev, found.st_ino
         for leftover in filter(is_leftover, self.path.iterdir()):
             leftover.unlink()
 
     def append(self, record: Mapping[str, float]) -> None:
         """Add one line to the history."""
-        if self._history is None:
-            self._history = self._history_file.open("a", encoding="utf-8")
-        self._history.write(json.dumps(record) + "\n")
+        self.refuse_gone()
+        with told_where_full(self._history_file):
+            if self._history is None:
+                self._history = self._history_file.open("a", encoding="utf-8")
+            self._history.write(json.dumps(record) + "\n")
+
+    def refuse_gone(self) -> None:
+        """Raise FolderGoneError when the folder that was taken is no longer at its path."""
+        if self._taken is None:
+            return
+        there = self.path.stat() if self.path.is_dir() else None
+        if there is None or (there.st_dev, there.st_ino) != self._taken:
+            raise FolderGoneError(
+                f"{self.path} was deleted, moved or replaced while a training wrote into it, so "
+                "the training stops; nothing is written in its place"
+            )
 
     def flush(self, to_disk: bool = False) -> None:
         """Let others read the history so far; to_disk: also see that it outlives the system."""
+        self.refuse_gone()
         if self._history is not None:
-            self._history.flush()
-            if to_disk:
-                os.fsync(self._history.fileno())
+            with told_where_full(self._history_file):
+                self._history.flush()
+                if to_disk:
+                    os.fsync(self._history.fileno())
 
     def history(self) -> list[dict[str, float]]:
         """All records so far, one per optimiser step; of one left out, finite numbers."""
@@ -103,7 +125,8 @@ class RunFolder:
     def close(self) -> None:
         """Close the history and leave the folder to others."""
         if self._history is not None:
-            self._history.close()
+            with suppress(OSError):  # a full disk, of which its last flush has told
+                self._history.close()
         if self._lock is not None:
             os.close(self._lock)
         self._history = self._lock = None

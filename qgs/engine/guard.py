@@ -15,9 +15,10 @@ from accelerate import Accelerator
 from accelerate.utils import gather_object
 from torch import Tensor, nn
 
-from qgs.contracts import TrainingConfig
+from qgs.composer import Recipe
 from qgs.data.sampling import Batch
-from qgs.engine.checkpoint import Saver, Weights
+from qgs.engine.causes import blamed
+from qgs.engine.checkpoint import Saver, Weights, refuse_other_tensors
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
@@ -89,28 +90,35 @@ class Guard:
         accelerator: Accelerator,
         objective: Objective,
         saver: Saver,
-        config: TrainingConfig,
+        recipe: Recipe,
         repeat: Callable[[Sequence[Batch]], Any],
     ) -> None:
         """objective: not wrapped by accelerate. repeat: computes the gradients of batches again."""
+        config = recipe.training
         self.detector = CollapseDetector(config.collapse_window)
         self.good = GoodWeights(objective.model, keep=accelerator.is_main_process)
         self.incidents = self.skipped = 0
         self._accelerator, self._objective, self._repeat = accelerator, objective, repeat
         self._saver, self._skips = saver, config.on_nonfinite == "skip"
+        self._recipe, self._alive = recipe, dict[str, float]()
 
     def state(self) -> dict[str, Any]:
         detector = self.detector.state()
-        return {"incidents": self.incidents, "skipped": self.skipped, "detector": detector}
+        counts = {"incidents": self.incidents, "skipped": self.skipped}
+        return {**counts, "detector": detector, "alive": self._alive}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self.incidents, self.skipped = state["incidents"], state["skipped"]
         self.detector.load_state(state["detector"])
+        self._alive = {name: float(n) for name, n in state.get("alive", {}).items()}
 
     def passed(self, numbers: Mapping[str, float]) -> None:
         """Take note of a finite step."""
         self.skipped = 0
         self.detector.observe(numbers)
+        self.good.observe(numbers)
+        if not self.detector.symptom:
+            self._alive = dict(numbers)
 
     def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
         """Look into the step after `step`, which is not finite; return to go on without it.
@@ -170,9 +178,13 @@ class Guard:
             self._collapse(step, symptom, COLLAPSE_CAUSES)
 
     def keep_good(self, step: int) -> None:
-        """Take the weights for good ones. Raises CollapseError for weights that are not finite."""
-        self._refuse_broken_weights(step)
-        self.good.refresh(step)
+        """Take the weights for good ones, where it is time and the images are as good as before.
+
+        Raises CollapseError for weights that are not finite.
+        """
+        if not self.detector.dead_steps and self.good.due(step, self.detector.window):
+            self._refuse_broken_weights(step)
+            self.good.refresh(step)
 
     def save(self, step: int) -> None:
         """Save the run. Raises CollapseError for weights that are not finite."""
@@ -203,6 +215,8 @@ class Guard:
 
     def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
         self._saver.save_checkpoint(self.good.step, self.good.tensors)
+        if self.detector.dead_steps:
+            causes = [blamed(self._recipe, self._alive or None, self._objective.owners), *causes]
         raise CollapseError(
             f"training collapsed at step {step}: {problem}. The weights of step {self.good.step} "
             f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
@@ -269,11 +283,16 @@ class CollapseDetector:
         self._has_drawn = state["has_drawn"]
 
 
+LOSS_OF_QUALITY = 1.0
+"""dB below the best PSNR so far, means of some ten steps, at which weights are no longer good."""
+
+
 class GoodWeights:
     """Copies in host memory of the weights at the last two times that the model was healthy.
 
-    A collapse is noticed late, and the newer copy may already be on its way down; the older one,
-    `tensors` after `step` optimiser steps, is at least a window away.
+    A collapse is noticed late, and the newer copy may already be on its way down; `tensors` after
+    `step` optimiser steps are the older one. Copies lie a fifth of a window apart at first and a
+    window in long runs, and none is made while the images are worse than they were.
 
     keep: whether this process holds the copies; one of several suffices.
     """
@@ -281,7 +300,22 @@ class GoodWeights:
     def __init__(self, model: nn.Module, keep: bool = True) -> None:
         self._weights, self._keep = Weights(model), keep
         self._copies: list[tuple[int, dict[str, Tensor]]] = []
+        self._psnr: float | None = None
+        self._best: float | None = None
         self.refresh(0)
+
+    def observe(self, numbers: Mapping[str, float]) -> None:
+        """Take note of a step's "psnr", in dB."""
+        now = numbers["psnr"]
+        self._psnr = now if self._psnr is None else self._psnr + (now - self._psnr) / 10
+
+    def due(self, step: int, window: int) -> bool:
+        """Whether the weights after `step` steps are to be copied. All processes say the same."""
+        apart = max(window // 5, min(window, step // 10))
+        if step - self._copies[-1][0] < apart or self._psnr is None:
+            return False
+        self._best = max(self._psnr, self._psnr if self._best is None else self._best)
+        return self._psnr >= self._best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
         """Copy the present weights, which `step` optimiser steps made. All processes must call."""
@@ -293,13 +327,17 @@ class GoodWeights:
     def state(self) -> dict[str, Any]:
         copies = enumerate(tensors for _, tensors in self._copies)
         tensors = {f"{i}/{name}": t for i, copy in copies for name, t in copy.items()}
-        return {"steps": [step for step, _ in self._copies], **tensors}
+        quality = {"psnr": self._psnr, "best": self._best}
+        return {"steps": [step for step, _ in self._copies], **quality, **tensors}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self._copies = [
-            (step, {name: state[f"{i}/{name}"] for name in self.tensors})
-            for i, step in enumerate(state["steps"])
-        ]
+        self._copies = []
+        quality = (state.get(name) for name in ("psnr", "best"))
+        self._psnr, self._best = (None if value is None else float(value) for value in quality)
+        for i, step in enumerate(state["steps"]):
+            copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
+            refuse_other_tensors(copy, self._weights.state() if self._keep else copy)
+            self._copies.append((int(step), copy if self._keep else {}))
         self.step, self.tensors = self._copies[0]
 
 
@@ -307,6 +345,12 @@ def broken_tensors(model: nn.Module) -> str:
     """Which tensors of `model` hold NaN or infinity; "" if none does."""
     names = [n for n, t in unique_tensors(model).items() if not whole(torch.isfinite(t).all())]
     return f"weights are not finite: {listed(names)}" if names else ""
+
+
+def refuse_broken(model: nn.Module, file: object) -> None:
+    """Raise ValueError when weights of `model`, read from `file`, are NaN or infinite."""
+    if problem := broken_tensors(model):
+        raise ValueError(f"{file}: {problem}; take another checkpoint of the run")
 
 
 def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:

@@ -43,6 +43,7 @@ class Objective(nn.Module):
     with layers nor with views. Where a loss needs all renderings at once, only the renderer's
     graphs are made in parts.
 
+    owners: the names of terms that were computed so far, to those of their losses.
     hook: called with the name and the value (tensors, or a nest of them) of what is computed.
     """
 
@@ -58,7 +59,7 @@ class Objective(nn.Module):
         self._of_images = [name for name in losses if name not in self._of_gaussians]
         self.render_views = render_views
         self.hook: Callable[[str, Any], None] = lambda name, value: None
-        self._owners: dict[str, str] = {}
+        self.owners: dict[str, str] = {}
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
         """Reconstruct `inputs` and compare with `targets`, layers weighted by the supervision.
@@ -124,10 +125,10 @@ class Objective(nn.Module):
         terms: dict[str, Tensor] = {}
         for name in names:
             new = self.losses[name](layer, rendering, target)
-            repeated = sorted(term for term in new if self._owners.setdefault(term, name) != name)
+            repeated = sorted(term for term in new if self.owners.setdefault(term, name) != name)
             if repeated:
                 raise ValueError(
-                    f"losses.{name} and losses.{self._owners[repeated[0]]} both have terms "
+                    f"losses.{name} and losses.{self.owners[repeated[0]]} both have terms "
                     f"{repeated}; a recipe can use each such loss once"
                 )
             terms |= new

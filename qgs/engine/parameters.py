@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from qgs.contracts import ModelComponent, Optimizer, ParameterGroup
+from qgs.engine.checkpoint import refuse_other_tensors
 from qgs.engine.distributed import placed_like, whole
 from qgs.io.checkpoint import unique_tensors
 
@@ -90,6 +91,7 @@ class MovingAverage:
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on from the averages in `state`."""
         own = self._averages
+        refuse_other_tensors(state, own)
         _copy({name: placed_like(state[name], tensor) for name, tensor in own.items()}, own)
 
 

@@ -99,6 +99,8 @@ class PeriodicEvaluation:
         picture = self._picture()
         if not self._accelerator.is_main_process:
             return
+        if not self._folder.is_dir():  # the training tells of it with its next step
+            raise FileNotFoundError(f"{self._folder} was deleted or moved")
         place = self._folder / "evaluations.jsonl"
         # Records of this step and later ones, from before a resume, go.
         kept = [record for record in read_records(place) if record["step"] < step]

@@ -1,17 +1,20 @@
 """The training loop."""
 
+import logging
 import math
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import set_seed
+from accelerate.utils import gather_object, set_seed
 from rich.console import Console
 from torch import Tensor, nn
 
@@ -40,7 +43,8 @@ from qgs.engine.distributed import (
     wants_shards,
     whole,
 )
-from qgs.engine.folder import RunFolder
+from qgs.engine.fit import explained, refuse_unfit
+from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.engine.guard import Guard, not_finite
 from qgs.engine.objective import Objective, Outcome
 from qgs.engine.parameters import MovingAverage, make_optimizer
@@ -49,6 +53,10 @@ from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.io.files import write_text
 from qgs.model import QueryGaussianModel
 
+ELSEWHERE = "another process of this training has no next batch; its own message tells why"
+
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class TrainingResult:
@@ -56,6 +64,8 @@ class TrainingResult:
 
     stopped_by: name of the signal that ended it early, else None. main: whether this process writes
     the files. resumed_at: the step from which a run was continued, None for one that began here.
+    left_out: samples that could not be made (`training.on_bad_sample`), of all processes and
+    sessions: how often.
     """
 
     model: QueryGaussianModel
@@ -65,6 +75,7 @@ class TrainingResult:
     stopped_by: str | None
     main: bool
     resumed_at: int | None = None
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 def train(
@@ -102,7 +113,11 @@ def train(
         for note in trainer.notes:
             terminal.print(note, highlight=False)
         with TrainingProgress(terminal) as progress, stop_requests(terminal.quiet) as stop:
-            return trainer.run(progress, stop)
+            try:
+                return trainer.run(progress, stop)
+            except FolderGoneError as error:
+                trainer.save_elsewhere(error)
+                raise
 
 
 class Trainer:
@@ -121,6 +136,7 @@ class Trainer:
         self.recipe, self.config = recipe, recipe.training
         self.folder, self.trackers = RunFolder(run), Trackers(recipe.training.trackers)
         self.step, self.samples, self.seconds = 0, 0, 0.0
+        self.left_out = Counter[str]()
         self._last_tick: float | None = None
         self._resumes, self._folder_is_open = resume, False
         with ExitStack() as resources:
@@ -141,6 +157,7 @@ class Trainer:
                 self.folder.take()
             self.accelerator.wait_for_everyone()
             saved = saved_state(self.folder, recipe)
+        refuse_unfit(recipe, self.accelerator)
         self.model = recipe.build_model(device=self.accelerator.device).train()
         self.notes = [] if saved else initialise(self.model, recipe)
         objective = Objective(self.model, recipe.build_losses(), config.render_views)
@@ -155,7 +172,7 @@ class Trainer:
         self.average = MovingAverage(self.model, config.ema) if config.ema else None
         self.saver = Saver(self.accelerator, self.folder, self.model)
         self._gradients = partial(compute_gradients, self.accelerator, self.objective, config)
-        self.guard = Guard(self.accelerator, objective, self.saver, config, self._gradients)
+        self.guard = Guard(self.accelerator, objective, self.saver, recipe, self._gradients)
         self.evaluations = PeriodicEvaluation(
             self.accelerator, recipe, self.model, self.average, self.folder.path, self.trackers
         )
@@ -184,12 +201,15 @@ class Trainer:
             start=self.samples // (config.batch_size * processes),
             share=Share(self.accelerator.process_index, processes),
             workers=config.workers,
+            skips=config.on_bad_sample == "skip",
         )
         resources.callback(batches.close)
         self.feed = Feed(batches, config.accumulate)
         self.feed.fetch()
-        if self.feed.error:
-            raise self.feed.error
+        flag = torch.tensor(float(bool(self.feed.error)))
+        failed = mean(self.accelerator, flag.to(self.accelerator.device))
+        if float(failed):
+            raise self.feed.error or SampleError(ELSEWHERE)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
@@ -197,7 +217,7 @@ class Trainer:
             if not self.folder.checkpoint.exists():
                 self.guard.save(self.step)
             return self._result(None)
-        stopped_by = None
+        stopped_by, alone = None, self.accelerator.num_processes == 1
         while self.used < 1 and not stopped_by:
             # Gradients of this step's batches; those of the next step are fetched meanwhile.
             rate = self.optimizer.learning_rate(self.step, self.seconds)
@@ -205,7 +225,12 @@ class Trainer:
                 group["lr"] = rate * group["factor"]
             self.torch_optimizer.zero_grad(set_to_none=True)
             batches = self.feed.batches
-            measured = self._gradients(batches)
+            with explained(self.step, self.guard.save_to_go_on if alone else None):
+                measured = self._gradients(batches)
+            for bad in (bad for batch in batches for bad in batch.left_out):
+                if not self.left_out[bad]:
+                    _log.warning("a sample is left out: %s", bad)
+                self.left_out[bad] += 1
             if not stop and self.step + 1 < self.config.steps:
                 self.feed.fetch()
             numbers, asked_to_stop, no_data = self._means(measured, stop)
@@ -216,7 +241,8 @@ class Trainer:
                 self._open_folder()
                 self.guard.leave_out(self.step, batches, symptom)
             else:
-                self.torch_optimizer.step()
+                with explained(self.step):
+                    self.torch_optimizer.step()
                 if self.average:
                     self.average.update()
                 self.guard.passed(numbers)
@@ -231,20 +257,17 @@ class Trainer:
             self._report(record | ({"skipped": True} if symptom else {}), progress)
             self.guard.refuse_collapse(self.step)
             evaluates = self._every(self.config.evaluate_every)
-            if not self.guard.detector.dead_steps:
-                if self._every(self.config.collapse_window):
-                    self.guard.keep_good(self.step)
-                if self._every(self.config.save_every) or evaluates:
-                    self.guard.save(self.step)
+            self.guard.keep_good(self.step)
+            saves = self._every(self.config.save_every) or evaluates
+            if saves and not self.guard.detector.dead_steps:
+                self.guard.save(self.step)
             if evaluates:
                 self._evaluate(stop)
             if asked_to_stop or evaluates:
                 stopped_by = self._stopped_by(stop)
             if no_data and self.used < 1 and not stopped_by:
                 self.guard.save_to_go_on(self.step)
-                error = self.feed.error or SampleError(
-                    "another process of this training has no next batch; its own message tells why"
-                )
+                error = self.feed.error or SampleError(ELSEWHERE)
                 error.add_note(f"The run is saved at step {self.step}; continue with --resume")
                 raise error
         stopped_by = stopped_by or self._stopped_by(stop)
@@ -253,6 +276,21 @@ class Trainer:
             self._evaluate(stop)
             stopped_by = self._stopped_by(stop)
         return self._result(stopped_by)
+
+    def save_elsewhere(self, gone: FolderGoneError) -> None:
+        """Save the run beside its lost folder, and note so on `gone`; needs one process alone."""
+        if self.accelerator.num_processes > 1:
+            return
+        places = (Path(f"{self.folder.path}-saved-{n}") for n in count(1))
+        place = next(path for path in places if not path.exists())
+        self.folder.close()
+        self.folder = self.saver.folder = RunFolder(place)
+        self._folder_is_open, self._resumes = False, False
+        self._open_folder()
+        self.saver.save(self.step)
+        self.folder.close()
+        note = f"The run, without its history, is saved at step {self.step} in {place}; it goes on"
+        gone.add_note(f"{note} there with --resume --out {place}")
 
     @property
     def used(self) -> float:
@@ -263,12 +301,22 @@ class Trainer:
     def state(self) -> dict[str, Any]:
         """What was counted so far, and what must not change for this to mean the same."""
         counted = {"step": self.step, "samples": self.samples, "seconds": self.seconds}
-        return counted | self._conditions
+        return counted | self._conditions | {"left_out": self._all_left_out()}
+
+    def _all_left_out(self) -> dict[str, int]:
+        """Samples left out by all processes, which must all call this."""
+        own = [self.left_out]
+        counts = gather_object(own) if self.accelerator.num_processes > 1 else own
+        return dict(sum(counts, Counter[str]()))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
         refuse_other_data(state, self._conditions, self.folder)
         self.step, self.samples, self.seconds = state["step"], state["samples"], state["seconds"]
+        if not (0 <= self.step <= self.samples and 0 <= self.seconds < math.inf):
+            raise ValueError(f"{self.step} steps of {self.samples} samples in {self.seconds} s")
+        if self.accelerator.is_main_process:
+            self.left_out = Counter({key: int(n) for key, n in state.get("left_out", {}).items()})
 
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""
@@ -339,6 +387,7 @@ class Trainer:
             stopped_by,
             self.accelerator.is_main_process,
             self.resumed_at,
+            self._all_left_out(),
         )
 
 

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,27 +14,24 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 import qgs
-from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
-from qgs.composer.slots import with_moved
 from qgs.contracts import CONTRACT_VERSION
-from qgs.io.differences import differing_tensors, shapes_of
-from qgs.io.files import replacing
+from qgs.io.differences import differing_tensors, differing_types, shapes_of
+from qgs.io.files import replacing, told_where_full
+from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
 from qgs.io.models import checkpoint_path
+from qgs.memory import TooLargeError
 from qgs.model import QueryGaussianModel
+from qgs.wording import listed
 
 FORMAT_VERSION = 2
 """Raised when what a checkpoint holds changes."""
 
-_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _RECIPE, _CONTRACT = "qgs.recipe", "qgs.contract_version"
 _PLUGINS, _DISTRIBUTIONS = "qgs.plugins", "qgs.distributions"
 _FORMAT, _VERSION, _EXTRA = "qgs.format_version", "qgs.version", "qgs.extra."
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
-
-
-class CheckpointError(ValueError):
-    """A file that holds no weights that can be used; the message says why and what to do."""
 
 
 def write_tensors(
@@ -46,19 +42,13 @@ def write_tensors(
     Raises OSError that tells the space needed and the space there is; what `path` held before is
     then still there.
     """
-    try:
-        with replacing(path) as temporary:
+    needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+    told = f" It takes {needed / 1e6:.1f} MB beside the file that it replaces, and"
+    with replacing(path) as temporary, told_where_full(Path(path), told):
+        try:
             save_file(dict(tensors), temporary, dict(metadata))
-    except (SafetensorError, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in _DISK_IS_FULL:
-            raise
-        needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
-        free = shutil.disk_usage(Path(path).parent).free
-        raise OSError(
-            f"{path} could not be written ({error}). It takes {needed / 1e6:.1f} MB beside the "
-            f"file that it replaces, and {free / 1e6:.1f} MB are free there. What was saved before "
-            "is whole: free space and save again; a training run goes on with --resume"
-        ) from error
+        except SafetensorError as error:  # which tells the reason in words alone
+            raise OSError(errno.ENOSPC, str(error)) from error
 
 
 @contextmanager
@@ -149,8 +139,15 @@ def load(
     where a plugin is missing or another release of it cannot stand for it.
     """
     path = checkpoint_path(path)
-    model = load_recipe(path).build_model()
-    load_weights(model, read_tensors(path), str(path))
+    recipe, tensors = load_recipe(path), read_tensors(path)
+    try:
+        _refuse_misfit(recipe.build_model("meta"), tensors, str(path))  # takes no memory
+        model = recipe.build_model()
+    except (RecipeError, TooLargeError) as error:
+        raise CheckpointError(
+            f"{path}: the model of its recipe cannot be built: {error}"
+        ) from error
+    load_weights(model, tensors, str(path))
     return (model if device is None else model.to(device)).eval()
 
 
@@ -158,12 +155,13 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """The recipe that a checkpoint carries. Raises as `load` does."""
     metadata = _read_metadata(path)
     try:
-        return resolve(with_moved(json.loads(metadata[_RECIPE])))
+        return stored_recipe(metadata, _RECIPE, path)
     except RecipeError as error:
-        names = {**json.loads(metadata.get(_DISTRIBUTIONS, "{}")), "qgs": "query-gaussians"}
+        written = {_PLUGINS: "{}", _DISTRIBUTIONS: "{}"} | metadata
+        names = {**mapping_in(written, _DISTRIBUTIONS, path), "qgs": "query-gaussians"}
         releases = {
             plugin: f"{names.get(plugin) or f'the plugin `{plugin}`'} {version}"
-            for plugin, version in json.loads(metadata.get(_PLUGINS, "{}")).items()
+            for plugin, version in mapping_in(written, _PLUGINS, path).items()
         }
         available = {"qgs", *available_plugins()}
         absent = [release for plugin, release in releases.items() if plugin not in available]
@@ -179,6 +177,13 @@ def load_extra(path: str | os.PathLike[str]) -> dict[str, str]:
     return {k.removeprefix(_EXTRA): v for k, v in metadata.items() if k.startswith(_EXTRA)}
 
 
+def load_step(path: str | os.PathLike[str]) -> int | None:
+    """The training step that `save` was given as `extra`, None without. Raises as `load` does."""
+    step = load_extra(path).get("step")
+    with reading(path, _EXTRA + "step"):
+        return int(step) if step else None
+
+
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
     """Parameters and persistent buffers, a shared one only under its first name."""
     first_names: dict[int, str] = {}
@@ -189,21 +194,27 @@ def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
 
 
 def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
-    """Copy `tensors` into `model`; names and shapes must match exactly.
+    """Copy `tensors` into `model`; names, shapes and types must match exactly.
 
-    Raises CheckpointError that lists all differences; `origin` names the source in it.
+    Raises CheckpointError that lists the differences; `origin` names the source in it.
     """
+    _refuse_misfit(model, tensors, origin)
+    with torch.no_grad():
+        for name, tensor in unique_tensors(model).items():
+            tensor.copy_(tensors[name])
+
+
+def _refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))
+    differences += differing_types(tensors, own, widened=True)
     if differences:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
-            + "\n  ".join(differences)
-            + "\nInstall the versions of qgs and of its plugins that wrote the file."
+            + listed(differences, 20, "\n  ")
+            + "\nInstall the versions of qgs and of its plugins that wrote the file; if they are, "
+            "it is damaged: copy it again."
         )
-    with torch.no_grad():
-        for name, tensor in own.items():
-            tensor.copy_(tensors[name])
 
 
 def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
@@ -226,11 +237,6 @@ def _read_metadata(path: str | os.PathLike[str]) -> dict[str, str]:
             "or `qgs train` can be loaded. If it holds published weights, turn them into a "
             f"checkpoint: `qgs import {path} --recipe auto --out CHECKPOINT.safetensors`"
         )
-    for key, known in ((_CONTRACT, CONTRACT_VERSION), (_FORMAT, FORMAT_VERSION)):
-        written = int(metadata.get(key, 0))
-        if written > known:
-            raise CheckpointError(
-                f"{path} was written by qgs {metadata.get(_VERSION, '?')} with {key} {written}; "
-                f"this is qgs {qgs.__version__}, which knows {known}: install the newer qgs"
-            )
+    known = {_CONTRACT: CONTRACT_VERSION, _FORMAT: FORMAT_VERSION}
+    refuse_newer(dict.fromkeys(known, "0") | metadata, known, _VERSION, path)
     return metadata

@@ -4,6 +4,7 @@ import re
 from collections.abc import Collection, Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from qgs.composer.recipe import flat
@@ -32,6 +33,22 @@ def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()
         f"shape of {name}: {file[name]} in the file, {shape} in the recipe"
         for name, shape in recipe.items()
         if name in file and file[name] != shape
+    ]
+
+
+def differing_types(
+    file: Mapping[str, Tensor], recipe: Mapping[str, Tensor], widened: bool = False
+) -> list[str]:
+    """The types of numbers in which tensors of both differ, one line each.
+
+    widened: a file may hold half precision where the recipe has float32.
+    """
+    alike = {(torch.float16, torch.float32), (torch.bfloat16, torch.float32)} if widened else ()
+    return [
+        f"type of {name}: {file[name].dtype} in the file, {tensor.dtype} in the recipe"
+        for name, tensor in recipe.items()
+        if name in file and file[name].dtype != tensor.dtype
+        if (file[name].dtype, tensor.dtype) not in alike
     ]
 
 

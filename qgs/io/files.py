@@ -1,16 +1,26 @@
 """Files and folders that appear whole or not at all; files of JSON records."""
 
+import errno
 import json
 import logging
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from qgs.memory import in_words
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
 _log = logging.getLogger(__name__)
+
+
+class DiskFullError(OSError):
+    """There is no space for a file; the message names it, and what to do."""
 
 
 @contextmanager
@@ -24,16 +34,36 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    with told_where_full(target):
+        try:
+            temporary.touch()
+            mode = temporary.stat().st_mode
+            yield temporary
+            temporary.chmod(mode)
+            _synchronise(temporary)
+            os.replace(temporary, target)
+            _synchronise(target.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def told_where_full(path: Path, needed: str = "") -> Iterator[None]:
+    """Raise DiskFullError about `path` when the disk is full in the `with` block.
+
+    needed: a sentence about the space that it takes.
+    """
     try:
-        temporary.touch()
-        mode = temporary.stat().st_mode
-        yield temporary
-        temporary.chmod(mode)
-        _synchronise(temporary)
-        os.replace(temporary, target)
-        _synchronise(target.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        free = shutil.disk_usage(path.parent).free
+        raise DiskFullError(
+            f"{path} could not be written ({error.strerror}).{needed} {in_words(free)} are free "
+            "there. What was saved before is whole: free space and repeat the command; a training "
+            "goes on with --resume"
+        ) from error
 
 
 def is_leftover(path: Path) -> bool:

@@ -179,7 +179,7 @@ BROKEN = {
     "aliases of aliases": (
         "recipe: 1\nseed:\n- &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
         + "".join(f"- &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefg")),
-        3, "", "more than 100,000 values", "fewer aliases",
+        3, "", "more than 20,000 values", "fewer aliases",
     ),
     "loss without a type": (
         "recipe: 1\nlosses:\n  mine: {weight: 0.1}\n",

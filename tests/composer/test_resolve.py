@@ -12,7 +12,7 @@ from refusals import refused
 from qgs.composer import RecipeError, compose, resolve
 from qgs.composer.errors import Problems
 from qgs.composer.files import merge
-from qgs.composer.nodes import Origin, from_plain
+from qgs.composer.nodes import Count, Origin, from_plain
 from qgs.composer.recipe import annotated
 from qgs.composer.slots import SECTIONS
 from qgs.composer.yaml_text import dump, load_text
@@ -71,7 +71,7 @@ def test_anchors_and_aliases_are_written_out():
 
 
 WORDS = st.sampled_from(["1e-4", "off", "12:30", "true", "null", "", "0o17", ".5", "- a", "a: b"])
-TEXTS = st.text(st.characters(codec="utf-8"), max_size=6) | WORDS
+TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=6) | WORDS
 INTEGERS = st.integers(-(2**63) + 1, 2**63 - 1)
 SCALARS = st.none() | st.booleans() | INTEGERS | st.floats(allow_nan=False) | TEXTS
 
@@ -82,10 +82,11 @@ def test_what_is_dumped_is_read_back(value):
     assert load_text(dump(value), "f", Problems()) == value
 
 
+INTEGERS = st.integers(-(2**63) + 1, 2**63 - 1)
 TREES = st.dictionaries(
     st.sampled_from("abc"),
     st.recursive(
-        st.integers(-(2**63) + 1, 2**63 - 1) | st.lists(st.integers(), max_size=2),
+        INTEGERS | st.lists(INTEGERS, max_size=2),
         lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
         max_leaves=6,
     ),
@@ -95,7 +96,7 @@ TREES = st.dictionaries(
 @settings(max_examples=60, deadline=None)
 @given(TREES, TREES)
 def test_merging_twice_is_merging_once_and_nothing_changes_nothing(a, b):
-    a, b, empty = (from_plain(tree, Origin("f")) for tree in (a, b, {}))
+    a, b, empty = (from_plain(tree, Origin("f"), Count()) for tree in (a, b, {}))
     assert merge(a, a) == a
     assert merge(merge(a, b), b) == merge(a, b)
     assert merge(empty, a) == merge(a, empty) == a

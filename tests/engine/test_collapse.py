@@ -11,6 +11,7 @@ import qgs
 from qgs.composer import Recipe
 from qgs.contracts import TrainingConfig
 from qgs.data.evaluation import evaluation_samples
+from qgs.engine.causes import blamed
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder
 from qgs.engine.guard import (
@@ -109,7 +110,11 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     kept = int(load_extra(folder.checkpoint)["step"])
     dead = [record["step"] for record in history if record["alpha"] < EMPTY_ALPHA]
     assert len(history) <= dead[0] + 100
-    assert kept < len(history) < 300
+    assert dead[0] - 50 < kept < dead[0] < len(history) < 300
+    assert (
+        f"most likely in this recipe: optimizer.learning_rate is {0.5:g} (default 0.0004)"
+        in message
+    )
     assert mean_alpha(folder.checkpoint, recipe) > EMPTY_ALPHA
 
 
@@ -121,6 +126,30 @@ def test_gaussians_invisible_from_the_start_are_noticed_within_the_window(
         run_anywhere(tiny("tokengs", INVISIBLE, *options), tmp_path / "run")
     history = RunFolder(tmp_path / "run").history()
     assert [record["step"] for record in history] == list(range(1, 21))
+
+
+def test_the_option_to_blame_is_that_of_the_recipe(tiny: Tiny) -> None:
+    dark = blamed(tiny("tokengs", INVISIBLE), None, {})
+    assert "model.head.opacity_bias is -20 (default -2.0)" in dark
+    assert "opacity of 2e-09" in dark
+    assert "views.scale_factor is 0.4" in blamed(tiny("tokengs"), None, {})
+    owners = {"mse": "photometric", "visibility": "visibility"}
+    heavy = tiny("tokengs", "losses.visibility.weight=50.0", "optimizer.learning_rate=1e-3")
+    named = blamed(heavy, {"mse": 0.1, "visibility": 3.0}, owners)
+    assert "losses.visibility.weight is 50" in named
+    assert "97% of the loss" in named
+    fast = tiny("tokengs", "optimizer.learning_rate=0.5")
+    assert "optimizer.learning_rate is 0.5" in blamed(fast, {"mse": 0.1, "visibility": 3.0}, owners)
+
+
+def test_no_copy_is_made_while_the_images_get_worse() -> None:
+    good = GoodWeights(torch.nn.Linear(2, 2))
+    for step in range(1, 101):
+        good.observe({"psnr": 20.0 if step <= 60 else 10.0})
+        if good.due(step, 50):
+            good.refresh(step)
+    assert good.state()["steps"] == [50, 60]
+    assert not good.due(61, 50)
 
 
 def test_a_run_that_ends_inside_a_collapse_fails_too(tiny: Tiny, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from training_runs import Tiny
 
 import qgs
 from qgs.composer import Recipe
-from qgs.contracts import TrainingConfig
 from qgs.data.stream import training_batches
 from qgs.engine.checkpoint import Saver
 from qgs.engine.distributed import make_accelerator
@@ -33,7 +32,7 @@ class Step:
     """One step of a small model, that can be broken in many places."""
 
     def __init__(self, recipe: Recipe) -> None:
-        self.accelerator = make_accelerator("cpu")
+        self.recipe, self.accelerator = recipe, make_accelerator("cpu")
         self.model = recipe.build_model().train()
         losses = recipe.build_losses()
         self.objective = Objective(self.model, losses, recipe.training.render_views)
@@ -165,7 +164,7 @@ def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPat
 
 def guard_of(step: Step, folder: Path) -> Guard:
     saver = Saver(step.accelerator, RunFolder(folder), step.model)
-    return Guard(step.accelerator, step.objective, saver, TrainingConfig(), step.gradients)
+    return Guard(step.accelerator, step.objective, saver, step.recipe, step.gradients)
 
 
 def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
@@ -216,7 +215,7 @@ def test_the_number_of_saved_incidents_is_bounded(step: Step, tmp_path: Path) ->
     assert len(list((tmp_path / "incidents").iterdir())) == MAX_SAVED
     assert "not saved" in told[-1][0]
     assert guard.skipped == guard.incidents == count
-    guard.passed({"alpha": 0.5, "deviation": 0.3, "gradient": 0.1})
+    guard.passed({"alpha": 0.5, "deviation": 0.3, "gradient": 0.1, "psnr": 9.0})
     assert (guard.skipped, guard.incidents) == (0, count)
     again = guard_of(step, tmp_path)
     again.load_state(guard.state())

@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
+from safetensors import safe_open
+from safetensors.torch import save_file
 from training_runs import QUIET, Tiny, run, run_calling, same, weights
 
 from qgs.composer import Recipe
@@ -261,6 +263,47 @@ def test_a_state_that_is_damaged_or_newer_is_refused(tiny: Tiny, tmp_path: Path)
         file.write_bytes(content)
         with pytest.raises(CheckpointError, match=message):
             resumed(recipe, folder)
+
+
+def test_a_state_with_damaged_metadata_is_refused_by_its_name(tiny: Tiny, tmp_path: Path) -> None:
+    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
+    kill_after(2, recipe, folder)
+    file = folder / "state.safetensors"
+    with safe_open(file, "pt") as saved:
+        metadata = saved.metadata()
+        tensors = {name: saved.get_tensor(name) for name in saved.keys()}  # noqa: SIM118
+    parts = json.loads(metadata["qgs.state"])
+
+    def damage(message: str, more: Any = (), **changed: str | None) -> None:
+        changed = {**metadata, **{f"qgs.{key}": value for key, value in changed.items()}}
+        whole = {key: value for key, value in changed.items() if value is not None}
+        save_file(tensors | dict(more), file, whole)
+        with pytest.raises(CheckpointError, match=message) as caught:
+            resumed(recipe, folder)
+        assert str(caught.value).startswith(str(file))
+
+    damage("`qgs.state` .*holds null", state="null")
+    damage("`qgs.state` .*JSONDecodeError", state=metadata["qgs.state"][:-9])
+    damage("`qgs.state` .*too deep", state='{"a":' * 5000)
+    damage("`qgs.recipe` .*holds list", recipe="[]")
+    damage("`qgs.recipe`.*KeyError", recipe=None)
+    damage("has `extends`", recipe=json.dumps({**recipe.tree, "extends": "/dev/zero"}))
+    damage("`qgs.state_version` ", state_version="one")
+    damage("`qgs.state_version` .*KeyError", state_version=None)
+    damage("the tensor `foo` belongs to no part", {"foo": torch.zeros(2)})
+    damage("the tensor `foo/bar` belongs to no part", {"foo/bar": torch.zeros(2)})
+    for part, key, value, message in (
+        ("counters", "step", None, r"`counters` .*step is 'None'"),
+        ("counters", "step", -1, "step is '-1'"),
+        ("counters", "seconds", float("nan"), "seconds is 'nan'"),
+        ("counters", "samples", {}, "samples is"),
+        ("random", "0/python", [3, [1], None], "`random` cannot be restored"),
+        ("random", "0/numpy", 3, "0/numpy is no mapping"),
+    ):
+        damaged = {**parts, part: {**parts[part], key: value}}
+        damage(message, state=json.dumps(damaged))
+    del parts["counters"]["step"]
+    damage("`counters` cannot be restored .*'step'", state=json.dumps(parts))
 
 
 def test_random_states_come_back() -> None:

@@ -1,0 +1,296 @@
+"""States and checkpoints of other tensors than were written, runs that do not fit, lost folders."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from training_runs import Tiny, change_batches, run, run_calling
+
+import qgs
+from qgs.data.sampling import Batch
+from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
+from qgs.engine import training
+from qgs.engine.checkpoint import read_state
+from qgs.engine.fit import OutOfMemoryError
+from qgs.engine.folder import FolderGoneError, RunFolder
+from qgs.io.checkpoint import CheckpointError
+from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+def rewrite(path: Path, change: Callable[[dict[str, torch.Tensor]], Any], **metadata: str) -> None:
+    """Write a safetensors file again, whole, with changed tensors and the same metadata."""
+    with safe_open(path, "pt") as file:
+        tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        known = file.metadata()
+    change(tensors)
+    save_file(tensors, path, known | metadata)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, tiny: Tiny) -> Path:
+    folder = tmp_path_factory.mktemp("damaged") / "run"
+    run(tiny("tokengs", "training.steps=3", "training.ema=0.9"), folder)
+    return folder
+
+
+@pytest.fixture
+def copied(trained: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def first_row(name: str) -> Callable[[dict[str, torch.Tensor]], None]:
+    return lambda tensors: tensors.update({name: tensors[name][:1].clone()})
+
+
+def as_integers(name: str) -> Callable[[dict[str, torch.Tensor]], None]:
+    return lambda tensors: tensors.update({name: tensors[name].view(torch.int32)})
+
+
+def with_nan(name: str) -> Callable[[dict[str, torch.Tensor]], None]:
+    return lambda tensors: tensors[name].view(-1)[:1].fill_(torch.nan)
+
+
+WEIGHT = "queries.features"
+MOMENT = "moments/model.queries.features/exp_avg"
+
+
+@pytest.mark.parametrize("lists", [True, False], ids=["listed", "written before lists"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (first_row(f"weights/{WEIGHT}"), WEIGHT),
+        (first_row(f"good/0/{WEIGHT}"), WEIGHT),
+        (first_row(f"ema/{WEIGHT}"), WEIGHT),
+        (as_integers(f"weights/{WEIGHT}"), "int32"),
+        (lambda t: t.pop(f"weights/{WEIGHT}"), WEIGHT),
+        (lambda t: t.update({"weights/foo": torch.ones(1)}), "foo"),
+        (lambda t: t.update({"moments/foo/exp_avg": torch.ones(1)}), "foo"),
+        (with_nan(f"weights/{WEIGHT}"), "not finite"),
+        (with_nan(MOMENT), "not finite"),
+    ],
+)
+def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
+    copied: Path, tiny: Tiny, change: Any, words: str, lists: bool
+) -> None:
+    state = copied / "state.safetensors"
+    with safe_open(state, "pt") as file:
+        known = file.metadata()["qgs.tensors"]
+        kinds = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118
+    change(kinds)
+    now = {n: [str(t.dtype).removeprefix("torch."), *t.shape] for n, t in kinds.items()}
+    rewrite(state, change, **{"qgs.tensors": known if lists else json.dumps(now)})
+    before = {path.name: path.read_bytes() for path in copied.iterdir() if path.is_file()}
+    with pytest.raises(CheckpointError, match=words) as caught:
+        run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
+    assert str(state) in str(caught.value)
+    assert before == {p.name: p.read_bytes() for p in copied.iterdir() if p.is_file()}
+
+
+def test_moments_of_another_shape_are_refused(copied: Path, tiny: Tiny) -> None:
+    rewrite(copied / "state.safetensors", first_row(MOMENT))
+    with pytest.raises(CheckpointError, match="not the tensors that were written"):
+        run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
+
+
+def test_a_checkpoint_of_other_types_is_refused_and_half_precision_is_widened(copied: Path) -> None:
+    file = copied / "checkpoint.safetensors"
+    rewrite(file, lambda t: t.update({WEIGHT: t[WEIGHT].half()}))
+    assert qgs.load(file).queries.state_dict()["features"].dtype == torch.float32
+    rewrite(file, lambda t: t.update({n: x.float().view(torch.int32) for n, x in t.items()}))
+    with pytest.raises(CheckpointError, match="type of .*: torch.int32 in the file"):
+        qgs.load(file)
+
+
+@pytest.mark.parametrize("option", ["width", "queries.count", "head.gaussians_per_query"])
+def test_sizes_of_a_checkpoint_are_compared_before_anything_is_allocated(
+    copied: Path, option: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = copied / "checkpoint.safetensors"
+    with safe_open(file, "pt") as opened:
+        tree = json.loads(opened.metadata()["qgs.recipe"])
+    *above, last = option.split(".")
+    below = tree["model"]
+    for key in above:
+        below = below[key]
+    below[last] = 65_536 if option == "width" else 10**9
+    rewrite(file, lambda tensors: None, **{"qgs.recipe": json.dumps(tree)})
+    monkeypatch.setattr(torch.nn.init, "normal_", None)
+    monkeypatch.setattr(torch, "randn", lambda *shape: torch.empty(shape, device="meta"))
+    with pytest.raises(CheckpointError, match="does not fit the model of its recipe"):
+        qgs.load(file)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("views.targets=1000000000", r"\(2 \+ 1000000000\) images of 16 x 16"),
+        ("training.batch_size=1000000000", "batch_size 1000000000"),
+        ("training.accumulate=1000000000", "1000000001 times"),
+        ("data.image_size=[800000, 800000]", "800000 x 800000"),
+        ("model.queries.count=10000000000", "the weights, "),
+    ],
+)
+def test_a_training_that_cannot_fit_says_so_with_numbers(
+    tiny: Tiny, tmp_path: Path, setting: str, words: str
+) -> None:
+    with pytest.raises(TooLargeError, match=words) as caught:
+        run(tiny("tokengs", setting), tmp_path / "run")
+    assert "available" in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_model_that_cannot_fit_is_refused_with_its_largest_part(tiny: Tiny) -> None:
+    with pytest.raises(TooLargeError, match=r"queries\.features .* TB"):
+        tiny("tokengs", "model.queries.count=100000000000").build_model()
+
+
+def test_what_fits_is_not_refused() -> None:
+    refuse_beyond_memory("this", {"a": 4, "b": 6}, "Less.", 10)
+    with pytest.raises(TooLargeError, match=r"11 bytes .* 10 bytes are available: b 7 bytes, a 4"):
+        refuse_beyond_memory("this", {"a": 4, "b": 7}, "Less.", 10)
+    assert [in_words(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]
+
+
+def test_out_of_memory_is_told_and_the_run_is_saved(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compute = training.compute_gradients
+    steps: list[int] = []
+
+    def fail(*arguments: Any) -> Any:
+        steps.append(1)
+        if len(steps) == 3:
+            raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+        return compute(*arguments)
+
+    monkeypatch.setattr(training, "compute_gradients", fail)
+    recipe = tiny("tokengs", "training.save_every=0")
+    with pytest.raises(OutOfMemoryError, match=r"in step 3 .*saved at step 2.*lower training") as e:
+        run(recipe, tmp_path / "run")
+    assert "batch_size" in str(e.value)
+    monkeypatch.undo()
+    assert run(recipe, tmp_path / "run", resume=True).resumed_at == 2
+
+
+@pytest.mark.parametrize("how", ["deleted", "replaced"])
+def test_a_folder_lost_while_training_is_told_and_what_was_learnt_is_kept(
+    tiny: Tiny, tmp_path: Path, how: str
+) -> None:
+    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
+
+    def lose(trainer: Any, stop: Any) -> None:
+        if trainer.step == 2:
+            shutil.move(folder, tmp_path / "elsewhere")
+            if how == "replaced":
+                folder.mkdir()
+
+    with pytest.raises(FolderGoneError, match="was deleted, moved or replaced"):
+        run_calling(lose, recipe, folder)
+    assert not folder.exists() or not list(folder.iterdir())
+    assert len(RunFolder(tmp_path / "elsewhere").history()) == 2
+
+
+def test_a_run_whose_folder_was_deleted_goes_on_beside_it(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, folder = tiny("tokengs"), tmp_path / "run"
+    gone = RunFolder.append
+
+    def lose(self: RunFolder, record: Any) -> None:
+        if record["step"] == 3:
+            shutil.rmtree(folder)
+        gone(self, record)
+
+    monkeypatch.setattr(RunFolder, "append", lose)
+    with pytest.raises(FolderGoneError) as caught:
+        run(recipe, folder)
+    monkeypatch.undo()
+    place = tmp_path / "run-saved-1"
+    assert str(place) in caught.value.__notes__[0]
+    assert not folder.exists()
+    assert run(recipe, place, resume=True).resumed_at == 3
+
+
+def bad_frames(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool]) -> None:
+    made = SampleStream._made
+
+    def failing(stream: SampleStream, number: int, attempt: int) -> Any:
+        if bad(number + attempt):
+            raise SampleError(f"scene 'x', frame {number + attempt} (a.png): cannot be read")
+        return made(stream, number, attempt)
+
+    monkeypatch.setattr(SampleStream, "_made", failing)
+
+
+def test_bad_samples_are_skipped_counted_and_named_if_asked_for(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bad_frames(monkeypatch, lambda number: number in (3, 5))
+    with pytest.raises(SampleError, match="frame 3"):
+        run(tiny("tokengs"), tmp_path / "stops")
+    skips = tiny("tokengs", "training.on_bad_sample=skip")
+    result = run(skips, tmp_path / "skips")
+    assert result.steps == 4
+    assert [reason.split("(")[0] for reason in result.left_out] == [
+        "scene 'x', frame 3 ",
+        "scene 'x', frame 5 ",
+    ]
+    assert caplog.text.count("a sample is left out") == 2
+    state = read_state(tmp_path / "skips" / "state.safetensors").parts["counters"]
+    assert state["left_out"] == result.left_out
+
+
+def test_too_many_bad_samples_in_a_row_end_a_run_all_the_same(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad_frames(monkeypatch, lambda number: number > 1)
+    with pytest.raises(SampleError, match=f"{MAX_REPLACED + 1} samples in a row"):
+        run(tiny("tokengs", "training.on_bad_sample=skip"), tmp_path / "run")
+
+
+def test_skipping_changes_no_sound_sample(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, list[Sequence[str]]] = {"stop": [], "skip": []}
+    for way in seen:
+
+        def note(batch: Batch, numbers: Sequence[int], way: str = way) -> None:
+            seen[way].append((*batch.scenes, *map(str, batch.input_frames)))
+
+        with monkeypatch.context() as patch:
+            change_batches(patch, note)
+            run(tiny("tokengs", f"training.on_bad_sample={way}"), tmp_path / way)
+    assert seen["stop"] == seen["skip"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("fuzz_files.py", "--count=150", "--seed=7"),
+        ("kill_training.py", "--what=evaluation", "--kills=8"),
+        ("kill_training.py", "--what=packing", "--kills=8"),
+    ],
+    ids=lambda command: " ".join(command),
+)
+def test_attacks_find_nothing(command: tuple[str, ...]) -> None:
+    tool, *options = command
+    done = subprocess.run(
+        [sys.executable, str(TOOLS / tool), *options],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=1200,
+    )
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-3000:]

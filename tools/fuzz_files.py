@@ -1,0 +1,358 @@
+"""Damage checkpoints and training states in many ways, and see that each is used or refused well.
+
+    python tools/fuzz_files.py --count 3000 --seed 0
+
+Each case, in a process of its own, ends in success or in one error of ours that names the file,
+within SECONDS of its processor and BYTES of memory. Prints every case that does not,
+with its number, and a line of counts; ends with 1 if there was any. `--only NUMBER` repeats one.
+"""
+
+import argparse
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from kill_training import RECIPE
+from rich.console import Console
+
+import qgs
+from qgs.composer import Recipe, resolve
+from qgs.engine.guard import TrainingError, refuse_broken
+from qgs.engine.training import train
+from qgs.io.ply import write_ply
+
+SECONDS, BYTES = 5.0, 2_000_000_000
+LONGEST = 60
+"""Seconds of the clock after which a case hangs, on however busy a machine."""
+
+STEPS = 2
+JUNK = (
+    None, True, -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "", "foo", "\0", "\ud800",
+    "/dev/zero", "/etc/passwd", "../" * 50, "x" * 100_000, [], {}, [[]], {"a": {"b": None}},
+    [0] * 10_000,
+)  # fmt: skip
+LARGE = {
+    "model.width": (4096, 65536, 10**9),
+    "model.queries.count": (10**5, 10**8, 10**18, 10**30),
+    "model.head.gaussians_per_query": (10**4, 10**6, 10**12, 10**18),
+    "model.encoder.depth": (256, 10**4, 10**9),
+    "model.decoder.depth": (100, 10**4, 10**9),
+    "model.heads": (3, 10**9),
+    "views.targets": (10**6, 10**9),
+    "training.batch_size": (10**6, 10**12),
+    "data.image_size": ([8 * 10**5] * 2, [10**9] * 2, [0, 0]),
+}
+TYPES = ("F64", "F16", "BF16", "I64", "I32", "U32", "I16", "I8", "U8", "BOOL", "F8_E4M3", "F99", "")
+
+
+@dataclass
+class File:
+    """A safetensors file, taken apart: what its header says of each tensor, metadata, bytes."""
+
+    tensors: dict[str, Any]
+    metadata: Any
+    data: bytearray
+
+    @classmethod
+    def read(cls, path: Path) -> "File":
+        """The file at `path`."""
+        whole = path.read_bytes()
+        end = 8 + int.from_bytes(whole[:8], "little")
+        header = json.loads(whole[8:end])
+        return cls(header, header.pop("__metadata__"), bytearray(whole[end:]))
+
+    def bytes(self) -> bytes:
+        """What `read` would take apart."""
+        header = json.dumps({"__metadata__": self.metadata, **self.tensors}).encode()
+        return len(header).to_bytes(8, "little") + header + self.data
+
+
+def a_tensor(file: File, dice: random.Random) -> tuple[str, dict[str, Any]]:
+    return dice.choice(list(file.tensors.items()))
+
+
+def other_type(file: File, dice: random.Random) -> None:
+    one = dice.random() < 0.5
+    kind, chosen = dice.choice(TYPES), [a_tensor(file, dice)[1]]
+    for entry in chosen if one else file.tensors.values():
+        entry["dtype"] = "I32" if not one and entry["dtype"] == "F32" else kind
+
+
+def other_shape(file: File, dice: random.Random) -> None:
+    _, entry = a_tensor(file, dice)
+    shape = entry["shape"]
+    changes: tuple[Callable[[], Any], ...] = (
+        lambda: shape[::-1],
+        lambda: [*shape, 1],
+        lambda: [1, *shape],
+        lambda: [-n for n in shape],
+        lambda: [n * 2**40 for n in shape] or [2**62],
+        lambda: [0, *shape],
+        lambda: [2**33, 2**33, *shape],
+        lambda: dice.choice(JUNK),
+        lambda: [torch.Size(shape).numel()],
+    )
+    entry["shape"] = dice.choice(changes)()
+
+
+def cut_rows(file: File, dice: random.Random) -> None:
+    """Some tensors to their first row, so that the file is whole and they would broadcast."""
+    entries = [e for e in file.tensors.values() if len(e["shape"]) > 1 or dice.random() < 0.2]
+    rows = dice.choice((0, 1, 1, 2))
+    kept, data = {id(e) for e in dice.sample(entries, dice.randint(1, 3))}, bytearray()
+    for entry in file.tensors.values():
+        first, last = entry["data_offsets"]
+        if id(entry) in kept and entry["shape"]:
+            last = first + (last - first) // max(entry["shape"][0], 1) * rows
+            entry["shape"] = [rows, *entry["shape"][1:]]
+        entry["data_offsets"] = [len(data), len(data) + last - first]
+        data += file.data[first:last]
+    file.data = data
+
+
+def other_offsets(file: File, dice: random.Random) -> None:
+    _, entry = a_tensor(file, dice)
+    first, last = entry["data_offsets"]
+    entry["data_offsets"] = dice.choice(
+        ([last, first], [first, 2**63], [-1, last], [0, last], dice.choice(JUNK), [first + 4, last])
+    )
+
+
+def other_name(file: File, dice: random.Random) -> None:
+    name, entry = a_tensor(file, dice)
+    news = ("foo", "", "/", "weights/", f"{name}x", "a/b/c/d", "x" * 10_000, name.upper(), "\u20ac")
+    file.tensors[dice.choice(news)] = file.tensors.pop(name)
+    if dice.random() < 0.3:
+        other, _ = a_tensor(file, dice)
+        file.tensors[name] = file.tensors.pop(other)
+    if dice.random() < 0.2:
+        file.tensors[name] = entry
+
+
+def other_values(file: File, dice: random.Random) -> None:
+    _, entry = a_tensor(file, dice)
+    first, last = entry["data_offsets"]
+    bad = dice.choice((b"\xff\xff\xff\xff", b"\x00\x00\x80\x7f", b"\x00\x00\xc0\x7f"))
+    if last - first >= 4:
+        place = first + dice.randrange((last - first) // 4) * 4
+        file.data[place : place + 4] = bad
+
+
+def other_metadata(file: File, dice: random.Random) -> None:
+    key = dice.choice(list(file.metadata))
+    text = file.metadata[key]
+    deep = dice.choice(("[", '{"a":')) * 5000
+    junk = json.dumps(dice.choice(JUNK))
+    cut = text[: dice.randrange(len(text) + 1)]
+    file.metadata[key] = dice.choice((cut, deep, junk, "null", "", text + text, "1e999", "-5"))
+    if dice.random() < 0.2:
+        del file.metadata[key]
+    if dice.random() < 0.05:
+        file.metadata = dice.choice(({}, [], None, {"a": 1}, {key: 5}))
+
+
+def other_value_of_json(file: File, dice: random.Random) -> None:
+    """A leaf, or a branch, of the JSON in the metadata."""
+    trees = {k: json.loads(v) for k, v in file.metadata.items() if v[:1] in "{["}
+    key = dice.choice(list(trees))
+    place: Any = trees[key]
+    while True:
+        keys = list(place) if isinstance(place, dict) else range(len(place))
+        if not keys:
+            break
+        chosen = dice.choice(keys)
+        inner = place[chosen]
+        if not isinstance(inner, dict | list) or not inner or dice.random() < 0.1:
+            place[chosen] = dice.choice(JUNK)
+            if isinstance(place, dict) and dice.random() < 0.2:
+                del place[chosen]
+            break
+        place = inner
+    file.metadata[key] = json.dumps(trees[key])
+
+
+def larger(file: File, dice: random.Random) -> None:
+    """Sizes in the recipe that no tensor has, or that no machine holds."""
+    tree = json.loads(file.metadata["qgs.recipe"])
+    for path in dice.sample(list(LARGE), dice.randint(1, 2)):
+        *parents, option = path.split(".")
+        below = tree
+        for parent in parents:
+            below = below[parent]
+        below[option] = dice.choice(LARGE[path])
+    file.metadata["qgs.recipe"] = json.dumps(tree)
+
+
+def other_recipe(file: File, dice: random.Random) -> None:
+    recipes = (
+        {"extends": "/etc/passwd"}, {"extends": "/dev/zero"}, {"recipe": 1}, {"recipe": 99},
+        {"recipe": 1, "plugins": ["nobody"]}, {"recipe": 1, "swap": {"*": {"type": "qgs/none"}}},
+        ["recipe"], "/etc/passwd", "/dev/zero", 7,
+    )  # fmt: skip
+    tree, new = json.loads(file.metadata["qgs.recipe"]), dice.choice(recipes)
+    joined = {**tree, **new} if isinstance(new, dict) and dice.random() < 0.5 else new
+    file.metadata["qgs.recipe"] = json.dumps(joined)
+
+
+def raw(path: Path, dice: random.Random) -> None:
+    """The bytes themselves."""
+    whole = bytearray(path.read_bytes())
+    end = 8 + int.from_bytes(whole[:8], "little")
+    kind = dice.randrange(8)
+    if kind == 0:
+        whole = whole[: dice.randrange(len(whole))]
+    elif kind == 1:
+        for _ in range(dice.randint(1, 20)):
+            whole[dice.randrange(end)] = dice.randrange(256)
+    elif kind == 2:
+        whole[:8] = dice.choice((0, end, 2**63, 2**64 - 1, 10**8, len(whole))).to_bytes(8, "little")
+    elif kind == 3:
+        whole += bytes(dice.randint(1, 100))
+    elif kind == 4:
+        whole = bytearray(
+            dice.choice((b"", b"PK\x03\x04", b"\x80\x02.", b"\0" * 100, b"{}", b"\xff" * 9))
+        )
+    elif kind == 5:
+        path.unlink()
+        path.mkdir()
+        return
+    elif kind == 6:
+        path.unlink()
+        os.mkfifo(path)
+        return
+    else:
+        whole = whole[: end + dice.randrange(64)]
+    path.write_bytes(whole)
+
+
+CHANGES = (
+    other_type, other_shape, cut_rows, other_offsets, other_name, other_values, other_metadata,
+    other_value_of_json, other_value_of_json, larger, other_recipe,
+)  # fmt: skip
+
+
+def damage(path: Path, dice: random.Random) -> str:
+    """Change the file in one way, rarely in two; the names of the ways."""
+    if dice.random() < 0.12:
+        raw(path, dice)
+        return "raw"
+    names = []
+    for change in dice.choices(CHANGES, k=dice.choice((1, 1, 1, 2))):
+        file = File.read(path)
+        try:
+            change(file, dice)
+        except (TypeError, KeyError, ValueError, IndexError):  # on top of another change
+            continue
+        path.write_bytes(file.bytes())
+        names.append(change.__name__)
+    return "+".join(names)
+
+
+def small(steps: int) -> Recipe:
+    sizes = ("model.width=16", "model.heads=2", "model.queries.count=8", "data.samples=1")
+    parts = ("model.decoder.depth=2", "model.supervision.layers=[2]", "data.image_size=[16, 16]")
+    training = (f"training.steps={steps}", "training.seconds=null", "optimizer.warmup=1")
+    return resolve(RECIPE, [*sizes, *parts, *training, "training.ema=0.9", "evaluation.scenes=1"])
+
+
+def use_checkpoint(checkpoint: Path) -> None:
+    model = qgs.load(checkpoint)
+    refuse_broken(model, checkpoint)
+    with torch.no_grad():
+        gaussians = model.decode(model.queries(1))
+    write_ply(gaussians, checkpoint.with_suffix(".ply"))
+
+
+def use_state(state: Path) -> None:
+    train(small(STEPS + 1), state.parent, console=Console(quiet=True), device="cpu", resume=True)
+
+
+def outcome(use: Callable[[Path], None], path: Path, report: int) -> None:
+    """Run `use` in a process of its own, and write what it raised, if that is not ours."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    try:
+        use(path)
+        os.write(report, b"success")
+    except (ValueError, OSError, TrainingError) as error:
+        told = str(path.parent) in str(error) and len(str(error)) < 20_000
+        text = f"refused {type(error).__name__}" if told else traceback.format_exc()[-3000:]
+        os.write(report, text.encode(errors="replace"))
+    except BaseException:
+        os.write(report, traceback.format_exc()[-3000:].encode(errors="replace"))
+    os._exit(0)
+
+
+def judged(use: Callable[[Path], None], path: Path) -> str:
+    """ "success", "refused ...", or what is wrong with this case."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if not child:
+        outcome(use, path, writing)
+    os.close(writing)
+    deadline = time.monotonic() + LONGEST
+    while True:
+        done, status, used = os.wait4(child, os.WNOHANG)
+        if done:
+            break
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            os.wait4(child, 0)
+            os.close(reading)
+            return f"hangs: no end after {LONGEST} s"
+        time.sleep(0.002)
+    with os.fdopen(reading, "rb") as pipe:
+        text = pipe.read().decode(errors="replace")
+    spent, peak = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024
+    if status:
+        return f"ended with status {status}"
+    if spent > SECONDS or peak > BYTES:
+        return f"took {spent:.1f} s and {peak / 1e9:.2f} GB, then: {text[:500]}"
+    return text
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="number of the one case to run")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    counts, wrong = Counter[str](), 0
+    with tempfile.TemporaryDirectory() as name:
+        scratch = Path(name)
+        train(small(STEPS), scratch / "run", console=Console(quiet=True), device="cpu")
+        numbers = range(options.count) if options.only is None else [options.only]
+        for number in numbers:
+            dice = random.Random(f"{options.seed} {number}")
+            run = scratch / f"case-{number}"
+            shutil.copytree(scratch / "run", run)
+            kind, use = dice.choice((("checkpoint", use_checkpoint), ("state", use_state)))
+            path = run / f"{kind}.safetensors"
+            ways = damage(path, dice)
+            found = judged(use, path)
+            if not found.startswith(("success", "refused")):
+                wrong += 1
+                print(f"case {number}: {kind}, {ways}: {found}\n", flush=True)
+                found = "WRONG"
+            counts[f"{kind} {found}"] += 1
+            shutil.rmtree(run)
+    print(f"{len(numbers)} cases, {wrong} wrong: {dict(sorted(counts.items()))}")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
