@@ -1,11 +1,18 @@
 """`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
 
+import keyword
 import re
 import shlex
+import sys
 import unicodedata
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, distribution, entry_points
+from importlib.metadata import (
+    PackageNotFoundError,
+    distribution,
+    entry_points,
+    packages_distributions,
+)
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -64,6 +71,18 @@ def check_name(name: str) -> None:
         raise ValueError(
             f"`{name}` is the name of a device on Windows, where no file can have it; choose "
             f"another, such as `{name}-things`"
+        )
+    module = name.replace("-", "_")
+    if keyword.iskeyword(module):
+        raise ValueError(
+            f"`{name}` is a word of Python's own, which no module or variable can be called; "
+            f"choose another, such as `{name}-things`"
+        )
+    if module in sys.stdlib_module_names or module in packages_distributions():
+        of = ", ".join(dict.fromkeys(packages_distributions().get(module, ["Python itself"])))
+        raise ValueError(
+            f"`{name}` is the name of a package that is installed here ({of}), so nobody could "
+            f"tell the two apart; choose another, such as `{name}-things`"
         )
     (value,) = load_mapping(f"name: {name}", name, Problems()).values()
     if value != name:

@@ -104,6 +104,34 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
         fields |= {name: (spec, chosen) for name, spec in provided.items() if name not in missing}
 
 
+def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
+    """Fields that queries start with and nothing reads but refinements, which only go on with them.
+
+    One sentence each, with what would do without the field.
+    """
+    used = {path: part for path, part in parts.items() if path[:-1] != ("model", "decoder")}
+    read = set[str]()
+    for part in used.values():
+        if not issubclass(part.component, Refinement):
+            read |= part.component.requires(part.config).keys()
+    keepers = [c for c in used.values() if issubclass(c.component, Queries | Refinement)]
+    for name in _offers(parts["model", "queries"].component, parts["model", "queries"].config):
+        if name in read:
+            continue
+        changes = [
+            f"set `{keeper.path}.{option}: {value}`"
+            for keeper in {keeper.path: keeper for keeper in keepers}.values()
+            for option, value, config in variants(keeper.config)
+            if name in keeper.component.provides(keeper.config)
+            if name not in keeper.component.provides(config)
+        ]
+        advice = f"; to do without it, {' and '.join(changes)}" if changes else ""
+        yield (
+            f"nothing reads {name}, which `{parts['model', 'queries'].type}` at model.queries "
+            f"provides: what is learnt of it has no effect{advice}"
+        )
+
+
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, int | None]]:
     """Every component's turn in a training step, and the layer that is decoded, else None.
 

@@ -106,6 +106,10 @@ def test_a_distribution_that_is_installed_is_not_replaced(install: Callable[...,
         ("true", "would be read as True"),
         ("false", "choose another, such as `false-things`"),
         ("1e3", "did you mean `e3`"),
+        ("class", "a word of Python's own"),
+        ("torch", "a package that is installed here (torch)"),
+        ("yaml", "a package that is installed here (PyYAML)"),
+        ("json", "a package that is installed here (Python itself)"),
     ],
 )
 def test_names_that_are_refused(name: str, message: str, tmp_path: Path) -> None:
