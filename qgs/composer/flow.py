@@ -76,21 +76,26 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
     """Report fields that are read before they are written, or not as they are written.
 
     After a component that could not be decoded, which might have provided it, nothing is missing.
+    What is missing at one place of a recipe is told once, not for every layer made from it.
     """
     steps = list(_execution_order(parts, depth))
+    told, whole = set[tuple[str, ...]](), True
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     branch, branch_layer = dict(state), None
     for position, (chosen, layer) in enumerate(steps):
         if layer is not None and layer != branch_layer:
             branch, branch_layer = dict(state), layer
         if chosen is None:
+            whole = False
             continue
         fields = state if layer is None else branch
         origin, needed = chosen.place.origin, chosen.component.requires(chosen.config)
         missing = {name: spec for name, spec in needed.items() if name not in fields}
-        before = [step for step, _ in steps[:position] if step]
-        if missing and len(before) == position:
-            after = [step for step, _ in steps[position + 1 :] if step]
+        if missing and whole and (key := (chosen.path, *missing)) not in told:
+            told.add(key)
+            by_path = {step.path: step for step, _ in steps[:position] if step}
+            before = list(by_path.values())
+            after = list({step.path: step for step, _ in steps[position + 1 :] if step}.values())
             # One change that meets them all, or changes for each of them.
             joint = _fixes(missing, chosen, before, registry)
             for group in [missing] if joint else [{name: missing[name]} for name in missing]:
