@@ -59,7 +59,7 @@ class MultiViewViT(Encoder):
     class Config(ComponentConfig):
         patch_size: int = Field(default=8, ge=1)
         """Side of a patch, pixels; must divide both sides of the image."""
-        depth: int = Field(default=3, ge=0)
+        depth: int = Field(default=3, ge=0, le=256)
         """Number of ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the MLPs (rounded down) over the model's width."""

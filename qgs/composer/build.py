@@ -124,10 +124,14 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         users_mistake = isinstance(error, ValueError | OSError) and issubclass(
             component, SceneSource | Optimizer
         )
+        where = chosen.place.origin.file, chosen.place.origin.line
+        if issubclass(component, ModelComponent) and _too_large(error):
+            reason = f"`{chosen.type}` with these options has tensors that no machine can hold"
+            problem = RecipeProblem(chosen.path, reason, "make the numbers in it smaller", *where)
+            raise RecipeError([problem]) from error
         if chosen.installed.plugin is BUILTIN or users_mistake:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
-        where = chosen.place.origin.file, chosen.place.origin.line
         problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
         raise RecipeError([problem]) from error
     if issubclass(component, Queries | Refinement):
@@ -140,6 +144,12 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
         hook = built.register_forward_hook(check)
     return built
+
+
+def _too_large(error: Exception) -> bool:
+    """Whether torch or Python refused the size of a tensor; torch has no type for that."""
+    words = ("overflow", "can't allocate memory", "not enough memory")
+    return isinstance(error, MemoryError) or any(word in str(error).lower() for word in words)
 
 
 def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:

@@ -150,3 +150,11 @@ def test_a_recipe_without_losses_is_a_recipe(write: Write) -> None:
         shown = annotated(recipe)
         assert resolve(write(shown, "again.yaml")).tree == recipe.tree
         assert (recipe.build_losses() == {}) == (text != "losses: null")
+
+
+@pytest.mark.parametrize("option", ["encoder.mlp_ratio", "queries.count"])
+def test_tensors_that_no_machine_holds_are_told_by_their_place(option: str, write: Write) -> None:
+    recipe = resolve(write("recipe: 1\n"), [f"model.{option}={2**62}"])
+    problem = refused("meta", by=recipe.build_model)
+    assert problem.option == f"model.{option.split('.')[0]}"
+    assert "tensors that no machine can hold" in problem.reason
