@@ -30,13 +30,13 @@ from typing import Any
 import torch
 import yaml
 
-from qgs.cli.recipe_tables import difference_tables, parameter_counts
+from qgs.cli.recipe_tables import parameter_counts
 from qgs.composer import PluginError, Recipe, RecipeError, resolve
 from qgs.composer.recipe import annotated, flat
 from qgs.composer.registry import load_sound_plugins
 from qgs.composer.slots import SLOTS
-from qgs.composer.yaml_text import dump
 from qgs.contracts import MissingExtraError
+from qgs.io.differences import differing_options
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SECONDS, MEGABYTES, CHARACTERS = 5.0, 2000, 100_000
@@ -369,8 +369,8 @@ def judged(case: Case, folder: Path) -> str:
     except MissingExtraError:
         return ""
     parameter_counts(model)
-    list(difference_tables(base(case.name)[1], recipe, "a", "b"))
-    texts = {"JSON": json.dumps(recipe.tree), "YAML": dump(recipe.tree), "page": annotated(recipe)}
+    differing_options(base(case.name)[1].tree, recipe.tree)
+    texts = {"JSON": json.dumps(recipe.tree), "YAML": annotated(recipe)}
     for kind, text in texts.items():
         path.write_bytes(text.encode())
         again = resolve(json.loads(text) if kind == "JSON" else path)

@@ -51,6 +51,8 @@ def compose(
     resolved.rate_factors(model)  # patterns that name no parameter are refused
     typer.echo(annotated(resolved))
     Console(stderr=True).print(parameter_table(resolved, model))
+    for warning in resolved.warnings:
+        typer.echo(f"warning: {warning}", err=True)
 
 
 def diff(

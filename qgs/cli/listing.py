@@ -141,7 +141,11 @@ def _type(option: Schema) -> str:
         return f"[{', '.join(map(_type, option['prefixItems']))}]"
     if "items" in option:
         return f"[{_type(option['items'])}, ...]"
-    kind = option.get("type", "any")
+    kind, inner = option.get("type", "any"), option.get("additionalProperties")
+    if isinstance(inner, dict):
+        return f"mapping to {_type(inner)}"
+    if "kind" in option.get("properties", {}):
+        return f"mapping of kind {_type(option['properties']['kind'])}"
     bounds = [f"{sign} {option[key]}" for key, sign in _BOUNDS.items() if key in option]
     return f"{_WORDS.get(kind, kind)} {', '.join(bounds)}".strip()
 

@@ -1,13 +1,18 @@
 """`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
 
-import importlib.util
 import keyword
 import re
 import shlex
+import sys
 import unicodedata
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, distribution, entry_points
+from importlib.metadata import (
+    PackageNotFoundError,
+    distribution,
+    entry_points,
+    packages_distributions,
+)
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -67,12 +72,17 @@ def check_name(name: str) -> None:
             f"`{name}` is the name of a device on Windows, where no file can have it; choose "
             f"another, such as `{name}-things`"
         )
-    if keyword.iskeyword(name) or keyword.issoftkeyword(name):
-        raise ValueError(f"`{name}` is a word of Python; choose another, such as `{name}-things`")
-    if importlib.util.find_spec(name.replace("-", "_")):
+    module = name.replace("-", "_")
+    if keyword.iskeyword(module):
         raise ValueError(
-            f"`{name}` is a package that Python finds here, so `type: {name}/...` and qgs-{name} "
-            f"would pass for a part of it; choose another, such as `{name}-things`"
+            f"`{name}` is a word of Python's own, which no module or variable can be called; "
+            f"choose another, such as `{name}-things`"
+        )
+    if module in sys.stdlib_module_names or module in packages_distributions():
+        of = ", ".join(dict.fromkeys(packages_distributions().get(module, ["Python itself"])))
+        raise ValueError(
+            f"`{name}` is the name of a package that is installed here ({of}), so nobody could "
+            f"tell the two apart; choose another, such as `{name}-things`"
         )
     (value,) = load_mapping(f"name: {name}", name, Problems()).values()
     if value != name:

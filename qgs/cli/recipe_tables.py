@@ -25,10 +25,9 @@ def parameter_table(recipe: Recipe, model: QueryGaussianModel) -> Table:
 def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Table]:
     """Slots, then options and settings, then parameters that differ in recipes called `a`, `b`.
 
-    Options are compared where both recipes have the same component.
+    "-" stands for an option that a recipe's component does not have.
     """
     differing = differing_options(first.tree, second.tree)
-    kinds = {path.removesuffix(".type") for path in differing if path.endswith(".type")}
     slots, options, parameters = (
         Table(title=title, title_justify="left")
         for title in ("slots that differ", "options that differ", "parameters")
@@ -42,7 +41,7 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
         cells = [escape("-" if value is None else value) for value in values]
         if path.endswith(".type"):
             slots.add_row(path.removesuffix(".type"), *cells)
-        elif not any(path.startswith(f"{kind}.") for kind in kinds):
+        else:
             options.add_row(path, *cells)
     parameters.add_column("difference", justify="right", overflow="fold")
     ours, theirs = (parameter_counts(r.build_model("meta")) for r in (first, second))

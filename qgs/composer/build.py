@@ -126,9 +126,9 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
             component, SceneSource | Optimizer
         )
         where = chosen.place.origin.file, chosen.place.origin.line
-        if is_out_of_memory(error) or "overflow" in str(error).lower():
-            why = f"`{chosen.type}` cannot be made in this size: {error}"
-            problem = RecipeProblem(chosen.path, why, "lower the numbers of its options", *where)
+        if issubclass(component, ModelComponent) and _too_large(error):
+            reason = f"`{chosen.type}` with these options has tensors that no machine can hold"
+            problem = RecipeProblem(chosen.path, reason, "make the numbers in it smaller", *where)
             raise RecipeError([problem]) from error
         if chosen.installed.plugin is BUILTIN or users_mistake:
             raise
@@ -145,6 +145,11 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
         hook = built.register_forward_hook(check)
     return built
+
+
+def _too_large(error: Exception) -> bool:
+    """Whether torch or Python refused the size of a tensor; torch has no type for that."""
+    return is_out_of_memory(error) or "overflow" in str(error).lower()
 
 
 def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:

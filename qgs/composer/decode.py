@@ -41,7 +41,7 @@ class ModelSettings(ComponentConfig):
 class DecoderSettings(ComponentConfig):
     """The decoder, but for the components of its layers."""
 
-    depth: int = Field(default=12, ge=1, le=1024)
+    depth: int = Field(default=12, ge=1, le=256)
     """Number of layers (L in the papers)."""
     layer_scale: float = Field(default=5e-5, gt=0)
     """Initial LayerScale of every sublayer (TokenGS release)."""

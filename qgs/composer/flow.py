@@ -76,21 +76,26 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
     """Report fields that are read before they are written, or not as they are written.
 
     After a component that could not be decoded, which might have provided it, nothing is missing.
+    What is missing at one place of a recipe is told once, not for every layer made from it.
     """
     steps = list(_execution_order(parts, depth))
+    told, whole = set[tuple[str, ...]](), True
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     branch, branch_layer = dict(state), None
     for position, (chosen, layer) in enumerate(steps):
         if layer is not None and layer != branch_layer:
             branch, branch_layer = dict(state), layer
         if chosen is None:
+            whole = False
             continue
         fields = state if layer is None else branch
         origin, needed = chosen.place.origin, chosen.component.requires(chosen.config)
         missing = {name: spec for name, spec in needed.items() if name not in fields}
-        before = [step for step, _ in steps[:position] if step]
-        if missing and len(before) == position:
-            after = [step for step, _ in steps[position + 1 :] if step]
+        if missing and whole and (key := (chosen.path, *missing)) not in told:
+            told.add(key)
+            by_path = {step.path: step for step, _ in steps[:position] if step}
+            before = list(by_path.values())
+            after = list({step.path: step for step, _ in steps[position + 1 :] if step}.values())
             # One change that meets them all, or changes for each of them.
             joint = _fixes(missing, chosen, before, registry)
             for group in [missing] if joint else [{name: missing[name]} for name in missing]:
@@ -102,6 +107,34 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                 problems.add(origin, chosen.path, reason, fix)
         provided = chosen.component.provides(chosen.config)
         fields |= {name: (spec, chosen) for name, spec in provided.items() if name not in missing}
+
+
+def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
+    """Fields that queries start with and nothing reads but refinements, which only go on with them.
+
+    One sentence each, with what would do without the field.
+    """
+    used = {path: part for path, part in parts.items() if path[:-1] != ("model", "decoder")}
+    read = set[str]()
+    for part in used.values():
+        if not issubclass(part.component, Refinement):
+            read |= part.component.requires(part.config).keys()
+    keepers = [c for c in used.values() if issubclass(c.component, Queries | Refinement)]
+    for name in _offers(parts["model", "queries"].component, parts["model", "queries"].config):
+        if name in read:
+            continue
+        changes = [
+            f"set `{keeper.path}.{option}: {value}`"
+            for keeper in {keeper.path: keeper for keeper in keepers}.values()
+            for option, value, config in variants(keeper.config)
+            if name in keeper.component.provides(keeper.config)
+            if name not in keeper.component.provides(config)
+        ]
+        advice = f"; to do without it, {' and '.join(changes)}" if changes else ""
+        yield (
+            f"nothing reads {name}, which `{parts['model', 'queries'].type}` at model.queries "
+            f"provides: what is learnt of it has no effect{advice}"
+        )
 
 
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, int | None]]:

@@ -22,13 +22,18 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     written = node if isinstance(node, MapNode) else MapNode(optimizer.place.origin)
     model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
     factors = {name: 1.0 for name, _ in module.named_parameters()}
-    known = [(path, n) for n in factors for path in _paths(n.removeprefix("model."), model)]
+    known: dict[int, dict[KeyPath, list[str]]] = {}  # names below a path, by its length
+    for name in factors:
+        for path in _paths(name.removeprefix("model."), model):
+            for end in range(1, len(path) + 1):
+                known.setdefault(end, {}).setdefault(path[:end], []).append(name)
     for pattern, factor in config.parts.items() if isinstance(config, OptimizerConfig) else ():
         wanted = pattern.removeprefix("model.").split(".")
-        named = [n for p, n in known if len(wanted) <= len(p) and all(map(fnmatchcase, p, wanted))]
+        below = known.get(len(wanted), {}).items()
+        named = [n for p, names in below if all(map(fnmatchcase, p, wanted)) for n in names]
         factors |= dict.fromkeys(named, factor)
         if not named and (module is not model or wanted[0] != "losses"):
-            parts = [path[:end] for path, _ in known for end in range(1, len(path) + 1)]
+            parts = [path for paths in known.values() for path in paths]
             reason = f"the pattern `{pattern}` matches no parameter of the model"
             outermost = ", ".join(dict.fromkeys(path[0] for path in parts))
             fix = near_pattern(pattern, parts) or f"its parts: {outermost}"

@@ -13,7 +13,7 @@ from qgs.composer.build import build, build_model
 from qgs.composer.decode import Chosen, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
 from qgs.composer.files import apply_overrides, merge, read_recipe
-from qgs.composer.flow import check_flow, check_options
+from qgs.composer.flow import check_flow, check_options, idle_fields
 from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.rates import rate_factors
@@ -48,6 +48,11 @@ class Recipe:
     training: contracts.TrainingConfig
     evaluation: contracts.EvaluationConfig
     plugin_versions: Mapping[str, str]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What works and is probably not what was meant, a sentence each."""
+        return list(idle_fields(self.parts))
 
     def build_model(self, device: torch.device | str | None = None) -> QueryGaussianModel:
         """The model with its initial parameters; on "meta" it takes no memory.

@@ -15,7 +15,7 @@ from qgs.contracts.settings import TrainingConfig
 class OptimizerConfig(ComponentConfig):
     """The options of every optimiser."""
 
-    parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={})
+    parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={}, max_length=1000)
     """Parts of the model to factors of the learning rate: `{encoder: 0.1}`; 0 freezes a part. A
     part is a path of the recipe, as in `swap`, or a module or parameter of the model; `*`, `?` and
     `[...]` stand for parts of one segment. It holds for everything below it:

@@ -159,7 +159,8 @@ class Trainer:
             saved = saved_state(self.folder, recipe)
         refuse_unfit(recipe, self.accelerator)
         self.model = recipe.build_model(device=self.accelerator.device).train()
-        self.notes = [] if saved else initialise(self.model, recipe)
+        warnings = [f"warning: {text}" for text in recipe.warnings]
+        self.notes = warnings + ([] if saved else initialise(self.model, recipe))
         objective = Objective(self.model, recipe.build_losses(), config.render_views)
         objective.to(self.accelerator.device)
         if wants_shards(self.accelerator):  # before the optimiser, whose moments lie in shards too

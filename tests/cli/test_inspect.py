@@ -116,7 +116,7 @@ def test_diff_fits_into_80_columns(recipe, tmp_path, monkeypatch):
     assert "slots that differ" in slots
     assert "locus/anchored" in slots
     assert "model.decoder.feed_forward.ratio" in options
-    assert "gamma_init" not in output
+    assert "model.decoder.cross_attention.gamma_init" in options, "those of a swapped slot too"
 
 
 def test_diff_of_one_recipe_with_overrides(recipe):
