@@ -5,6 +5,9 @@ import re
 import numpy as np
 from upath import UPath
 
+from qgs.data.images import load_array
+from qgs.data.paths import open_file
+from qgs.data.photos.checks import listed_size
 from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoFrame, PhotoReader, image_folder
 
 
@@ -48,9 +51,9 @@ def _skipped(names: list[str]) -> str:
 def _rows(file: UPath) -> np.ndarray:
     """(N, 17) float64. Raises ValueError for a file of something else."""
     try:
-        with file.open("rb") as opened:
-            rows = np.load(opened, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+        with open_file(file) as opened:
+            rows = load_array(opened)
+    except Exception as error:  # NumPy raises anything on damaged headers
         raise ValueError(
             f"{file} is no NumPy file of numbers ({error}): export it again"
         ) from error
@@ -65,11 +68,12 @@ def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     c2w = np.eye(4)
     c2w[:3] = np.stack([right, down, -back, centre], 1)
-    whole = np.isfinite([height, width]).all() and min(height, width) >= 1
+    size, problems = listed_size(float(height), float(width))
     return PhotoFrame(
         name=f"{path.parent.name}/{path.name}",
         path=path,
         c2w=c2w,
         intrinsics=(float(focal), float(focal), float(width / 2), float(height / 2)),
-        size=(round(height), round(width)) if whole else None,
+        size=size,
+        problems=problems,
     )

@@ -1,6 +1,5 @@
 """nerfstudio: `transforms.json`, whose schema Blender's and DL3DV's files share."""
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
@@ -13,7 +12,8 @@ from upath import UPath
 
 from qgs.data.images import image_size
 from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
-from qgs.data.photos.checks import FrameProblem
+from qgs.data.paths import read_json
+from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing, with_images
 
 Value = TypeVar("Value")
@@ -53,10 +53,7 @@ class Nerfstudio(PhotoReader):
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
     """The frames of a transforms file in order, with their faults in them. Raises ValueError."""
-    try:
-        data = json.loads(file.read_bytes())  # with or without a byte order mark
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not valid JSON: {error}; export it again") from error
+    data = read_json(file, "export it again")
     entries = data.get("frames") if isinstance(data, Mapping) else None
     if not isinstance(entries, list) or not entries:
         raise ValueError(f"{file} lists no frames: expected a non-empty list under 'frames'")
@@ -85,9 +82,10 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
         problem = FrameProblem("path", "it has no 'file_path'", fix)
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
     values = {**data, **entry}
-    size = _size(values) or size
     name = image_name(path)
-    problems: list[FrameProblem] = []
+    sides = [_number(values, key) for key in ("h", "w")]
+    given, wrong = (None, ()) if None in sides else listed_size(*sides)
+    size, problems = given or size, [*wrong]
 
     def read(value: Callable[[], Value], otherwise: Value) -> Value:
         try:
@@ -136,12 +134,6 @@ def _number(values: Mapping[str, Any], key: str) -> float | None:
     """A number, NaN included; None where it is absent, null or something else."""
     value = values.get(key)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def _size(values: Mapping[str, Any]) -> Size | None:
-    sides = [_number(values, key) for key in ("h", "w")]
-    height, width = (side if side and math.isfinite(side) else 0 for side in sides)
-    return (round(height), round(width)) if height >= 1 and width >= 1 else None
 
 
 def _intrinsics(values: Mapping[str, Any], size: Size | None) -> Intrinsics:

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from operator import attrgetter
 from typing import ClassVar
@@ -24,7 +25,7 @@ from qgs.data.images import (
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted
-from qgs.data.paths import opened_path
+from qgs.data.paths import opened_path, read_file
 from qgs.data.photos import Format, formats_of, read_listing
 from qgs.data.photos.checks import require_sound, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
@@ -129,7 +130,7 @@ class PhotoScene(EncodedScene):
         if listed.mask is not None:
             Image.fromarray(_whole_mask(listed)).save(buffer, "png")
         return EncodedFrame(
-            listed.name, listed.path.read_bytes(), listed.c2w, listed.at_size(size), size,
+            listed.name, read_file(listed.path), listed.c2w, listed.at_size(size), size,
             listed.lens, buffer.getvalue() or None, self._config.background,
         )  # fmt: skip
 
@@ -158,6 +159,8 @@ class PhotoScene(EncodedScene):
         self, pixels: np.ndarray, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
     ) -> np.ndarray:
         """The content of `file` without distortion, at the delivered size."""
+        if file != frame.path and frame.size is None:  # a mask or depth map follows the photo
+            frame = replace(frame, size=image_size(frame.path))
         size = _checked(pixels.shape[:2], frame, file)
         pixels = undistorted(pixels, frame.at_size(size), frame.lens, mode)
         kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
@@ -269,7 +272,8 @@ def present_frames(
     if len(present) < 2:
         raise FileNotFoundError(
             f"{listing.file} names {len(frames)} images, of which {len(present)} exist "
-            f"and 2 are needed; the first missing one is {missing[0] if missing else 'none'}"
+            f"and 2 are needed: "
+            + (f"the first missing one is {missing[0]}" if missing else "add photos")
         )
     if missing:
         warn_once(

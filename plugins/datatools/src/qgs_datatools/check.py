@@ -198,6 +198,9 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     with ThreadPoolExecutor(options.threads) as pool:
         decoded = pool.map(partial(decode, headers_only=options.headers_only), photos)
     scene = DecodedScene(name, photos, list(decoded))
+    if (there := sum(photo.exists for photo in photos)) < 2:
+        fix = "add photos, or take the scene out"
+        absent.append(Finding(name, f"{there} photos are there, and a scene needs 2", fix))
     files = list(file_findings(scene, _LISTINGS.get(candidate.kind, "the data set")))
     sizes = list(size_findings(scene))
     poses, others = camera_findings(scene, _frames(sizes))

@@ -21,6 +21,7 @@ from qgs.data.chunk_files import (
     load_chunk,
     parse_record,
     read_chunk_index,
+    read_mask,
     unit_problems,
 )
 from qgs.data.lenses import Size
@@ -194,7 +195,11 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         size=size,
         problems=tuple(unit_problems(record, frame)),
     )
-    return Photo(photo, lambda: record.images[frame].numpy().tobytes())
+    return Photo(
+        photo,
+        lambda: record.images[frame].numpy().tobytes(),
+        read_mask=lambda: read_mask(record, frame),
+    )
 
 
 def _listed_sizes(record: Record) -> list[Size] | None:
