@@ -25,12 +25,14 @@ from qgs.types import Cameras, Gaussians
 for count, size in ((40, (24, 40)), (2000, (64, 64)), (5000, (128, 128))):
     random = torch.Generator().manual_seed(count)
     draw = lambda *shape: torch.rand(shape, generator=random)
-    means = (draw(2, count, 3) - 0.5) * torch.tensor([3.0, 2.0, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
+    means = (draw(2, count, 3) - 0.5) * torch.tensor([3.0, 2.0, 1.0])
+    means = means + torch.tensor([0.0, 0.0, 3.0])
     c2w = torch.eye(4).repeat(2, 3, 1, 1)
     c2w[..., :3, 3] = 0.3 * draw(2, 3, 3)
     lens = torch.tensor([0.8 * size[1], 0.8 * size[1], size[1] / 2, size[0] / 2]).repeat(2, 3, 1)
     shape = (2, count)
-    inputs = [means, 0.1 * draw(*shape, 3), draw(*shape, 4), draw(*shape), draw(*shape, 3), c2w, lens]
+    inputs = [means, 0.1 * draw(*shape, 3), draw(*shape, 4), draw(*shape), draw(*shape, 3)]
+    inputs += [c2w, lens]
     for tensor in inputs:
         tensor.requires_grad_()
     out = CpuRenderer(RendererConfig())(Gaussians(*inputs[:5]), Cameras(c2w, lens, size))

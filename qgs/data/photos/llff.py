@@ -8,7 +8,7 @@ from upath import UPath
 from qgs.data.images import load_array
 from qgs.data.paths import open_file
 from qgs.data.photos.checks import listed_size
-from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoFrame, PhotoReader, image_folder
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_files, image_folder
 
 
 class Llff(PhotoReader):
@@ -27,16 +27,15 @@ class Llff(PhotoReader):
         """See `PhotoReader`. Raises ValueError unless there are as many photos as rows."""
         file, photos = folder / cls.listing, image_folder(folder, images)
         rows = _rows(file)
-        shown = {item.name: item for item in photos.iterdir() if not item.name.startswith(".")}
-        names = sorted(name for name in shown if name.lower().endswith(IMAGE_SUFFIXES))
-        if len(names) != len(rows):
+        files = image_files(photos)
+        skipped = _skipped([item.name for item in files])
+        if len(files) != len(rows):
             raise ValueError(
-                f"{file} has {len(rows)} poses, but {photos} has {len(names)} images: they belong "
-                f"together in the order of the names{_skipped(names)}, so give all images and no "
+                f"{file} has {len(rows)} poses, but {photos} has {len(files)} images: they belong "
+                f"together in the order of the names{skipped}, so give all images and no "
                 "others"
             )
-        frames = [_frame(shown[name], row) for name, row in zip(names, rows, strict=True)]
-        return Listing(file, frames)
+        return Listing(file, [_frame(*pair) for pair in zip(files, rows, strict=True)])
 
 
 def _skipped(names: list[str]) -> str:

@@ -106,6 +106,13 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
     return held
 
 
+def image_files(folder: UPath) -> list[UPath]:
+    """The photos in a folder, by name."""
+    files = [item for item in folder.iterdir() if not item.name.startswith(".")]
+    photos = [item for item in files if item.name.lower().endswith(IMAGE_SUFFIXES)]
+    return sorted(photos, key=lambda item: item.name)
+
+
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
     """`wanted`, else images, else its least reduced copy. Raises FileNotFoundError."""
     if wanted is not None:
