@@ -150,7 +150,7 @@ def _described(data: Any) -> str:
     if isinstance(data, Mapping):
         return f"a mapping with the keys {listed(map(repr, data)) or 'none'}"
     if isinstance(data, list | tuple):
-        return f"a list of {listed(dict.fromkeys(map(_described, data))) or 'nothing'}"
+        return f"a list of {listed(dict.fromkeys(map(a_type, data))) or 'nothing'}"
     if isinstance(data, Tensor) and not _is_plain(data):
         return "a sparse, quantised or expanded tensor"
     return a_type(data)

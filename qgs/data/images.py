@@ -200,8 +200,8 @@ def decode_mask(file: IO[bytes]) -> np.ndarray:
     if image.mode.startswith("I;16"):
         numbers = np.array(image).astype(np.uint16)
         grey = _scaled(numbers) if numbers.max() > 255 else numbers.astype(np.uint8)
-    elif image.mode == "L" and not image.has_transparency_data:
-        grey = np.array(image)
+    elif image.mode in ("1", "L") and not image.has_transparency_data:
+        grey = np.array(image.convert("L"))
     else:
         rgba = np.array(eight_bits(image).convert("RGBA"))
         grey = rgba[..., 0]

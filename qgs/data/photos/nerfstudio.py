@@ -24,7 +24,7 @@ _FISHEYE = "OPENCV_FISHEYE"
 _OTHER = ("k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
 
 
 class Nerfstudio(PhotoReader):
@@ -127,7 +127,7 @@ def _pose(entry: Mapping[str, Any]) -> np.ndarray:
     if c2w.shape != (4, 4):
         reason = "'transform_matrix' must be 4 x 4 numbers"
         raise _UnreadableError("c2w", reason, "export the pose again")
-    return c2w @ _OPENGL_TO_OPENCV
+    return c2w * _OPENGL_TO_OPENCV
 
 
 def _number(values: Mapping[str, Any], key: str) -> float | None:

@@ -243,7 +243,8 @@ def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
     for frame in frames:
         photo = scene.photos[frame].listed
         height, width = photo.size or scene.decoded[frame].size or (1, 1)
-        fov.append((width / 2 / photo.intrinsics[0], height / 2 / photo.intrinsics[1]))
+        sides = zip((width, height), photo.intrinsics, strict=False)
+        fov.append([side / 2 / focal if focal > 0 else 0.0 for side, focal in sides])
         c2w.append(photo.c2w[:3])
     drawn = {"c2w": np.array(c2w, np.float32), "fov": np.array(fov, np.float32)}
     return {"frames": tuple(frames), **drawn}
