@@ -271,7 +271,7 @@ def _image(folder: Path, chance: random.Random) -> str:
     file = chance.choice(found)
     kinds: dict[str, Callable[[], bytes]] = {
         "bomb": lambda: _png(30_000, 30_000),
-        "large": lambda: _png(12_000, 12_000),
+        "large": lambda: _png(4_000, 3_000),
         "swapped": lambda: _png(30, 40),
         "no pixels": lambda: _png(0, 0),
         "float": lambda: formats.encoded(_float(), "TIFF"),

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import IO
 
@@ -21,9 +20,9 @@ TURNED = "have an EXIF orientation, which is not followed: they are read as they
 TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
 
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
-_FORMATS = (
-    "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF", "TGA",
-)  # fmt: skip
+# of photos; others, such as EPS, would start programs
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA")
+_MOST_PIXELS = 120_000_000  # which take 2 GB with transparency; the largest phones make 108
 _ORIENTATION, _PHOTOMETRIC = 0x0112, 262  # tags of EXIF and TIFF
 
 
@@ -98,7 +97,7 @@ def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Imag
 
 
 def orientation(image: Image.Image) -> int:
-    """How EXIF would turn an image; 1 for not at all, and for EXIF that cannot be read."""
+    """How EXIF would turn a decoded image; 1 for not at all, and for EXIF that is damaged."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
     except Exception:
@@ -128,13 +127,11 @@ def open_depth(path: UPath, unit: float) -> np.ndarray:
         else:
             image = _decoded(file)
             depth = np.array(image)
-            if image.mode == "P" or (image.mode[0] == "I" and _white_is_zero(image)):
-                raise OSError("its numbers are no depths, but a palette's or inverted ones")
+            if image.mode == "P":
+                raise OSError("its numbers are those of a palette")
         if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-            raise OSError(
-                f"it must hold one number for each pixel, as 16-bit images and .npy files do, got "
-                f"{depth.dtype} {depth.shape}"
-            )
+            wanted = "it must hold one number for each pixel, as 16-bit images do"
+            raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
         metric = (depth * unit).astype(np.float32)
     return np.where(np.isfinite(metric), metric, np.float32(0))
@@ -143,12 +140,9 @@ def open_depth(path: UPath, unit: float) -> np.ndarray:
 def load_array(file: IO[bytes]) -> np.ndarray:
     """The array of a .npy file. Raises ValueError for objects and for a header that is not true."""
     version = np.lib.format.read_magic(file)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-    shape, _, dtype = (header or np.lib.format.read_array_header_2_0)(file)
-    begin = file.tell()
-    held, promised = file.seek(0, 2) - begin, math.prod(shape) * dtype.itemsize
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects, whose reading could run code")
+    of_version = {(1, 0): np.lib.format.read_array_header_1_0}
+    shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
+    held, promised = -file.tell() + file.seek(0, 2), math.prod(shape) * dtype.itemsize
     if held < promised or min(shape, default=0) < 0:
         raise ValueError(f"its header promises {promised} bytes, and {held} follow")
     file.seek(0)
@@ -174,14 +168,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
         if image.mode not in _EIGHT_BITS:
             raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
         return image
-    numbers = np.array(image).astype(np.uint16)
-    transparent = image.info.get("transparency")
-    numbers = 65535 - numbers if _white_is_zero(image) else numbers
-    grey = Image.fromarray(_scaled(numbers))
-    if transparent is None:
-        return grey
-    alpha = np.where(numbers == transparent, 0, 255).astype(np.uint8)
-    return Image.merge("LA", (grey, Image.fromarray(alpha)))
+    return Image.fromarray(_scaled(np.array(image)))
 
 
 def _scaled(numbers: np.ndarray) -> np.ndarray:
@@ -189,16 +176,11 @@ def _scaled(numbers: np.ndarray) -> np.ndarray:
     return ((numbers.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def _white_is_zero(image: Image.Image) -> bool:
-    """Of TIFF files, whose 16-bit numbers Pillow leaves as they are."""
-    return getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == 0
-
-
 def decode_mask(file: IO[bytes]) -> np.ndarray:
     """As `open_mask`, for an open file. Raises OSError for no image, and for one with colours."""
     image = _decoded(file)
     if image.mode.startswith("I;16"):
-        numbers = np.array(image).astype(np.uint16)
+        numbers = np.array(image)
         grey = _scaled(numbers) if numbers.max() > 255 else numbers.astype(np.uint8)
     elif image.mode in ("1", "L") and not image.has_transparency_data:
         grey = np.array(image.convert("L"))
@@ -220,7 +202,12 @@ def _decoded(file: IO[bytes]) -> Image.Image:
 def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
     """An image of a format of photos, not yet decoded. Raises OSError, inside of the block too."""
     try:
-        with Image.open(file, formats=_formats()) as image:
+        with Image.open(file, formats=_FORMATS) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                raise OSError(f"it has {image.width} x {image.height} pixels: scale it down")
+            inverted = getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == 0
+            if image.mode[0] == "I" and (inverted or "transparency" in image.info):
+                raise OSError("its 16 bits are inverted, or one value is transparent: rewrite it")
             yield image
     except UnidentifiedImageError as error:
         raise OSError("its header is none of a known image format") from error
@@ -228,13 +215,6 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
         raise
     except Exception as error:  # decoders raise anything on damaged files
         raise OSError(str(error) or type(error).__name__) from error
-
-
-@cache
-def _formats() -> list[str]:
-    """Those of photos that Pillow knows here: others, such as EPS, would start programs."""
-    Image.init()
-    return [name for name in _FORMATS if name in Image.OPEN]
 
 
 def to_tensor(images: np.ndarray) -> Tensor:

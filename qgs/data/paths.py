@@ -68,7 +68,9 @@ def read_json(path: UPath, fix: str, **options: Any) -> Any:
     is no JSON, FileNotFoundError for none.
     """
     try:
-        return json.loads(read_file(path), parse_int=_number, **options)
+        # Python refuses more than 4300 digits, and NumPy more than 18 among floats
+        number = lambda digits: int(digits) if len(digits) <= 18 else float(digits)  # noqa: E731
+        return json.loads(read_file(path), parse_int=number, **options)
     except FileNotFoundError:
         raise
     except RecursionError:
@@ -76,10 +78,6 @@ def read_json(path: UPath, fix: str, **options: Any) -> Any:
     except (ValueError, OSError) as error:
         reason = str(error)
     raise ValueError(f"{path} is not valid JSON ({reason}): {fix}")
-
-
-def _number(digits: str) -> int | float:
-    return int(digits) if len(digits) <= 18 else float(digits)
 
 
 def stays_inside(name: str) -> bool:

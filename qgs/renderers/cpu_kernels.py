@@ -28,8 +28,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         "nogil": True,
         "error_model": "numpy",  # no branch on a division by zero
         "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-        # Kernels loaded from the cache share the functions that they call by name, so that one may
-        # run another's build of them; what is inlined is its own. The bits are the same each time.
+        # kernels from the cache share what they call, and may run another's build of it
         "forceinline": True,
     }
     try:

@@ -76,7 +76,6 @@ READ = {
         GREY,
     ),
     "colours of 16 bits": (colours_of_16_bits(), RGB),
-    "TIFF whose white is 0": (inverted_tiff(), GREY),
     "1 bit": (encoded(Image.fromarray(GREY >= 128)), BELOW),
     "colours": (encoded(RGB), RGB),
     "opaque alpha": (encoded(with_alpha(RGB)), RGB),
@@ -106,6 +105,10 @@ REFUSED = {
     "float TIFF": encoded(Image.fromarray(GREY.astype(np.float32)), "TIFF"),
     "32 bits": encoded(Image.fromarray(GREY.astype(np.int32)), "TIFF"),
     "LAB": encoded(Image.new("LAB", SIZE[::-1]), "TIFF"),
+    "16 bits whose white is 0": inverted_tiff(),
+    "16 bits with a transparent value": encoded(
+        Image.fromarray((GREY * 257).astype(np.uint16)), transparency=0
+    ),
     "PostScript": encoded(RGB, "EPS"),
     "text": b"no image",
     "cut off": encoded(RGB)[:60],

@@ -9,7 +9,14 @@ from upath import UPath
 
 from qgs.data.paths import read_file, read_json
 from qgs.data.photos.checks import FrameProblem, listed_size
-from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing, image_files
+from qgs.data.photos.reader import (
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    existing,
+    image_files,
+    numbers,
+)
 
 _LISTS = ("frames", "cameras", "views")
 _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")
@@ -67,7 +74,7 @@ def _cameras(data: Any) -> list[Mapping[str, Any]]:
     if not isinstance(given, list):
         poses, matrices, names = (top.get(key) for key in ("c2w", "K", "images"))
         poses = poses if isinstance(poses, list) else []
-        shared = np.ndim(_numbers(matrices)) < 3
+        shared = np.ndim(numbers(matrices)) < 3
         matrices = [matrices] * len(poses) if shared else matrices
         names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
         if len(matrices) != len(poses):
@@ -84,7 +91,7 @@ def _frame(folder: UPath, place: UPath, values: Mapping[str, Any], name: str) ->
         size, problems = listed_size(
             *(s if isinstance(s, int | float) else math.nan for s in sides)
         )
-    pose, matrix = _numbers(values.get("c2w")), _numbers(values.get("K"))
+    pose, matrix = numbers(values.get("c2w")), numbers(values.get("K"))
     if matrix.shape in ((3, 3), (4, 4)):
         matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     if pose.shape == (3, 4):
@@ -102,10 +109,3 @@ def _frame(folder: UPath, place: UPath, values: Mapping[str, Any], name: str) ->
     return PhotoFrame(
         inside, place / name, pose, (fx, fy, cx, cy), size, problems=(*problems, *more)
     )
-
-
-def _numbers(value: Any) -> np.ndarray:
-    try:
-        return np.array(value, np.float64)
-    except (TypeError, ValueError):
-        return np.zeros(0)

@@ -14,7 +14,14 @@ from qgs.data.images import image_size
 from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
 from qgs.data.paths import read_json
 from qgs.data.photos.checks import FrameProblem, listed_size
-from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing, with_images
+from qgs.data.photos.reader import (
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    existing,
+    numbers,
+    with_images,
+)
 
 Value = TypeVar("Value")
 
@@ -118,10 +125,7 @@ def image_name(file_path: str) -> str:
 
 def _pose(entry: Mapping[str, Any]) -> np.ndarray:
     """OpenGL to OpenCV: the camera's y and z axes change sign."""
-    try:
-        c2w = np.array(entry.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
-        c2w = np.zeros(0)
+    c2w = numbers(entry.get("transform_matrix"))
     if c2w.shape == (3, 4):
         c2w = np.vstack([c2w, [0, 0, 0, 1]])
     if c2w.shape != (4, 4):

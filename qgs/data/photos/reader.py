@@ -93,6 +93,14 @@ class PhotoReader(ABC):
         """
 
 
+def numbers(value: object) -> np.ndarray:
+    """Nested lists as float64; an empty array for what is no array of numbers."""
+    try:
+        return np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return np.zeros(0)
+
+
 def existing(paths: Iterable[UPath]) -> set[UPath]:
     """Those of `paths` that exist; each folder is listed once, which object stores need."""
     by_folder: dict[str, list[UPath]] = {}

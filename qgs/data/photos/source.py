@@ -142,29 +142,31 @@ class PhotoScene(EncodedScene):
         return np.stack([self._cache.get(k, lambda k=k: read(self._frames[k[2]])) for k in keys])
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
-        pixels = np.array(open_rgb(frame.path, self._config.background))
-        return self._delivered(pixels, frame, frame.path)
+        image = open_rgb(frame.path, self._config.background)
+        return self._delivered(image, frame, frame.path)
 
     def _mask(self, frame: PhotoFrame) -> np.ndarray:
         if frame.mask is None:
             return np.full(self._config.image_size, 255, np.uint8)
-        return self._delivered(_whole_mask(frame), frame, frame.mask)
+        return self._delivered(Image.fromarray(_whole_mask(frame)), frame, frame.mask)
 
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
         assert frame.depth is not None
         depth = open_depth(frame.depth, self._config.depth_unit)
-        return self._delivered(depth, frame, frame.depth, "nearest")
+        return self._delivered(Image.fromarray(depth), frame, frame.depth, "nearest")
 
     def _delivered(
-        self, pixels: np.ndarray, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
+        self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
     ) -> np.ndarray:
         """The content of `file` without distortion, at the delivered size."""
         if file != frame.path and frame.size is None:  # a mask or depth map follows the photo
             frame = replace(frame, size=image_size(frame.path))
-        size = _checked(pixels.shape[:2], frame, file)
-        pixels = undistorted(pixels, frame.at_size(size), frame.lens, mode)
+        size = _checked((image.height, image.width), frame, file)
+        if frame.lens is not None:
+            pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
+            image = Image.fromarray(pixels)
         kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
-        return CropResize(size, self._config.image_size).image(Image.fromarray(pixels), kernel)
+        return CropResize(size, self._config.image_size).image(image, kernel)
 
 
 def _whole_mask(frame: PhotoFrame) -> np.ndarray:
@@ -272,8 +274,7 @@ def present_frames(
     if len(present) < 2:
         raise FileNotFoundError(
             f"{listing.file} names {len(frames)} images, of which {len(present)} exist "
-            f"and 2 are needed: "
-            + (f"the first missing one is {missing[0]}" if missing else "add photos")
+            f"and 2 are needed: add {missing[0] if missing else 'photos'}"
         )
     if missing:
         warn_once(

@@ -133,6 +133,8 @@ class ChunkFolder:
 
     def compare_index(self, files: set[str]) -> None:
         """Tell where the index and the folder's `files` differ."""
+        if not self.index:
+            self.tell(self._label(INDEX), "it names no scene", "remove it, or write it anew")
         for name, keys in self._placed.items():
             if name not in files:
                 self.tell(

@@ -70,11 +70,12 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
     try:
         data = photo.read()
         with opened_image(io.BytesIO(data)) as image:
-            size, turned = (image.height, image.width), orientation(image) != 1
+            size, turned = (image.height, image.width), False
             if not headers_only:
                 image.draft(None, _SMALLEST)
                 image.load()
                 eight_bits(image)
+                turned = orientation(image) != 1  # EXIF may stand behind the pixels
     except Exception as error:  # whatever a reader raises; the other photos go on
         return Decoded(error=said(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()
