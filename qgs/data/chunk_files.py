@@ -13,7 +13,6 @@ has none, and `held_out`, the frames that training is not to see.
 """
 
 import io
-import json
 import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,13 +22,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from upath import UPath
 
+from qgs.data.images import decode_mask, encoded_size
 from qgs.data.lenses import Intrinsics, Size
-from qgs.data.paths import is_local, stays_inside
-from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
+from qgs.data.paths import is_local, open_file, read_json, stays_inside
+from qgs.data.photos.checks import (
+    LARGEST_SIDE,
+    FrameProblem,
+    intrinsics_problems,
+    pose_problems,
+    size_problems,
+)
 from qgs.data.scenes import warn_once
 from qgs.wording import listed
 
@@ -37,6 +42,7 @@ INDEX = "index.json"
 SUFFIX = ".torch"
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
+_OBJECTS = ("Unsupported", "unsupported", "Trying to call reduce", "Can only", "must be imported")
 _DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
 
 
@@ -77,9 +83,8 @@ class Record:
     def stored_size(self, frame: int) -> Size:
         """(H, W) in the header of an image. Raises ValueError for no readable image."""
         try:
-            with Image.open(io.BytesIO(self.images[frame].numpy().tobytes())) as image:
-                return image.height, image.width
-        except (OSError, SyntaxError, ValueError) as error:
+            return encoded_size(io.BytesIO(self.images[frame].numpy().tobytes()))
+        except OSError as error:
             raise ValueError(
                 f"{self.place(frame)}: the bytes are no readable image ({error}): pack the data "
                 "set again with `qgs data pack`, or remove the scene from index.json"
@@ -108,19 +113,23 @@ def parse_record(file: str, data: Any) -> Record:
     sizes, masks, names = data.get("sizes"), data.get("masks"), data.get("names")
     if sizes is not None:
         sizes = _tensor(where, "sizes", sizes, (count, 2))
+        sound = not (sizes.is_floating_point() or sizes.is_complex())
+        sound = sound and bool(((sizes >= 1) & (sizes <= LARGEST_SIDE)).all())
+        _expect(sound, where, f"'sizes' must be whole pixels from 1 to {LARGEST_SIDE}")
     if masks is not None:
         masks = _files(where, "masks", masks)
         _expect(len(masks) == count, where, f"{len(masks)} masks for {count} images")
     if not isinstance(names, list):
         stamps = data.get("timestamps")
-        names = stamps.flatten().tolist() if isinstance(stamps, Tensor) else ()
+        names = stamps.flatten().tolist() if _is_plain(stamps) else ()
         names = names if len(names) == count else range(count)
     _expect(len(names) == count, where, f"{len(names)} names for {count} images")
     given = data.get("held_out")
-    held_out = tuple(given.tolist() if isinstance(given, Tensor) else given or ())
+    given = given.flatten().tolist() if _is_plain(given) else given or ()
+    held_out = tuple(given) if isinstance(given, list | tuple) else (given,)
     of_frames = all(isinstance(frame, int) and 0 <= frame < count for frame in held_out)
     wanted = f"'held_out' must list frames from 0 to {count - 1}"
-    _expect(of_frames, where, f"{wanted}, got {list(held_out)}")
+    _expect(of_frames, where, f"{wanted}, got {listed(map(repr, held_out))}")
     names = [str(name) for name in names]
     return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
 
@@ -140,24 +149,56 @@ def a_type(value: object) -> str:
 def _described(data: Any) -> str:
     if isinstance(data, Mapping):
         return f"a mapping with the keys {listed(map(repr, data)) or 'none'}"
+    if isinstance(data, list | tuple):
+        return f"a list of {listed(dict.fromkeys(map(a_type, data))) or 'nothing'}"
+    if isinstance(data, Tensor) and not _is_plain(data):
+        return "a sparse, quantised or expanded tensor"
     return a_type(data)
 
 
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
-    data = torch.from_numpy(data) if isinstance(data, np.ndarray) else data
-    found = list(data.shape) if isinstance(data, Tensor) else _described(data)
+    if isinstance(data, np.ndarray) and data.dtype.kind in "fiu":
+        data = torch.from_numpy(data)
+    found = list(data.shape) if _is_plain(data) else _described(data)
     wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
     _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
-    return data
+    return data.detach()
+
+
+def _is_plain(data: Any) -> bool:
+    """Whether `data` is a tensor of numbers that are there: not sparse, quantised or expanded."""
+    return (
+        isinstance(data, Tensor)
+        and (data.layout, data.device.type) == (torch.strided, "cpu")
+        and not (data.is_quantized or data.is_nested)
+        and data.numel() * data.element_size() <= data.untyped_storage().nbytes()
+    )
 
 
 def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
     valid = isinstance(data, list | tuple) and all(
-        isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
+        _is_plain(item) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
     )
     wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
     _expect(valid, where, f"{name!r} must be {wanted}, got {_described(data)}")
     return data
+
+
+def read_mask(record: Record, frame: int) -> np.ndarray | None:
+    """The mask of a frame, (H, W) uint8 of its image's shape; None without. Raises ValueError."""
+    data = None if record.masks is None else record.masks[frame].numpy().tobytes()
+    if not data:
+        return None
+    try:
+        mask = decode_mask(io.BytesIO(data))
+    except OSError as error:
+        fix = "pack the chunk again, or remove the scene from index.json"
+        raise ValueError(
+            f"the mask of {record.place(frame)} is unusable ({error}): {fix}"
+        ) from error
+    for problem in size_problems(mask.shape[:2], record.image_sizes[frame]):
+        raise ValueError(f"the mask of {record.place(frame)}: {problem}")
+    return mask
 
 
 def require_usable(record: Record) -> None:
@@ -208,6 +249,7 @@ def load_chunk(path: UPath) -> list[Any]:
     Raises FileNotFoundError, and ValueError for a file that is no list.
     """
     try:
+        open_file(path).close()  # raises for what is no file
         file = str(path) if is_local(path) else io.BytesIO(path.read_bytes())
         mapped = is_local(path) and path.stat().st_size > 0 and zipfile.is_zipfile(file)
         data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
@@ -231,7 +273,7 @@ def load_chunk(path: UPath) -> list[Any]:
 def _why(error: Exception) -> str:
     """Why torch refuses a file, without its advice to trust it and without its colours."""
     said = str(error)
-    if "Unsupported" in said:
+    if any(words in said for words in _OBJECTS):
         return "it holds Python objects, whose reading could run code"
     if type(error).__name__ in ("UnpicklingError", "EOFError") or "central directory" in said:
         return "it is cut off or no torch file"
@@ -279,13 +321,7 @@ def has_chunks(folder: UPath) -> bool:
 
 def read_chunk_index(path: UPath) -> dict[str, str]:
     """An index.json: key to file name. Raises ValueError for what it cannot mean."""
-    try:
-        index = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"{path} is not valid JSON ({error}): copy it again, or remove it to have the chunks "
-            "read instead"
-        ) from error
+    index = read_json(path, "copy it again, or remove it to have the chunks read instead")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
     inside = {name for name in set(index.values()) if stays_inside(name)}

@@ -7,13 +7,22 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+from PIL import Image
 from pydantic import Field
 from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import SceneSource, Split
-from qgs.data.chunk_files import SUFFIX, Chunk, Record, has_chunks, list_scenes, require_usable
-from qgs.data.images import CropResize, decode_gray, decode_rgb, to_tensor
+from qgs.data.chunk_files import (
+    SUFFIX,
+    Chunk,
+    Record,
+    has_chunks,
+    list_scenes,
+    read_mask,
+    require_usable,
+)
+from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.paths import opened_path
 from qgs.data.scenes import (
     BoundedCache,
@@ -99,7 +108,7 @@ class ChunkScene(EncodedScene):
         record = self._record
         if record.masks is None:
             return None
-        masks = np.stack([self._mask(record, record.masks[frame], frame) for frame in frames])
+        masks = np.stack([self._mask(record, frame) for frame in frames])
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def encoded(self, frame: int) -> EncodedFrame:
@@ -136,16 +145,12 @@ class ChunkScene(EncodedScene):
             )
         return CropResize((image.height, image.width), self._config.image_size).image(image)
 
-    def _mask(self, record: Record, data: Tensor, frame: int) -> np.ndarray:
-        if not len(data):
+    def _mask(self, record: Record, frame: int) -> np.ndarray:
+        mask = read_mask(record, frame)
+        if mask is None:
             return np.full(self._config.image_size, 255, np.uint8)
-        try:
-            mask = decode_gray(io.BytesIO(data.numpy().tobytes()))
-        except OSError as error:
-            raise ValueError(
-                f"the mask of {record.place(frame)} cannot be read: {error}"
-            ) from error
-        return CropResize((mask.height, mask.width), self._config.image_size).image(mask)
+        crop = CropResize((mask.shape[0], mask.shape[1]), self._config.image_size)
+        return crop.image(Image.fromarray(mask))
 
 
 class ChunksSource(LazySource):

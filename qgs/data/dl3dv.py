@@ -1,6 +1,5 @@
 """`qgs/dl3dv`: DL3DV's scenes, from archives or folders."""
 
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from pydantic import Field
 from upath import UPath
 
 from qgs.contracts import SceneSource
-from qgs.data.paths import ArchivePath, opened_path
+from qgs.data.paths import ArchivePath, opened_path, read_json
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
 from qgs.data.scenes import LazyScenes, LazySource, warn_once
@@ -163,17 +162,14 @@ def read_scene_list(file: UPath) -> list[str]:
     """Scenes: keys of a JSON mapping, a list, or lines. Raises FileNotFoundError, ValueError."""
     if not file.is_file():
         raise FileNotFoundError(f"the list of scenes {file} does not exist")
-    text = file.read_text(encoding="utf-8-sig")
     if file.suffix == ".json":
-        try:
-            names = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{file} is not valid JSON ({error})") from error
+        names = read_json(file, "correct it")
         if not isinstance(names, dict | list) or not all(isinstance(name, str) for name in names):
             raise ValueError(
                 f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
             )
     else:
+        text = file.read_text(encoding="utf-8-sig")
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
         names = [line for line in lines if line]
     if not names:

@@ -1,6 +1,5 @@
 """Which views an evaluation compares: drawn by seed, or named by an index file."""
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
-from qgs.data.paths import opened_path
+from qgs.data.paths import opened_path, read_json
 from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, training_frames
 from qgs.geometry.poses import largest_distance
 from qgs.wording import listed
@@ -57,17 +56,12 @@ def read_index(path: str) -> EvaluationIndex:
             f"there is no evaluation index at {path}; evaluation.index is a JSON file of the form "
             f"{_FORM}, relative to the working directory"
         )
+    written = read_json(file, f"write {_FORM}", object_pairs_hook=_without_repeats)
     try:
-        text = file.read_text(encoding="utf-8")
-        written = json.loads(text, object_pairs_hook=_without_repeats)
         index = TypeAdapter(dict[str, IndexEntry | None]).validate_python(written)
-    except ValueError as error:
-        reason: object = error
-        if isinstance(error, ValidationError):
-            wrong = [
-                f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()
-            ]
-            reason = listed(wrong, between="; ")
+    except ValidationError as error:
+        wrong = [f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()]
+        reason = listed(wrong, between="; ")
         raise ValueError(f"{path} is no evaluation index {_FORM}: {reason}") from error
     if not any(index.values()):
         raise ValueError(f"the evaluation index {path} names no scene to judge")

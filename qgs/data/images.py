@@ -1,5 +1,6 @@
 """Image, mask and depth files to pixels of the wanted size, and the intrinsics that follow them."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -8,11 +9,21 @@ from typing import IO
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 from upath import UPath
 
-_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+from qgs.data.paths import open_file
+from qgs.data.scenes import warn_once
+
+TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
+TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
+
+_EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
+# of photos; others, such as EPS, would start programs
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA")
+_MOST_PIXELS = 120_000_000  # which take 2 GB with transparency; the largest phones make 108
+_ORIENTATION, _PHOTOMETRIC = 0x0112, 262  # tags of EXIF and TIFF
 
 
 @dataclass(frozen=True)
@@ -48,38 +59,61 @@ class CropResize:
 
 
 @contextmanager
-def _readable(path: Path | UPath, kind: str) -> Iterator[None]:
+def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
+    """`path`, open. Raises ValueError for what goes wrong inside, whatever a decoder raises."""
     try:
-        yield
-    except _UNREADABLE as error:
+        with open_file(path) as file:
+            yield file
+    except Exception as error:
+        reason = str(error) or type(error).__name__
         raise ValueError(
-            f"{path} cannot be read as {kind} ({error}): replace the file, or remove its frame"
+            f"{path} cannot be read as {kind} ({reason}): replace the file, or remove its frame"
         ) from error
 
 
 def image_size(path: UPath) -> tuple[int, int]:
     """(H, W) in the header of an image file. Raises ValueError for a file that is no image."""
-    with _readable(path, "an image"), path.open("rb") as file, Image.open(file) as image:
+    with _readable(path, "an image") as file:
+        return encoded_size(file)
+
+
+def encoded_size(file: IO[bytes]) -> tuple[int, int]:
+    """(H, W) in the header of an open file. Raises OSError for no image."""
+    with opened_image(file) as image:
         return image.height, image.width
 
 
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
-    """The file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable."""
-    with _readable(path, "an image"), path.open("rb") as file:
-        return decode_rgb(file, background)
+    """The file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
+
+    Pixels stay where they are stored, as COLMAP and nerfstudio read them; an EXIF orientation that
+    says otherwise is logged.
+    """
+    with _readable(path, "an image") as file:
+        image = decode_rgb(file, background)
+    if orientation(image) != 1:
+        warn_once(f"photos in {path.parent} {TURNED}: {TURN}")
+    return image
+
+
+def orientation(image: Image.Image) -> int:
+    """How EXIF would turn a decoded image; 1 for not at all, and for EXIF that is damaged."""
+    try:
+        return image.getexif().get(_ORIENTATION, 1)
+    except Exception:
+        return 1
 
 
 def open_mask(path: UPath) -> np.ndarray:
     """A mask as (H, W) uint8, 255 for what is modelled; 0/1 files too. Raises ValueError."""
-    with _readable(path, "the mask of a photo"), path.open("rb") as file:
-        grey = np.array(decode_gray(file))
-    return grey * np.uint8(255) if grey.max() == 1 else grey
+    with _readable(path, "the mask of a photo") as file:
+        return decode_mask(file)
 
 
 def alpha_mask(path: UPath) -> np.ndarray:
     """The alpha channel of a photo as (H, W) uint8; 255 for one without. Raises as `open_mask`."""
-    with _readable(path, "an image"), path.open("rb") as file:
-        image = _decoded(file)
+    with _readable(path, "an image") as file:
+        image = eight_bits(_decoded(file))
     if not image.has_transparency_data:
         return np.full((image.height, image.width), 255, np.uint8)
     return np.array(image.convert("RGBA").getchannel("A"))
@@ -87,23 +121,37 @@ def alpha_mask(path: UPath) -> np.ndarray:
 
 def open_depth(path: UPath, unit: float) -> np.ndarray:
     """A depth map as (H, W) float32; unit: world units per number; 0: unknown. ValueError."""
-    with _readable(path, "a depth map"), path.open("rb") as file:
+    with _readable(path, "a depth map") as file:
         if path.suffix.lower() == ".npy":
-            depth = np.asarray(np.load(file, allow_pickle=False)).squeeze()
+            depth = load_array(file).squeeze()
         else:
-            depth = np.array(_decoded(file))
-    if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-        raise ValueError(
-            f"{path} must hold one number for each pixel, got {depth.dtype} {depth.shape}: give "
-            "16-bit images or .npy files, or remove 'depth_file_path'"
-        )
-    metric = (depth * unit).astype(np.float32)
+            image = _decoded(file)
+            depth = np.array(image)
+            if image.mode == "P":
+                raise OSError("its numbers are those of a palette")
+        if depth.ndim != 2 or depth.dtype.kind not in "fiu":
+            wanted = "it must hold one number for each pixel, as 16-bit images do"
+            raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        metric = (depth * unit).astype(np.float32)
     return np.where(np.isfinite(metric), metric, np.float32(0))
+
+
+def load_array(file: IO[bytes]) -> np.ndarray:
+    """The array of a .npy file. Raises ValueError for objects and for a header that is not true."""
+    version = np.lib.format.read_magic(file)
+    of_version = {(1, 0): np.lib.format.read_array_header_1_0}
+    shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
+    held, promised = -file.tell() + file.seek(0, 2), math.prod(shape) * dtype.itemsize
+    if held < promised or min(shape, default=0) < 0:
+        raise ValueError(f"its header promises {promised} bytes, and {held} follow")
+    file.seek(0)
+    return np.load(file, allow_pickle=False)
 
 
 def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image.Image:
     """As `open_rgb`, for an open file. Raises OSError for bytes that are no readable image."""
-    image = _decoded(file)
+    image = eight_bits(_decoded(file))
     if image.has_transparency_data:
         color = tuple(round(255 * channel) for channel in background)
         canvas = Image.new("RGBA", image.size, (*color, 255))
@@ -111,18 +159,62 @@ def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image
     return image if image.mode == "RGB" else image.convert("RGB")
 
 
-def decode_gray(file: IO[bytes]) -> Image.Image:
-    """An open image file as one 8-bit channel. Raises OSError as `decode_rgb`."""
-    return _decoded(file).convert("L")
+def eight_bits(image: Image.Image) -> Image.Image:
+    """`image` with 8 bits a channel; its header is enough unless it has 16 bits of grey.
+
+    Raises OSError for numbers of which none is known to be white: float, 32-bit and LAB files.
+    """
+    if not image.mode.startswith("I;16"):
+        if image.mode not in _EIGHT_BITS:
+            raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
+        return image
+    return Image.fromarray(_scaled(np.array(image)))
+
+
+def _scaled(numbers: np.ndarray) -> np.ndarray:
+    """16 bits to 8, rounded."""
+    return ((numbers.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def decode_mask(file: IO[bytes]) -> np.ndarray:
+    """As `open_mask`, for an open file. Raises OSError for no image, and for one with colours."""
+    image = _decoded(file)
+    if image.mode.startswith("I;16"):
+        numbers = np.array(image)
+        grey = _scaled(numbers) if numbers.max() > 255 else numbers.astype(np.uint8)
+    elif image.mode in ("1", "L") and not image.has_transparency_data:
+        grey = np.array(image.convert("L"))
+    else:
+        rgba = np.array(eight_bits(image).convert("RGBA"))
+        grey = rgba[..., 0]
+        if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
+            raise OSError("it has colours or transparency: give a grey image, white on the object")
+    return grey * np.uint8(255) if grey.max() == 1 else grey
 
 
 def _decoded(file: IO[bytes]) -> Image.Image:
-    try:
-        with Image.open(file) as image:
-            image.load()
-    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise OSError(str(error)) from error
+    with opened_image(file) as image:
+        image.load()
     return image
+
+
+@contextmanager
+def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
+    """An image of a format of photos, not yet decoded. Raises OSError, inside of the block too."""
+    try:
+        with Image.open(file, formats=_FORMATS) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                raise OSError(f"it has {image.width} x {image.height} pixels: scale it down")
+            inverted = getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == 0
+            if image.mode[0] == "I" and (inverted or "transparency" in image.info):
+                raise OSError("its 16 bits are inverted, or one value is transparent: rewrite it")
+            yield image
+    except UnidentifiedImageError as error:
+        raise OSError("its header is none of a known image format") from error
+    except OSError:
+        raise
+    except Exception as error:  # decoders raise anything on damaged files
+        raise OSError(str(error) or type(error).__name__) from error
 
 
 def to_tensor(images: np.ndarray) -> Tensor:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 from upath import UPath
 
@@ -45,6 +46,38 @@ def opened_path(path: str | Path | UPath) -> UPath:
 def is_local(path: Path | UPath) -> bool:
     """Whether the system can open `path` by its name, as torch and zipfile do."""
     return isinstance(path, Path)
+
+
+def open_file(path: Path | UPath) -> IO[bytes]:
+    """`path`, open for reading bytes. Raises OSError, also for a pipe, a device or a folder."""
+    if is_local(path) and path.exists() and not path.is_file():
+        raise OSError("it is no regular file, but a folder, a pipe or a device")
+    return path.open("rb")
+
+
+def read_file(path: Path | UPath) -> bytes:
+    """The bytes of `path`. Raises as `open_file`."""
+    with open_file(path) as file:
+        return file.read()
+
+
+def read_json(path: UPath, fix: str, **options: Any) -> Any:
+    """What a JSON file holds; integers of more than 18 digits become floats, which may be infinite.
+
+    fix: what to do, for the message. options: of `json.loads`. Raises ValueError for a file that
+    is no JSON, FileNotFoundError for none.
+    """
+    try:
+        # Python refuses more than 4300 digits, and NumPy more than 18 among floats
+        number = lambda digits: int(digits) if len(digits) <= 18 else float(digits)  # noqa: E731
+        return json.loads(read_file(path), parse_int=number, **options)
+    except FileNotFoundError:
+        raise
+    except RecursionError:
+        reason = "its brackets are nested too deeply"
+    except (ValueError, OSError) as error:
+        reason = str(error)
+    raise ValueError(f"{path} is not valid JSON ({reason}): {fix}")
 
 
 def stays_inside(name: str) -> bool:

@@ -28,6 +28,8 @@ def kernel(function: Callable[..., Any]) -> Any:
         "nogil": True,
         "error_model": "numpy",  # no branch on a division by zero
         "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+        # kernels from the cache share what they call, and may run another's build of it
+        "forceinline": True,
     }
     try:
         return njit(cache=True, **options)(function)

@@ -108,7 +108,7 @@ def test_folders_and_files_that_are_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         opened(tmp_path / "nothing")
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
-    with pytest.raises(FileNotFoundError, match=r"holds a.png \(1 images\)"):
+    with pytest.raises(FileNotFoundError, match=r"holds a.png \(images: 1 in it\)"):
         opened(tmp_path)
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(ValueError, match="not valid JSON"):

@@ -90,7 +90,8 @@ IN_A_FOLDER = {
     "width and height swapped": (
         listed(w=SIZE[0], h=SIZE[1]),
         ALL + "the image is 180 x 120 pixels, but listed as 120 x 180, another aspect ratio, so "
-        "that the intrinsics cannot be scaled: width and height are swapped; swap them back",
+        "that the intrinsics cannot be scaled: width and height are swapped; swap them back, or "
+        "turn the photos' pixels where EXIF does (`mogrify -auto-orient`)",
     ),
     "a listed size that intrinsics do not go with": (
         listed(w=360, h=240),

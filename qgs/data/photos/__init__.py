@@ -7,15 +7,21 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from upath import UPath
 
 from qgs.data.photos.blender import Blender
+from qgs.data.photos.cameras import CamerasJson
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.llff import Llff
 from qgs.data.photos.nerfstudio import Nerfstudio
-from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoReader
+from qgs.data.photos.reader import Listing, PhotoReader, image_files
 from qgs.data.scenes import warn_once
 from qgs.wording import listed
 
-READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Blender, Colmap, Llff)
+READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Blender, Colmap, Llff, CamerasJson)
 """All formats. Where a folder holds several listings, the first of this order is read."""
+
+_SMALLEST = (
+    '{"fl_x": FOCAL_LENGTH_IN_PIXELS, "w": WIDTH, "h": HEIGHT, "frames": [{"file_path": '
+    '"images/0.png", "transform_matrix": 4 x 4 camera-to-world, x right, y up, z back}, ...]}'
+)
 
 if TYPE_CHECKING:
     Format: TypeAlias = str
@@ -62,11 +68,15 @@ def _nothing(folder: UPath, format: Format, held: list[type[PhotoReader]]) -> st
         names = ", ".join(reader.name for reader in held)
         other = f"; it can be read as {names}" if held else ""
         return f"{folder} has no {listing}, which {format} needs{other}"
-    inside = sorted(item.name for item in folder.iterdir())
-    images = sum(name.lower().endswith(IMAGE_SUFFIXES) for name in inside)
-    shown = listed(inside) or "nothing"
+    inside = sorted(folder.iterdir(), key=lambda item: item.name)
+    counts = {f"{item.name}/": len(image_files(item)) for item in inside if item.is_dir()}
+    counts = {
+        name: count for name, count in {"it": len(image_files(folder)), **counts}.items() if count
+    }
+    images = listed(f"{count} in {name}" for name, count in counts.items()) or "none"
     return (
-        f"{folder} has no transforms.json nor another listing of cameras; it holds {shown} "
-        f"({images} images). Camera poses are needed: make them with COLMAP or with nerfstudio's "
-        f"`ns-process-data`, or give the folder that holds one of {_listings()}"
+        f"{folder} has no transforms.json nor another listing of cameras; it holds "
+        f"{listed(item.name for item in inside) or 'nothing'} (images: {images}). Camera poses are "
+        "needed: make them with COLMAP or with nerfstudio's `ns-process-data`, or give the folder "
+        f"that holds one of {_listings()}. The smallest transforms.json that would do: {_SMALLEST}"
     )

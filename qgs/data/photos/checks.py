@@ -9,6 +9,8 @@ from qgs.data.lenses import Intrinsics, Size
 from qgs.data.photos.reader import FrameProblem, PhotoFrame
 from qgs.data.scenes import warn_once
 
+LARGEST_SIDE = 10**6  # pixels of a listed photo
+_FARTHEST = 1e12  # a camera's coordinate beyond is none, and its square leaves float32
 _RIGID = 1e-3  # of rotations against orthonormality
 _SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
 _SQUARE = 0.1  # relative difference of sides, or of fx and fy, that is none
@@ -20,6 +22,10 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
     """What is wrong with a pose (4, 4): NaN, mirrored, sheared or scaled."""
     if not np.isfinite(c2w).all():
         yield FrameProblem("c2w", "the pose has NaN or infinite numbers", "remove the frame")
+        return
+    if np.abs(c2w).max() > _FARTHEST:
+        reason = f"the pose has a number beyond {_FARTHEST:.0e}"
+        yield FrameProblem("c2w", reason, "correct it, or remove the frame")
         return
     rotation = c2w[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -88,9 +94,19 @@ def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
         "size",
         f"the image is {size[1]} x {size[0]} pixels, but listed as {listed[1]} x {listed[0]}, "
         "another aspect ratio, so that the intrinsics cannot be scaled",
-        "width and height are swapped; swap them back" if swapped
+        "width and height are swapped; swap them back, or turn the photos' pixels where EXIF does "
+        "(`mogrify -auto-orient`)" if swapped
         else "give the original image, or correct the listed size",
     )  # fmt: skip
+
+
+def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FrameProblem, ...]]:
+    """The size (H, W) that a listing gives, None and why where no photo can have it."""
+    if all(1 <= side <= LARGEST_SIDE for side in (height, width)):
+        return (round(height), round(width)), ()
+    said = f"{str(width)[:12]} x {str(height)[:12]}"
+    reason = f"the listed size, {said} pixels, is none of a photo"
+    return None, (FrameProblem("size", reason, "correct the width and height"),)
 
 
 def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:

@@ -16,7 +16,7 @@ from upath import UPath
 
 from qgs.contracts import MissingExtraError
 from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
-from qgs.data.photos.checks import FrameProblem
+from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -166,7 +166,8 @@ def _parameters(model: str) -> list[str]:
 def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
     """Fields of a `PhotoFrame` that the camera took."""
     values = dict(zip(_parameters(model), parameters, strict=True))
-    fields: dict[str, Any] = {"size": (height, width) if height and width else None}
+    size, problems = listed_size(height, width)
+    fields: dict[str, Any] = {"size": size, "problems": problems}
     if model not in _LENSES:
         fix = f"undistort with `colmap image_undistorter`, or use one of {', '.join(_LENSES)}"
         problem = FrameProblem("lens", f"the camera model {model} is not known", fix)

@@ -5,7 +5,10 @@ import re
 import numpy as np
 from upath import UPath
 
-from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoFrame, PhotoReader, image_folder
+from qgs.data.images import load_array
+from qgs.data.paths import open_file
+from qgs.data.photos.checks import listed_size
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_files, image_folder
 
 
 class Llff(PhotoReader):
@@ -24,16 +27,15 @@ class Llff(PhotoReader):
         """See `PhotoReader`. Raises ValueError unless there are as many photos as rows."""
         file, photos = folder / cls.listing, image_folder(folder, images)
         rows = _rows(file)
-        shown = {item.name: item for item in photos.iterdir() if not item.name.startswith(".")}
-        names = sorted(name for name in shown if name.lower().endswith(IMAGE_SUFFIXES))
-        if len(names) != len(rows):
+        files = image_files(photos)
+        skipped = _skipped([item.name for item in files])
+        if len(files) != len(rows):
             raise ValueError(
-                f"{file} has {len(rows)} poses, but {photos} has {len(names)} images: they belong "
-                f"together in the order of the names{_skipped(names)}, so give all images and no "
+                f"{file} has {len(rows)} poses, but {photos} has {len(files)} images: they belong "
+                f"together in the order of the names{skipped}, so give all images and no "
                 "others"
             )
-        frames = [_frame(shown[name], row) for name, row in zip(names, rows, strict=True)]
-        return Listing(file, frames)
+        return Listing(file, [_frame(*pair) for pair in zip(files, rows, strict=True)])
 
 
 def _skipped(names: list[str]) -> str:
@@ -48,9 +50,9 @@ def _skipped(names: list[str]) -> str:
 def _rows(file: UPath) -> np.ndarray:
     """(N, 17) float64. Raises ValueError for a file of something else."""
     try:
-        with file.open("rb") as opened:
-            rows = np.load(opened, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+        with open_file(file) as opened:
+            rows = load_array(opened)
+    except Exception as error:  # NumPy raises anything on damaged headers
         raise ValueError(
             f"{file} is no NumPy file of numbers ({error}): export it again"
         ) from error
@@ -65,11 +67,12 @@ def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     c2w = np.eye(4)
     c2w[:3] = np.stack([right, down, -back, centre], 1)
-    whole = np.isfinite([height, width]).all() and min(height, width) >= 1
+    size, problems = listed_size(float(height), float(width))
     return PhotoFrame(
         name=f"{path.parent.name}/{path.name}",
         path=path,
         c2w=c2w,
         intrinsics=(float(focal), float(focal), float(width / 2), float(height / 2)),
-        size=(round(height), round(width)) if whole else None,
+        size=size,
+        problems=problems,
     )

@@ -1,6 +1,5 @@
 """nerfstudio: `transforms.json`, whose schema Blender's and DL3DV's files share."""
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
@@ -13,8 +12,16 @@ from upath import UPath
 
 from qgs.data.images import image_size
 from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
-from qgs.data.photos.checks import FrameProblem
-from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing, with_images
+from qgs.data.paths import read_json
+from qgs.data.photos.checks import FrameProblem, listed_size
+from qgs.data.photos.reader import (
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    existing,
+    numbers,
+    with_images,
+)
 
 Value = TypeVar("Value")
 
@@ -24,7 +31,7 @@ _FISHEYE = "OPENCV_FISHEYE"
 _OTHER = ("k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
 
 
 class Nerfstudio(PhotoReader):
@@ -53,10 +60,7 @@ class Nerfstudio(PhotoReader):
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
     """The frames of a transforms file in order, with their faults in them. Raises ValueError."""
-    try:
-        data = json.loads(file.read_bytes())  # with or without a byte order mark
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not valid JSON: {error}; export it again") from error
+    data = read_json(file, "export it again")
     entries = data.get("frames") if isinstance(data, Mapping) else None
     if not isinstance(entries, list) or not entries:
         raise ValueError(f"{file} lists no frames: expected a non-empty list under 'frames'")
@@ -85,9 +89,10 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
         problem = FrameProblem("path", "it has no 'file_path'", fix)
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
     values = {**data, **entry}
-    size = _size(values) or size
     name = image_name(path)
-    problems: list[FrameProblem] = []
+    sides = [_number(values, key) for key in ("h", "w")]
+    given, wrong = (None, ()) if None in sides else listed_size(*sides)
+    size, problems = given or size, [*wrong]
 
     def read(value: Callable[[], Value], otherwise: Value) -> Value:
         try:
@@ -120,28 +125,19 @@ def image_name(file_path: str) -> str:
 
 def _pose(entry: Mapping[str, Any]) -> np.ndarray:
     """OpenGL to OpenCV: the camera's y and z axes change sign."""
-    try:
-        c2w = np.array(entry.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
-        c2w = np.zeros(0)
+    c2w = numbers(entry.get("transform_matrix"))
     if c2w.shape == (3, 4):
         c2w = np.vstack([c2w, [0, 0, 0, 1]])
     if c2w.shape != (4, 4):
         reason = "'transform_matrix' must be 4 x 4 numbers"
         raise _UnreadableError("c2w", reason, "export the pose again")
-    return c2w @ _OPENGL_TO_OPENCV
+    return c2w * _OPENGL_TO_OPENCV
 
 
 def _number(values: Mapping[str, Any], key: str) -> float | None:
     """A number, NaN included; None where it is absent, null or something else."""
     value = values.get(key)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def _size(values: Mapping[str, Any]) -> Size | None:
-    sides = [_number(values, key) for key in ("h", "w")]
-    height, width = (side if side and math.isfinite(side) else 0 for side in sides)
-    return (round(height), round(width)) if height >= 1 and width >= 1 else None
 
 
 def _intrinsics(values: Mapping[str, Any], size: Size | None) -> Intrinsics:

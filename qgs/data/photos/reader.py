@@ -93,6 +93,14 @@ class PhotoReader(ABC):
         """
 
 
+def numbers(value: object) -> np.ndarray:
+    """Nested lists as float64; an empty array for what is no array of numbers."""
+    try:
+        return np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return np.zeros(0)
+
+
 def existing(paths: Iterable[UPath]) -> set[UPath]:
     """Those of `paths` that exist; each folder is listed once, which object stores need."""
     by_folder: dict[str, list[UPath]] = {}
@@ -104,6 +112,13 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
         names = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
         held.update(path for path in inside if path.name in names)
     return held
+
+
+def image_files(folder: UPath) -> list[UPath]:
+    """The photos in a folder, by name."""
+    files = [item for item in folder.iterdir() if not item.name.startswith(".")]
+    photos = [item for item in files if item.name.lower().endswith(IMAGE_SUFFIXES)]
+    return sorted(photos, key=lambda item: item.name)
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:

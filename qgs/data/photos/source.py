@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from operator import attrgetter
 from typing import ClassVar
@@ -24,7 +25,7 @@ from qgs.data.images import (
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted
-from qgs.data.paths import opened_path
+from qgs.data.paths import opened_path, read_file
 from qgs.data.photos import Format, formats_of, read_listing
 from qgs.data.photos.checks import require_sound, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
@@ -129,7 +130,7 @@ class PhotoScene(EncodedScene):
         if listed.mask is not None:
             Image.fromarray(_whole_mask(listed)).save(buffer, "png")
         return EncodedFrame(
-            listed.name, listed.path.read_bytes(), listed.c2w, listed.at_size(size), size,
+            listed.name, read_file(listed.path), listed.c2w, listed.at_size(size), size,
             listed.lens, buffer.getvalue() or None, self._config.background,
         )  # fmt: skip
 
@@ -141,27 +142,31 @@ class PhotoScene(EncodedScene):
         return np.stack([self._cache.get(k, lambda k=k: read(self._frames[k[2]])) for k in keys])
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
-        pixels = np.array(open_rgb(frame.path, self._config.background))
-        return self._delivered(pixels, frame, frame.path)
+        image = open_rgb(frame.path, self._config.background)
+        return self._delivered(image, frame, frame.path)
 
     def _mask(self, frame: PhotoFrame) -> np.ndarray:
         if frame.mask is None:
             return np.full(self._config.image_size, 255, np.uint8)
-        return self._delivered(_whole_mask(frame), frame, frame.mask)
+        return self._delivered(Image.fromarray(_whole_mask(frame)), frame, frame.mask)
 
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
         assert frame.depth is not None
         depth = open_depth(frame.depth, self._config.depth_unit)
-        return self._delivered(depth, frame, frame.depth, "nearest")
+        return self._delivered(Image.fromarray(depth), frame, frame.depth, "nearest")
 
     def _delivered(
-        self, pixels: np.ndarray, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
+        self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
     ) -> np.ndarray:
         """The content of `file` without distortion, at the delivered size."""
-        size = _checked(pixels.shape[:2], frame, file)
-        pixels = undistorted(pixels, frame.at_size(size), frame.lens, mode)
+        if file != frame.path and frame.size is None:  # a mask or depth map follows the photo
+            frame = replace(frame, size=image_size(frame.path))
+        size = _checked((image.height, image.width), frame, file)
+        if frame.lens is not None:
+            pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
+            image = Image.fromarray(pixels)
         kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
-        return CropResize(size, self._config.image_size).image(Image.fromarray(pixels), kernel)
+        return CropResize(size, self._config.image_size).image(image, kernel)
 
 
 def _whole_mask(frame: PhotoFrame) -> np.ndarray:
@@ -269,7 +274,7 @@ def present_frames(
     if len(present) < 2:
         raise FileNotFoundError(
             f"{listing.file} names {len(frames)} images, of which {len(present)} exist "
-            f"and 2 are needed; the first missing one is {missing[0] if missing else 'none'}"
+            f"and 2 are needed: add {missing[0] if missing else 'photos'}"
         )
     if missing:
         warn_once(

@@ -21,7 +21,7 @@ class Photo:
     read: Callable[[], bytes]
     exists: bool = True
     mask_exists: bool = True
-    check_mask: Callable[[], None] | None = None  # for a mask that `listed` has no file of
+    read_mask: Callable[[], np.ndarray | None] | None = None  # a mask that is in no file, (H, W)
 
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Pinhole RGB, `side` pixels long at most, and its intrinsics (4,). Raises OSError."""

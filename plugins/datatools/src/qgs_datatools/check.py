@@ -198,6 +198,9 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     with ThreadPoolExecutor(options.threads) as pool:
         decoded = pool.map(partial(decode, headers_only=options.headers_only), photos)
     scene = DecodedScene(name, photos, list(decoded))
+    if (there := sum(photo.exists for photo in photos)) < 2:
+        fix = "add photos, or take the scene out"
+        absent.append(Finding(name, f"{there} photos are there, and a scene needs 2", fix))
     files = list(file_findings(scene, _LISTINGS.get(candidate.kind, "the data set")))
     sizes = list(size_findings(scene))
     poses, others = camera_findings(scene, _frames(sizes))
@@ -240,7 +243,8 @@ def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
     for frame in frames:
         photo = scene.photos[frame].listed
         height, width = photo.size or scene.decoded[frame].size or (1, 1)
-        fov.append((width / 2 / photo.intrinsics[0], height / 2 / photo.intrinsics[1]))
+        sides = zip((width, height), photo.intrinsics, strict=False)
+        fov.append([side / 2 / focal if focal > 0 else 0.0 for side, focal in sides])
         c2w.append(photo.c2w[:3])
     drawn = {"c2w": np.array(c2w, np.float32), "fov": np.array(fov, np.float32)}
     return {"frames": tuple(frames), **drawn}

@@ -21,6 +21,7 @@ from qgs.data.chunk_files import (
     load_chunk,
     parse_record,
     read_chunk_index,
+    read_mask,
     unit_problems,
 )
 from qgs.data.lenses import Size
@@ -132,6 +133,8 @@ class ChunkFolder:
 
     def compare_index(self, files: set[str]) -> None:
         """Tell where the index and the folder's `files` differ."""
+        if not self.index:
+            self.tell(self._label(INDEX), "it names no scene", "remove it, or write it anew")
         for name, keys in self._placed.items():
             if name not in files:
                 self.tell(
@@ -194,7 +197,11 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         size=size,
         problems=tuple(unit_problems(record, frame)),
     )
-    return Photo(photo, lambda: record.images[frame].numpy().tobytes())
+    return Photo(
+        photo,
+        lambda: record.images[frame].numpy().tobytes(),
+        read_mask=lambda: read_mask(record, frame),
+    )
 
 
 def _listed_sizes(record: Record) -> list[Size] | None:

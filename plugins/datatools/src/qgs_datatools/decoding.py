@@ -5,12 +5,21 @@ import io
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import median, median_low
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from qgs.data.evaluation import one_line
-from qgs.data.images import open_mask
+from qgs.data.images import (
+    TURN,
+    TURNED,
+    eight_bits,
+    open_depth,
+    open_mask,
+    opened_image,
+    orientation,
+)
 from qgs.data.lenses import Size
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
@@ -26,12 +35,16 @@ _COPY = re.compile(r"images_\d+")
 
 @dataclass(frozen=True)
 class Decoded:
-    """size: (H, W), None where it cannot be decoded. digest: of the bytes. Errors in words."""
+    """size: (H, W), None where it cannot be decoded. digest: of the bytes. turned: by EXIF.
+
+    error: of the photo, in words; other_errors: of its mask and depth map, with what to do.
+    """
 
     size: Size | None = None
     digest: bytes = b""
+    turned: bool = False
     error: str | None = None
-    mask_error: str | None = None
+    other_errors: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,17 +69,18 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
         return Decoded()
     try:
         data = photo.read()
-        with Image.open(io.BytesIO(data)) as image:
-            size = (image.height, image.width)
+        with opened_image(io.BytesIO(data)) as image:
+            size, turned = (image.height, image.width), False
             if not headers_only:
                 image.draft(None, _SMALLEST)
                 image.load()
-    except UnidentifiedImageError:
-        return Decoded(error="its header is none of a known image format")
+                eight_bits(image)
+                turned = orientation(image) != 1  # EXIF may stand behind the pixels
     except Exception as error:  # whatever a reader raises; the other photos go on
         return Decoded(error=said(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()
-    return Decoded(size, digest, mask_error=None if headers_only else _mask_error(photo))
+    others = () if headers_only else tuple(_other_errors(photo, size))
+    return Decoded(size, digest, turned, other_errors=others)
 
 
 def said(error: Exception) -> str:
@@ -74,16 +88,20 @@ def said(error: Exception) -> str:
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)
 
 
-def _mask_error(photo: Photo) -> str | None:
-    mask = photo.listed.mask
-    try:
-        if photo.check_mask is not None:
-            photo.check_mask()
-        elif mask is not None and photo.mask_exists and mask != photo.listed.path:
-            open_mask(mask)
-    except Exception as error:
-        return said(error)
-    return None
+def _other_errors(photo: Photo, size: Size) -> Iterator[tuple[str, str]]:
+    """What is wrong with the mask and the depth map of a photo of `size`, and what to do."""
+    mask, depth = photo.listed.mask, photo.listed.depth
+    of_file = mask is not None and photo.mask_exists and mask != photo.listed.path
+    read_mask = photo.read_mask or (partial(open_mask, mask) if of_file else None)
+    read_depth = partial(open_depth, depth, 1.0) if depth is not None else None
+    for kind, file, read in (("mask", mask, read_mask), ("depth map", depth, read_depth)):
+        try:
+            found = read() if read else None
+            problems = () if found is None else size_problems(found.shape[:2], size)
+            reasons = [f"{file or 'its mask'}: {problem.reason}" for problem in problems]
+        except Exception as error:
+            reasons = [said(error)]
+        yield from ((reason, f"replace the {kind}") for reason in reasons)
 
 
 def file_findings(scene: DecodedScene, listing: str) -> Iterator[Finding]:
@@ -98,8 +116,10 @@ def file_findings(scene: DecodedScene, listing: str) -> Iterator[Finding]:
         if not photo.mask_exists and photo.listed.mask is not None:
             reason = f"its mask does not exist in {photo.listed.mask.parent.name}"
             yield scene.finding([frame], reason, "add it, or list no mask")
-        if result.mask_error is not None:
-            yield scene.finding([frame], result.mask_error, "replace the mask")
+        for reason, fix in result.other_errors:
+            yield scene.finding([frame], reason, fix)
+        if result.turned:
+            yield scene.finding([frame], f"photos {TURNED}", TURN, "warning")
 
 
 @dataclass(frozen=True)

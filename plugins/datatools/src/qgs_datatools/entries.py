@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.contracts import Scene
-from qgs.data.images import decode_gray, decode_rgb
+from qgs.data.images import decode_mask, decode_rgb
 from qgs.data.lenses import undistorted
 from qgs.data.scenes import EncodedFrame, EncodedScene
 
@@ -54,7 +54,7 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
     frame = scene.encoded(index)
     try:
         pixels = np.array(decode_rgb(io.BytesIO(frame.data), frame.background))
-        mask = None if frame.mask is None else np.array(decode_gray(io.BytesIO(frame.mask)))
+        mask = None if frame.mask is None else decode_mask(io.BytesIO(frame.mask))
     except OSError as error:
         raise ValueError(
             f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "

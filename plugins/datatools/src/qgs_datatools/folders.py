@@ -6,6 +6,7 @@ from functools import partial
 from upath import UPath
 
 from qgs.data.dl3dv import find_scenes, scene_folder
+from qgs.data.paths import read_file
 from qgs.data.photos import READERS, Format, formats_of, read_listing
 from qgs.data.photos.reader import existing
 from qgs.data.photos.source import folder_name
@@ -72,7 +73,7 @@ def _photos(folder: UPath, kind: Format, images: str | None) -> list[Photo]:
     masks = existing(frame.mask for frame in frames if frame.mask is not None)
     return [
         Photo(
-            frame, frame.path.read_bytes, frame.path in there,
+            frame, partial(read_file, frame.path), frame.path in there,
             frame.mask is None or frame.mask == frame.path or frame.mask in masks,
         )
         for frame in frames

@@ -1,12 +1,12 @@
 """Evaluation indices, compared with the scenes that a data set holds."""
 
-import json
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from upath import UPath
 
 from qgs.data.evaluation import GIVEN, IndexEntry, given_targets, read_index
+from qgs.data.paths import read_json
 from qgs_datatools.findings import Finding, spans
 
 
@@ -26,7 +26,7 @@ def found_indices(path: UPath) -> list[UPath]:
 
 def _is_index(file: UPath) -> bool:
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = read_json(file, "")
     except (OSError, ValueError):
         return False
     return isinstance(data, dict) and any(

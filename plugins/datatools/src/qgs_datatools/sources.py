@@ -66,9 +66,9 @@ def _missing(source: SceneSource, split: Split, place: int) -> Sequence[str]:
 
 def _photos(source: SceneSource, split: Split, place: int) -> list[Photo]:
     scene = source.scenes(split)[place]
-    image, mask = partial(_image_file, scene), partial(_check_mask, scene)
+    image, mask = partial(_image_file, scene), partial(_read_mask, scene)
     return [
-        Photo(_frame(scene, i), partial(image, i), check_mask=partial(mask, i))
+        Photo(_frame(scene, i), partial(image, i), read_mask=partial(mask, i))
         for i in range(len(scene))
     ]
 
@@ -85,7 +85,8 @@ def _image_file(scene: Scene, frame: int) -> bytes:
     return Encoding().image(np.ascontiguousarray(pixels))
 
 
-def _check_mask(scene: Scene, frame: int) -> None:
+def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
     mask, wanted = scene.masks([frame]), (1, 1, *scene.cameras.size)
     if mask is not None and (mask.shape != wanted or not bool(((mask >= 0) & (mask <= 1)).all())):
         raise ValueError(f"its mask {tuple(mask.shape)} is not of shape {wanted} and in [0, 1]")
+    return None if mask is None else mask[0, 0].numpy()

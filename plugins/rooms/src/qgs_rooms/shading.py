@@ -197,7 +197,7 @@ def _light(lights, floor, size, code, x, y, z, normal):
     )
 
 
-@njit(forceinline=True, **INNER)
+@njit(**INNER)
 def _gather(t, code, i, j, own, samples, step, top, o, rays, points):
     """Write where rays of the pixel at (i, j) hit surface `own`, the mean in row 0; count them."""
     n = 0
@@ -217,7 +217,7 @@ def _gather(t, code, i, j, own, samples, step, top, o, rays, points):
     return n
 
 
-@njit(forceinline=True, **INNER)
+@njit(**INNER)
 def _mixed(shapes, size, textures, row, code, points, n, footprint):
     """Mean weights of a texture's second and third colour; a smooth one is looked up in row 0."""
     kind, period, seed = int(textures[row, 0]), textures[row, 1], int(textures[row, 2])
@@ -239,7 +239,7 @@ def _channel(textures, row, c, weights, light):
     return min(value * (light + (1 - light) * textures[row, 3]), 1.0)
 
 
-@njit(forceinline=True, **INNER)
+@njit(**INNER)
 def _shade(room, floor, code, points, n, footprint):
     """n times the RGB in [0, 1] of a surface seen at rows 1 to n of `points`."""
     shapes, textures, size, lights = room

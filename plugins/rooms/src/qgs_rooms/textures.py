@@ -11,6 +11,9 @@ OPTIONS = {
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+    # Cached kernels share the functions that they call by name, so that one loaded from the cache
+    # may run another kernel's build of them, with other roundings; what is inlined is its own.
+    "forceinline": True,
 }
 INNER = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # called by kernels alone
 

@@ -1,0 +1,100 @@
+"""`cameras.json` with c2w, K and photos beside it."""
+
+import json
+
+import pytest
+import torch
+from photo_formats import copied, scene, synthetic
+
+from qgs.data.photos import formats_of
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return synthetic(tmp_path / "photos")
+
+
+def matrix(photos) -> list[list[float]]:
+    fx, fy, cx, cy = photos.intrinsics
+    return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+
+
+def cameras(photos, **more):
+    return [{"c2w": pose.tolist(), "K": matrix(photos), **more} for pose in photos.c2w]
+
+
+def named(photos, key="image", prefix=""):
+    return [{key: prefix + f.name, **c} for f, c in zip(photos.files, cameras(photos), strict=True)]
+
+
+FORMS = {
+    "a list": lambda p: named(p),
+    "frames": lambda p: {"frames": named(p, "file_path")},
+    "names below images": lambda p: {"cameras": named(p, prefix="images/")},
+    "names in images": lambda p: {"views": named(p, "name")},
+    "no names": lambda p: cameras(p),
+    "one K": lambda p: {"K": list(p.intrinsics), "c2w": [c[:3].tolist() for c in p.c2w]},
+    "K of each": lambda p: {
+        "c2w": p.c2w.tolist(),
+        "K": [matrix(p)] * 6,
+        "images": [file.name for file in p.files],
+    },
+    "a size": lambda p: {
+        "w": 80, "h": 60,
+        "frames": [{"c2w": c["c2w"], "K": [2 * v for v in p.intrinsics]} for c in cameras(p)],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_read(tmp_path, photos, form):
+    folder = tmp_path / "scene"
+    copied(photos, folder / ("images" if "images" in form else ""))
+    (folder / "cameras.json").write_text(json.dumps(FORMS[form](photos)))
+    read = scene(folder)
+    torch.testing.assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
+    expected = torch.tensor(photos.intrinsics).double().expand(6, 4)
+    torch.testing.assert_close(read.cameras.intrinsics, expected)
+    assert [read.frame_name(i).split("/")[-1] for i in range(6)] == [f.name for f in photos.files]
+    assert formats_of(folder) == ["cameras"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (lambda p: cameras(p)[:4], "lists 4 cameras without names of images, but .* has 6 images"),
+        (
+            lambda p: [{"c2w": 1, "K": matrix(p), "image": "a.png"}],
+            r"frame 0 .*'c2w' has the shape",
+        ),
+        (lambda p: [{"c2w": p.c2w[0].tolist(), "K": "x", "image": "a"}], "'K' has the shape"),
+        (lambda p: {"K": 1, "c2w": {}}, "lists no cameras: expected"),
+        (lambda p: [*named(p), 7], "frame 6: no image is named"),
+        (lambda p: cameras(p, w=0, h=3), "the listed size, 0 x 3 pixels, is none of a photo"),
+        (
+            lambda p: [{**c, "K": [1.2, 1.2, 0.5, 0.5]} for c in named(p)],
+            "look normalised .*multiply",
+        ),
+    ],
+)
+def test_what_is_refused_names_the_file(tmp_path, photos, content, message):
+    copied(photos, tmp_path / "scene")
+    file = tmp_path / "scene" / "cameras.json"
+    file.write_text(json.dumps(content(photos)))
+    with pytest.raises(ValueError, match=rf"cameras\.json.*{message}"):
+        scene(file.parent, format="cameras")
+
+
+def test_files_of_that_name_from_other_programs_are_no_photos(tmp_path, photos):
+    copied(photos, tmp_path / "scene")
+    (tmp_path / "scene" / "cameras.json").write_text('[{"id": 0, "position": [0, 0, 0]}]')
+    with pytest.raises(FileNotFoundError, match=r"images: 6 in it\)"):
+        scene(tmp_path / "scene")
+
+
+def test_a_folder_without_cameras_is_told_what_would_do(tmp_path, photos):
+    copied(photos, tmp_path / "scene" / "frames")
+    with pytest.raises(
+        FileNotFoundError, match=r"images: 6 in frames/\).*The smallest transf.*fl_x"
+    ):
+        scene(tmp_path / "scene")

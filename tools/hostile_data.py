@@ -1,0 +1,328 @@
+"""Small data sets in every format, each with one hostile change that a seed chooses."""
+
+import importlib
+import io
+import json
+import os
+import random
+import shutil
+import struct
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+formats: Any = importlib.import_module("photo_formats")
+
+_SIZE = (30, 40)
+_DEEP = 100_000
+_HOSTILE: Sequence[Any] = (
+    10**400, -(10**400), 10**5000, 10**18, -1, 0, 1e308, -1e308, 1e-320, float("nan"),
+    float("inf"), None, True, "", "\0", "\ud800", "x" * 100_000, "../../../../etc/passwd",
+    "/dev/zero", "images", ".", [], {}, [[]], [None] * 4, {"a": 1}, "NaN", 1.5,
+)  # fmt: skip
+
+
+def write_data_set(folder: Path, seed: int) -> str:
+    """Write the data set of a seed to `folder`; its format and change in words."""
+    chance = random.Random(seed)
+    kind = chance.choice(sorted(_WRITERS))
+    write, listings, own = _WRITERS[kind]
+    content = write(folder, chance)
+    changes: list[Callable[[], str]] = [
+        lambda: _bytes(chance.choice([folder / name for name in listings]), chance),
+        lambda: _image(folder, chance),
+        *(lambda change=change: change(folder, content, chance) for change in own),
+    ]
+    try:
+        return f"{kind}: {chance.choice([*changes[:2], *changes[2:] * 2])()}"
+    except ValueError as error:  # json of integers beyond Python's limit
+        return f"{kind}: no change ({error})"
+
+
+def _photos(folder: Path, chance: random.Random, suffix: str = "png") -> Any:
+    place = folder.parent / f"{folder.name}-photos"
+    photos = formats.synthetic(place, 5, _SIZE, suffix, chance.randrange(1000))
+    return formats.centred(photos)
+
+
+def _nerfstudio(folder: Path, chance: random.Random) -> Any:
+    formats.write_nerfstudio(folder, _photos(folder, chance))
+    file = folder / "transforms.json"
+    data = json.loads(file.read_text())
+    if chance.random() < 0.5:
+        for place, frame in enumerate(data["frames"]):
+            frame.update(mask_path=f"mask{place}.png", depth_file_path=f"depth{place}.npy")
+            mask = np.full(_SIZE, 255, np.uint8)
+            (folder / frame["mask_path"]).write_bytes(formats.encoded(mask))
+            np.save(folder / frame["depth_file_path"], np.ones(_SIZE, np.float32))
+        file.write_text(json.dumps(data))
+    return None
+
+
+def _cameras(folder: Path, chance: random.Random) -> Any:
+    photos = _photos(folder, chance)
+    formats.copied(photos, folder)
+    frames = [
+        {"image": file.name, "c2w": pose.tolist(), "K": list(photos.intrinsics)}
+        for file, pose in zip(photos.files, photos.c2w, strict=True)
+    ]
+    (folder / "cameras.json").write_text(json.dumps({"w": 40, "h": 30, "frames": frames}))
+
+
+def _dl3dv(folder: Path, chance: random.Random) -> Any:
+    inner = folder / "inner"
+    _nerfstudio(inner, chance)
+    return inner
+
+
+def _zipped(folder: Path, inner: Path, chance: random.Random) -> str:
+    """Pack the scene, changed before or after."""
+    what = chance.choice([_json, lambda *given: _image(given[0], given[2]), None])
+    said = what(inner, None, chance) if what else ""
+    for file in inner.rglob("*"):
+        if not file.is_file():  # what no archive holds
+            file.unlink() if not file.is_dir() else None
+    archive = folder / f"{'0123456789abcdef' * 4}.zip"
+    shutil.make_archive(str(archive.with_suffix("")), "zip", inner)
+    shutil.rmtree(inner)
+    if what is None:
+        with zipfile.ZipFile(archive, "a") as opened:
+            name = chance.choice(["../out", "/etc/out", "a/transforms.json/b", "transforms.json"])
+            opened.writestr(name, "x")
+            said = f"holds {name}"
+        if chance.random() < 0.5:
+            said = _bytes(archive, chance)
+    return said
+
+
+def _chunks(folder: Path, chance: random.Random) -> Any:
+    photos = _photos(folder, chance)
+    w2c = np.linalg.inv(photos.c2w)[:, :3].reshape(-1, 12)
+    fx, fy, cx, cy = photos.intrinsics
+    rows = [[fx / 40, fy / 30, cx / 40, cy / 30, 0, 0, *row] for row in w2c]
+    data = [torch.frombuffer(bytearray(f.read_bytes()), dtype=torch.uint8) for f in photos.files]
+    mask = formats.encoded(np.full(_SIZE, 255, np.uint8))
+    record = {
+        "key": "s0", "url": "", "timestamps": torch.arange(5),
+        "cameras": torch.tensor(rows).float(), "images": data, "sizes": torch.tensor([_SIZE] * 5),
+        "masks": [torch.frombuffer(bytearray(mask), dtype=torch.uint8)] * 5,
+        "held_out": torch.tensor([2]), "names": list("abcde"),
+    }  # fmt: skip
+    record.pop(chance.choice(["masks", "sizes", "held_out", "names", "url"]))
+    (folder / "train").mkdir(parents=True)
+    torch.save([record], folder / "train" / "0.torch")
+    (folder / "train" / "index.json").write_text('{"s0": "0.torch"}')
+    return record
+
+
+class _Payload:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, ("touch /tmp/qgs-fuzz-ran",)
+
+
+def _record(folder: Path, record: dict[str, Any], chance: random.Random) -> str:
+    """Replace a field of the record, or the record."""
+    tensors: list[Callable[[torch.Tensor], Any]] = [
+        lambda t: t.to_sparse(), lambda t: t.double().requires_grad_(), lambda t: t[:0],
+        lambda t: t.float() * torch.nan, lambda t: t.to(torch.complex64), lambda t: t.bool(),
+        lambda t: torch.zeros(1, dtype=t.dtype).expand(10**12), lambda t: t.to("meta"),
+        lambda t: t.float() * 1e30, lambda t: t.tolist(), lambda t: t[None],
+        lambda t: torch.quantize_per_tensor(t.float(), 0.1, 0, torch.quint8), lambda t: t * 0,
+    ]  # fmt: skip
+    key = chance.choice(list(record))
+    value = record[key]
+    change = chance.choice(tensors)
+    if isinstance(value, torch.Tensor) and chance.random() < 0.6:
+        record[key] = change(value)
+    elif isinstance(value, list) and isinstance(value[0], torch.Tensor) and chance.random() < 0.6:
+        place = chance.randrange(len(value))
+        record[key] = [change(item) if i == place else item for i, item in enumerate(value)]
+    else:
+        record[key] = chance.choice([*_HOSTILE, torch.tensor(1), torch.tensor([2**62]), [3] * 5])
+    records: list[Any] = [record]
+    twist = chance.randrange(12)
+    if twist == 0:
+        records.append(records)
+    elif twist == 1:
+        records = [{**record, "url": _Payload()}]
+    elif twist == 2:
+        records = chance.choice([[], {}, [None], [[]], [record, record], 7, [{"key": 3}]])
+    elif twist == 3:
+        one = {name: item[:1] for name, item in record.items() if hasattr(item, "__getitem__")}
+        records = [{**one, "key": "s0"}]
+    torch.save(records, folder / "train" / "0.torch")
+    return f"{key} is {str(record[key])[:40]!r}, twist {twist}"
+
+
+def _json(folder: Path, _: Any, chance: random.Random) -> str:
+    """Replace or remove a value of a JSON file, or nest it deeply."""
+    file = chance.choice(sorted(folder.rglob("*.json")))
+    if chance.random() < 0.08:
+        file.write_text("[" * _DEEP + "]" * _DEEP)
+        return f"{file.name} is {_DEEP} deep"
+    data = json.loads(file.read_text())
+    holder, path = data, []
+    while True:
+        key = chance.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
+        path.append(key)
+        inside = holder[key]
+        if not isinstance(inside, dict | list) or not inside or chance.random() < 0.15:
+            break
+        holder = inside
+    value = chance.choice(_HOSTILE)
+    if chance.random() < 0.15:
+        del holder[key]
+    else:
+        holder[key] = value
+    text = json.dumps(data)
+    file.write_text(text)
+    return f"{file.name} {path} is {str(value)[:30]!r}"
+
+
+def _array(folder: Path, _: Any, chance: random.Random) -> str:
+    """Change an .npy file."""
+    found = sorted(folder.rglob("*.npy"))
+    if not found:
+        return _image(folder, chance)
+    file = chance.choice(found)
+    values = np.load(file)
+    what = chance.choice(
+        ["objects", "header", "shape", "NaN", "1e308", "integers", "words", "half"]
+    )
+    out = io.BytesIO()
+    if what == "objects":
+        np.save(out, np.array([[{}] * 17] * 5, object), allow_pickle=True)
+    elif what == "header":
+        shape = chance.choice([(10**12, 17), (2**62, 4), (-1, 17), (10**9,), (5, 17, 10**9), ()])
+        header = {"descr": chance.choice(["<f8", "|O"]), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(out, header)
+    elif what == "half":
+        out.write(file.read_bytes()[: file.stat().st_size // 2])
+    else:
+        place = tuple(chance.randrange(extent) for extent in values.shape)
+        if what in ("NaN", "1e308"):
+            values = values.astype(np.float64)
+            values[place] = float(what)
+        kinds = {"integers": np.int64, "words": str}
+        values = values.astype(kinds[what]) if what in kinds else values
+        np.save(out, values[:-1] if what == "shape" else values)
+    file.write_bytes(out.getvalue())
+    return f"{file.name}: {what}"
+
+
+def _text(folder: Path, _: Any, chance: random.Random) -> str:
+    """Replace a word of a COLMAP text file."""
+    found = sorted(folder.rglob("*.txt"))
+    if not found:
+        return _bytes(chance.choice(sorted(folder.rglob("*.bin"))), chance)
+    file = chance.choice(found)
+    words = file.read_text().split(" ")
+    place, value = chance.randrange(len(words)), chance.choice(_HOSTILE[:17])
+    words[place] = "9" * 5000 if value == 10**5000 else str(value)
+    file.write_text(" ".join(words), errors="replace")
+    return f"{file.name}, word {place} is {words[place][:30]!r}"
+
+
+def _bytes(file: Path, chance: random.Random) -> str:
+    """Damage the bytes of a file, or put something else in its place."""
+    data = bytearray(file.read_bytes())
+    what = chance.choice(["cut", "flip", "zeros", "empty", "random", "count", "place"])
+    at = chance.randrange(max(len(data), 1))
+    if what == "cut":
+        del data[at:]
+    elif what in ("flip", "zeros"):
+        for place in range(at, min(at + chance.choice([1, 8, 64]), len(data))):
+            data[place] = 0 if what == "zeros" else data[place] ^ chance.randrange(1, 256)
+    elif what == "count":
+        data[:8] = struct.pack("<Q", chance.choice([0, 2**40, 2**63, 2**64 - 1]))
+    elif what == "place":
+        return _in_place_of(file, chance)
+    else:
+        data = bytearray() if what == "empty" else bytearray(chance.randbytes(len(data)))
+    file.write_bytes(data)
+    return f"{file.name}: {what} at {at}"
+
+
+def _in_place_of(file: Path, chance: random.Random) -> str:
+    file.unlink()
+    what = chance.choice(["pipe", "folder", "loop", "nothing", "/dev/zero", "no target"])
+    if what == "pipe":
+        os.mkfifo(file)
+    elif what == "folder":
+        file.mkdir()
+    elif what != "nothing":
+        target = {"loop": file.name, "no target": "nowhere"}.get(what, what)
+        file.symlink_to(target)
+    return f"{file.name} is {what}"
+
+
+def _image(folder: Path, chance: random.Random) -> str:
+    """Damage or replace a photo, a mask or a depth map."""
+    found = [f for f in sorted(folder.rglob("*")) if f.suffix in (".png", ".npy") and f.is_file()]
+    if not found:
+        return "no change: its photos are inside of another file"
+    file = chance.choice(found)
+    kinds: dict[str, Callable[[], bytes]] = {
+        "bomb": lambda: _png(30_000, 30_000),
+        "large": lambda: _png(4_000, 3_000),
+        "swapped": lambda: _png(30, 40),
+        "no pixels": lambda: _png(0, 0),
+        "float": lambda: formats.encoded(_float(), "TIFF"),
+        "PostScript": lambda: formats.encoded(np.zeros((*_SIZE, 3), np.uint8), "EPS"),
+    }
+    kind = chance.choice([*kinds, "bytes", "bytes", "place"])
+    if kind == "bytes":
+        return _bytes(file, chance)
+    if kind == "place":
+        return _in_place_of(file, chance)
+    file.write_bytes(kinds[kind]())
+    return f"{file.name} is {kind}"
+
+
+def _float() -> Any:
+    return formats.Image.fromarray(np.ones(_SIZE, np.float32))
+
+
+def _png(width: int, height: int) -> bytes:
+    """A black 1-bit PNG."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    rows = zlib.compress(bytes((1 + (width + 7) // 8) * height), 1)
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def _colmap(kind: str) -> Callable[[Path, random.Random], Any]:
+    return lambda folder, chance: formats.write_colmap(folder, _photos(folder, chance), kind)
+
+
+def _llff(folder: Path, chance: random.Random) -> Any:
+    return formats.write_llff(folder, _photos(folder, chance))
+
+
+def _blender(folder: Path, chance: random.Random) -> Any:
+    return formats.write_blender(folder, _photos(folder, chance), 3)
+
+
+_MODEL = tuple(f"sparse/0/{name}" for name in ("cameras", "images"))
+_WRITERS: dict[str, tuple[Callable[..., Any], tuple[str, ...], tuple[Callable[..., str], ...]]] = {
+    "nerfstudio": (_nerfstudio, ("transforms.json",), (_json, _json, _array)),
+    "blender": (_blender, ("transforms_train.json",), (_json,)),
+    "cameras": (_cameras, ("cameras.json",), (_json,)),
+    "llff": (_llff, ("poses_bounds.npy",), (_array,)),
+    "colmap text": (_colmap("text"), tuple(f"{name}.txt" for name in _MODEL), (_text,)),
+    "colmap binary": (_colmap("binary"), tuple(f"{name}.bin" for name in _MODEL), (_text,)),
+    "dl3dv": (_dl3dv, ("inner/transforms.json",), (_zipped,)),
+    "chunks": (_chunks, ("train/index.json", "train/0.torch"), (_record, _record, _record, _json)),
+}
