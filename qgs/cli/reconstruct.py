@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,11 +13,13 @@ from qgs.cli.options import Device, Size, parse_size
 from qgs.wording import listed
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Component, Scene, Split
+    from qgs.contracts import Component, Scene, Split, ViewsConfig
+    from qgs.model import QueryGaussianModel
 
 
 def reconstruct(
@@ -38,6 +40,25 @@ def reconstruct(
     tune: Annotated[
         int, typer.Option(min=0, help="Steps of token tuning on the input photos; 0 for none.")
     ] = 0,
+    refine: Annotated[
+        float | None,
+        typer.Option(help="Seconds of optimising the Gaussians on all photos not compared with."),
+    ] = None,
+    refine_size: Annotated[
+        str | None,
+        typer.Option(metavar="HxW", help="Size of the photos for --refine; default: the inputs'."),
+    ] = None,
+    refine_inputs: Annotated[
+        bool, typer.Option("--refine-inputs", help="Refine on the input photos alone.")
+    ] = False,
+    gaussians: Annotated[
+        int | None,
+        typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
+    ] = None,
+    scale: Annotated[
+        str | None,
+        typer.Option(help="Of the photos' world: auto, or a factor; default: the recipe's."),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
@@ -50,6 +71,7 @@ def reconstruct(
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
 
     Of a folder that the model was trained on, held-out photos are compared with where there are.
+    What --refine makes is written to OUT/refined, beside what the model predicted.
     """
     if out.is_file():
         raise FileExistsError(f"{out} is a file; choose a folder for --out")
@@ -59,7 +81,11 @@ def reconstruct(
             "of the same names"
         )
     chosen, compared = frame_list(frames, "--frames"), frame_list(holdout, "--holdout")
-    pixels = parse_size(size)
+    pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
+    refuse_unused(
+        refine,
+        {"--refine-size": fine, "--refine-inputs": refine_inputs or None, "--gaussians": gaussians},
+    )
 
     from rich.console import Console
 
@@ -80,20 +106,95 @@ def reconstruct(
         console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
     sources = registry.components("data")
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
-    sample, world = choose_sample(scene, recipe.views, inputs, chosen, compared)
+    views = views_of(recipe, scale)
+    sample, world = choose_sample(scene, views, inputs, chosen, compared)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    gaussians = record = None
+    tuned = record = None
     if tune:
         rate = recipe.evaluation.tuning_rate
         tuning = fit(model, sample.inputs, tuning_loss(recipe), tune, rate)
-        gaussians, before, after = tuning.prediction.gaussians, tuning.losses[0], tuning.losses[-1]
+        tuned, before, after = tuning.prediction.gaussians, tuning.losses[0], tuning.losses[-1]
         record = {"steps": tune, "rate": rate, "loss_before": before, "loss_after": after}
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
-    result = run(model, sample, world, seen, gaussians, record)
-    console.print(score_table(result))
-    for path in write_reconstruction(model, result, out):
+    result = run(model, sample, world, seen, tuned, record)
+    what = "feed-forward" if refine else ""
+    console.print(score_table(result, what))
+    told(console, write_reconstruction(model, result, out))
+    if refine:
+        if fine is not None:
+            scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
+        better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
+        console.print(score_table(better, "refined"))
+        told(console, write_reconstruction(model, better, out / "refined"))
+
+
+def refined(
+    model: QueryGaussianModel,
+    scene: Scene,
+    start: Reconstruction,
+    seconds: float,
+    count: int | None,
+    inputs_only: bool,
+    seen: Sequence[int],
+    console: Console,
+) -> Reconstruction:
+    """The reconstruction `start`, refined on photos of `scene` at its size; see `qgs.refine`."""
+    from qgs.analysis.reconstruction import reconstruct, refinement_photos
+    from qgs.engine.refining import refine
+
+    sample, photos, frames = refinement_photos(scene, start, inputs_only)
+    before = start.gaussians
+    compared = sample.targets if sample.target_frames else None
+    result = refine(
+        before, photos, seconds, count=count, compared=compared,
+        renderer=model.renderer, console=console,
+    )  # fmt: skip
+    ended = f", ended by {result.stopped_by}" if result.stopped_by else ""
+    height, width = photos.cameras.size
+    console.print(
+        f"refined for {result.seconds:.1f} s{ended}: {result.steps} steps on {len(frames)} photos "
+        f"of {width} x {height} pixels, {before.count:,} -> {result.gaussians.count:,} Gaussians",
+        highlight=False,
+    )
+    record = {
+        "seconds": result.seconds,
+        "steps": result.steps,
+        "frames": frames,
+        "stopped_by": result.stopped_by,
+        "curve": [asdict(point) for point in result.curve],
+    }
+    return reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
+
+
+def told(console: Console, paths: Sequence[Path]) -> None:
+    """Name the files that were written."""
+    for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
+
+
+def views_of(recipe: Recipe, scale: str | None) -> ViewsConfig:
+    """The recipe's views, in a world scaled by `scale`: "auto" or a factor, None for its own."""
+    if scale is None:
+        return recipe.views
+    if scale == "auto":
+        return recipe.views.model_copy(update={"scale": "auto"})
+    try:
+        factor = float(scale)
+    except ValueError:
+        factor = 0.0
+    if not 0 < factor < float("inf"):
+        raise ValueError(f"--scale must be auto or a factor above 0, such as 0.4; got {scale!r}")
+    return recipe.views.model_copy(update={"scale": "constant", "scale_factor": factor})
+
+
+def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:
+    """Raise ValueError for options of a refinement that is not asked for, or takes no time."""
+    given = [name for name, value in options.items() if value is not None]
+    if seconds is None and given:
+        raise ValueError(f"{listed(given)} needs --refine SECONDS: add it, such as --refine 30")
+    if seconds is not None and not 0 < seconds < float("inf"):
+        raise ValueError(f"--refine must be a number of seconds above 0, got {seconds:g}")
 
 
 def chosen_scene(
@@ -148,15 +249,19 @@ def frame_list(text: str | None, option: str) -> list[int] | None:
         ) from None
 
 
-def score_table(result: Reconstruction) -> Table:
-    """PSNR of every rendered view and of the baselines, inputs first, and the means by kind."""
+def score_table(result: Reconstruction, what: str = "") -> Table:
+    """PSNR of every rendered view and of the baselines, inputs first, and the means by kind.
+
+    what: said before the number of Gaussians.
+    """
     from rich.table import Table
 
     from qgs.analysis.reconstruction import KINDS
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
 
-    table = Table(title=f"{result.sample.scene}: {result.gaussians.count:,} Gaussians")
+    count = f"{result.gaussians.count:,} Gaussians"
+    table = Table(title=f"{result.sample.scene}: {f'{what}, {count}' if what else count}")
     table.add_column("view")
     shown = Psnr.column.shown
     for name in ("frames", Psnr.column.heading, *BASELINES):

@@ -1,0 +1,241 @@
+"""Refinement: Gaussians of one scene, optimised on its photos as 3D Gaussian splatting does."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from qgs.engine.distributed import StopRequest, stop_requests
+from qgs.engine.growth import Leaves
+from qgs.engine.tracking import TrainingProgress
+from qgs.losses.photometric import mean_squared_error, mean_ssim
+from qgs.metrics.images import psnr
+from qgs.types import Cameras, Gaussians, Views
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_RATES = {
+    "means": 2e-3,  # of the scene's size
+    "log_scales": 2e-2,
+    "quats": 1e-2,
+    "opacity_logits": 5e-2,
+    "color_logits": 5e-2,
+}
+_LAST = {"means": 0.01}  # of the rate, at the end; others:
+_LAST_OF_OTHERS = 0.1
+_SSIM, _OPACITY, _SCALE = 0.25, 0.06, 0.06  # weights beside the mean squared error
+_GROWN, _SETTLED = 0.6, 0.8  # of the budget: the wanted number is there; none is moved any more
+_STEPS_BETWEEN_GROWTHS = 40
+_LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))  # part of the resolution, up to this part of the budget
+_LEAST_SIDE = 32  # pixels: no level is smaller
+_POINTS = 12  # of the curve
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """How far a refinement was. psnr: dB, mean over the photos that it is compared with."""
+
+    seconds: float
+    step: int
+    gaussians: int
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Refined Gaussians (1, G). curve: from the start on; empty without photos to compare with.
+
+    seconds: on the clock, evaluations left out. stopped_by: name of the signal that ended it early.
+    """
+
+    gaussians: Gaussians
+    curve: Sequence[CurvePoint]
+    steps: int
+    seconds: float
+    stopped_by: str | None = None
+
+
+def refine(
+    gaussians: Gaussians,
+    views: Views,
+    seconds: float,
+    *,
+    count: int | None = None,
+    compared: Views | None = None,
+    renderer: nn.Module | None = None,
+    seed: int = 0,
+    console: "Console | None" = None,
+) -> Refinement:
+    """Go on from `gaussians` (1, G) by optimising them on the photos `views` (1, V).
+
+    seconds: of optimisation, counted after the first step, in which kernels compile. count:
+    Gaussians wanted at the end, as many as given by default; more grow within the first part of the
+    time, of fewer the most opaque are kept. compared: photos (1, W) for the curve, never optimised
+    on. renderer: `qgs/auto` by default. console: where progress is shown; nowhere by default.
+    The first Ctrl-C finishes the step and returns what there is. Any world will do: its size is
+    measured by the distance of the Gaussians from the cameras.
+
+    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
+    """
+    _refuse_unusable(gaussians, views, seconds, count)
+    with _shown_on(console) as (progress, stop), torch.enable_grad():
+        run = _Run(gaussians, views, seconds, count, renderer, seed)
+        curve = [point for point in run.curve(compared, progress, stop) if compared is not None]
+        name = stop.signal.name if stop.signal else None
+        with torch.no_grad():
+            return Refinement(run.leaves.gaussians(), curve, run.step, run.spent, name)
+
+
+class _Run:
+    """One refinement: its Gaussians, photos by level of resolution, and clock."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        views: Views,
+        seconds: float,
+        count: int | None,
+        renderer: nn.Module | None,
+        seed: int,
+    ) -> None:
+        self.renderer = renderer or default_renderer()
+        self.wanted = count or gaussians.count
+        if self.wanted < gaussians.count:
+            gaussians = gaussians[:, gaussians.opacities[0].topk(self.wanted).indices]
+        self.start, self.size = gaussians.count, _size_of(gaussians, views.cameras)
+        self.rates = {**_RATES, "means": _RATES["means"] * self.size}
+        self.leaves = Leaves(gaussians, self.rates)
+        side = min(views.cameras.size)
+        parts = {part: part == 1 or side // part >= _LEAST_SIDE for part, _ in _LEVELS}
+        self.levels = [(resized(views, p), end) for p, end in _LEVELS if parts[p]]
+        self.seconds, self.step, self.spent, self.grown = seconds, 0, 0.0, 0
+        self.generator = torch.Generator().manual_seed(seed)
+        self.order: list[int] = []
+
+    def curve(
+        self, compared: Views | None, progress: TrainingProgress | None, stop: StopRequest
+    ) -> Iterator[CurvePoint]:
+        """Optimise until the time is used or a stop is asked for; points of the curve between."""
+        yield self._point(compared)
+        due = 1
+        while self.spent < self.seconds and not stop:
+            began = perf_counter()
+            loss, quality = self._optimise()
+            if self.step > 1:  # the first one compiles
+                self.spent += perf_counter() - began
+            if progress:
+                progress.update(
+                    self.step, loss, quality, self.step, self.spent, self.spent / self.seconds
+                )
+            if self.spent >= due * self.seconds / _POINTS and self.spent < self.seconds:
+                due = math.floor(self.spent / self.seconds * _POINTS) + 1
+                yield self._point(compared)
+        yield self._point(compared)
+
+    def _optimise(self) -> tuple[float, float]:
+        """One step on one photo, and growth where it is due; the loss and PSNR before it."""
+        used = min(self.spent / self.seconds, 1.0)
+        for group in self.leaves.optimizer.param_groups:
+            name = group["name"]
+            group["lr"] = self.rates[name] * _LAST.get(name, _LAST_OF_OTHERS) ** used
+        views = next(views for views, end in self.levels if used < end or end == 1)
+        if not self.order:
+            self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
+        photo = views.select([self.order.pop()])
+        gaussians = self.leaves.gaussians()
+        rgb = self.renderer(gaussians, photo.cameras).rgb
+        error = mean_squared_error(rgb, photo.images)
+        loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
+        loss = loss + _OPACITY * gaussians.opacities.mean()
+        loss = loss + _SCALE * gaussians.scales.mean() / self.size
+        self.leaves.optimizer.zero_grad()
+        loss.backward()
+        self.leaves.optimizer.step()
+        self.step += 1
+        if self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED:
+            self.grown = self.step
+            share = min(used / _GROWN, 1.0)
+            now = round(self.start * (self.wanted / self.start) ** share)
+            self.leaves.grow(now, self.generator)
+        numbers = torch.stack([loss.detach(), error.detach()]).tolist()
+        return numbers[0], -10 * math.log10(max(numbers[1], 1e-10))
+
+    @torch.no_grad()
+    def _point(self, compared: Views | None) -> CurvePoint:
+        quality = math.nan
+        if compared is not None:
+            quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
+        return CurvePoint(self.spent, self.step, self.leaves.count, quality)
+
+
+def resized(views: Views, part: int) -> Views:
+    """The views at 1/part of their resolution, by means over areas."""
+    if part == 1:
+        return views
+    height, width = views.cameras.size
+    size = height // part, width // part
+    images = F.interpolate(views.images[0], size=size, mode="area")[None]
+    factors = [size[1] / width, size[0] / height]
+    intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
+    return Views(images, Cameras(views.cameras.c2w, intrinsics, size))
+
+
+@torch.no_grad()
+def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
+    """Mean PSNR in dB of renderings against `views` (1, V)."""
+    rgb: Tensor = renderer(gaussians, views.cameras).rgb
+    return float(psnr(rgb[0], views.images[0]).mean())
+
+
+def default_renderer() -> nn.Module:
+    """`qgs/auto` with its default options: gsplat on CUDA, else the CPU's kernels."""
+    from qgs.renderers.auto import AutoRenderer
+
+    return AutoRenderer(AutoRenderer.Config())
+
+
+def _size_of(gaussians: Gaussians, cameras: Cameras) -> float:
+    """Median distance from a camera to a Gaussian, world units."""
+    distances = torch.cdist(gaussians.means[0].detach(), cameras.c2w[0, :, :3, 3])
+    return float(distances.median().clamp_min(1e-6))
+
+
+@contextmanager
+def _shown_on(console: "Console | None") -> Iterator[tuple[TrainingProgress | None, StopRequest]]:
+    with stop_requests(console is None) as stop:
+        if console is None:
+            yield None, stop
+        else:
+            with TrainingProgress(console) as progress:
+                yield progress, stop
+
+
+def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int | None) -> None:
+    scenes, photos = views.images.shape[:2]
+    if gaussians.means.shape[0] != 1 or scenes != 1:
+        raise ValueError(
+            "refinement takes one scene, Gaussians (1, G) and views (1, V); got "
+            f"{gaussians.means.shape[0]} scenes of Gaussians and {scenes} of views: select one"
+        )
+    if not photos or not gaussians.count:
+        raise ValueError(
+            f"refinement needs photos and Gaussians, got {photos} photos and {gaussians.count} "
+            "Gaussians"
+        )
+    if not seconds > 0 or (count is not None and count < 1):
+        raise ValueError(
+            "refinement needs more than 0 seconds and at least one Gaussian, got "
+            f"{seconds:g} seconds" + ("" if count is None else f" and {count} Gaussians")
+        )
+    if not all(bool(tensor.isfinite().all()) for tensor in vars(gaussians).values()):
+        raise ValueError(
+            "some of the Gaussians are not finite: the model that predicted them is broken, or "
+            "its photos are far from what it was trained on"
+        )
