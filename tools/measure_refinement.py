@@ -30,6 +30,9 @@ from qgs.io.checkpoint import load_recipe
 from qgs.io.files import write_text
 from qgs.types import Gaussians, Views
 
+ROOM_VIEWS = 29
+"""On the path of a room, 4 for each of the 8 between which the inputs of the recipe are chosen."""
+
 
 def random_points(count: int, seed: int = 0) -> Gaussians:
     """Gaussians (1, count) about the point at depth 1 of the first camera."""
@@ -44,9 +47,17 @@ def random_points(count: int, seed: int = 0) -> Gaussians:
 def opened(recipe, name: str, split: str, size: tuple[int, int] | None) -> tuple[Scene, str]:
     """The scene `name`, and how its world is scaled."""
     if name == "room":
-        return recipe.build_data().scenes(split)[0], recipe.views.scale
+        data = recipe.build_data()
+        views = {"views_per_scene": ROOM_VIEWS}
+        finer = type(data)(data.config.model_copy(update=views))
+        return finer.scenes(split)[0], recipe.views.scale
     sources = load_sound_plugins()[0].components("data")
     return chosen_scene(recipe, name, size, None, sources)[0], "auto"
+
+
+def room_frames(inputs: int) -> tuple[list[int], list[int]]:
+    """Inputs, ends included, over five of the seven parts of the path, and four between them."""
+    return [4 + round(20 * k / (inputs - 1)) for k in range(inputs)], [8, 12, 15, 20]
 
 
 def photos_of(scene: Scene, sample: Sample, world, photos: int) -> Views:
@@ -61,7 +72,8 @@ def measure(model, recipe, name: str, photos: int, arguments) -> list[dict]:
     """Runs on one scene from both starts, with their curves."""
     scene, scale = opened(recipe, name, arguments.split, arguments.size)
     views = recipe.views.model_copy(update={"scale": scale})
-    sample, world = choose_sample(scene, views, photos or None, None, None)
+    frames = room_frames(photos or views.inputs) if name == "room" else (None, None)
+    sample, world = choose_sample(scene, views, photos or None, *frames)
     optimised = photos_of(scene, sample, world, photos)
     with torch.no_grad():
         predicted = model(sample.inputs).gaussians

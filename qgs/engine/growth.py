@@ -13,8 +13,8 @@ from torch import Tensor
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Gaussians
 
-DEAD = 0.005
-"""Opacity below which a Gaussian adds nothing that can be seen."""
+DEAD = 0.05
+"""Opacity below which a Gaussian moves. Training for hours takes 0.005; in seconds more must move."""
 _MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
 

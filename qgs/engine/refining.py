@@ -16,25 +16,26 @@ from qgs.engine.growth import Leaves
 from qgs.engine.tracking import TrainingProgress
 from qgs.losses.photometric import mean_squared_error, mean_ssim
 from qgs.metrics.images import psnr
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Gaussians, Views, map_tensors
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 _RATES = {
-    "means": 2e-3,  # of the scene's size
-    "log_scales": 2e-2,
+    "means": 7e-3,  # of the scene's size
+    "log_scales": 4e-2,
     "quats": 1e-2,
-    "opacity_logits": 5e-2,
+    "opacity_logits": 0.1,
     "color_logits": 5e-2,
 }
 _LAST = {"means": 0.01}  # of the rate, at the end; others:
 _LAST_OF_OTHERS = 0.1
-_SSIM, _OPACITY, _SCALE = 0.25, 0.06, 0.06  # weights beside the mean squared error
+_SSIM = 0.25  # weight beside the mean squared error
+_SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos
 _GROWN, _SETTLED = 0.6, 0.8  # of the budget: the wanted number is there; none is moved any more
 _STEPS_BETWEEN_GROWTHS = 40
 _LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))  # part of the resolution, up to this part of the budget
-_LEAST_SIDE = 32  # pixels: no level is smaller
+_LEAST_SIDE = 64  # pixels: no level is smaller
 _POINTS = 12  # of the curve
 
 
@@ -89,8 +90,8 @@ def refine(
         run = _Run(gaussians, views, seconds, count, renderer, seed)
         curve = [point for point in run.curve(compared, progress, stop) if compared is not None]
         name = stop.signal.name if stop.signal else None
-        with torch.no_grad():
-            return Refinement(run.leaves.gaussians(), curve, run.step, run.spent, name)
+        refined = map_tensors(Tensor.detach, run.leaves.gaussians())
+        return Refinement(refined, curve, run.step, run.spent, name)
 
 
 class _Run:
@@ -153,19 +154,24 @@ class _Run:
         rgb = self.renderer(gaussians, photo.cameras).rgb
         error = mean_squared_error(rgb, photo.images)
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
-        loss = loss + _OPACITY * gaussians.opacities.mean()
-        loss = loss + _SCALE * gaussians.scales.mean() / self.size
+        spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
+        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread
         self.leaves.optimizer.zero_grad()
         loss.backward()
         self.leaves.optimizer.step()
         self.step += 1
-        if self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED:
+        self._grow(used)
+        numbers = torch.stack([loss.detach(), error.detach()]).tolist()
+        return numbers[0], -10 * math.log10(max(numbers[1], 1e-10))
+
+    def _grow(self, used: float) -> None:
+        """Relocate and add Gaussians where that is due after a step that began at `used`."""
+        regular = self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED
+        if regular or (used >= _GROWN and self.leaves.count < self.wanted):
             self.grown = self.step
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
             self.leaves.grow(now, self.generator)
-        numbers = torch.stack([loss.detach(), error.detach()]).tolist()
-        return numbers[0], -10 * math.log10(max(numbers[1], 1e-10))
 
     @torch.no_grad()
     def _point(self, compared: Views | None) -> CurvePoint:
