@@ -14,7 +14,7 @@ from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Gaussians
 
 DEAD = 0.05
-"""Opacity below which a Gaussian moves. Training for hours takes 0.005; in seconds more must move."""
+"""Opacity below which a Gaussian moves; the paper's 0.005 is for hours, in seconds more must."""
 _MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
 
