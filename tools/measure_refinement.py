@@ -5,7 +5,7 @@
 SCENE is a folder of photos, or "room" for a room of the checkpoint's test split. --photos: how many
 are optimised on; 0 stands for all that are not compared with. Each is refined from the prediction
 and from random points about the look-at point; frames and scale are those of `qgs reconstruct`
-with --scale auto (a room keeps the recipe's). Prints a line a run and writes the curves; --plot
+with views.scale=auto (a room keeps the recipe's). Prints a line a run and writes the curves; --plot
 draws those of a file. Seconds are CPU seconds of one thread, so that other work on the machine
 does not count.
 """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Component, Scene, Split, ViewsConfig
+    from qgs.contracts import Component, Scene, Split
     from qgs.model import QueryGaussianModel
 
 
@@ -55,9 +55,9 @@ def reconstruct(
         int | None,
         typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
     ] = None,
-    scale: Annotated[
-        str | None,
-        typer.Option(help="Of the photos' world: auto, or a factor; default: the recipe's."),
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override of `views`, such as views.scale=auto; repeatable."),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
@@ -80,6 +80,8 @@ def reconstruct(
             f"{out} is not empty; choose another --out, or add --overwrite to replace the files "
             "of the same names"
         )
+    if foreign := [text for text in overrides or () if not text.startswith("views.")]:
+        raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     chosen, compared = frame_list(frames, "--frames"), frame_list(holdout, "--holdout")
     pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
     refuse_unused(
@@ -91,6 +93,7 @@ def reconstruct(
 
     from qgs.analysis.reconstruction import choose_sample, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
+    from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
@@ -101,13 +104,14 @@ def reconstruct(
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
+    if overrides:
+        recipe = resolve(recipe.tree, overrides)
     registry, broken = load_sound_plugins()
     for problem in broken:
         console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
     sources = registry.components("data")
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
-    views = views_of(recipe, scale)
-    sample, world = choose_sample(scene, views, inputs, chosen, compared)
+    sample, world = choose_sample(scene, recipe.views, inputs, chosen, compared)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     tuned = record = None
     if tune:
@@ -120,25 +124,21 @@ def reconstruct(
     result = run(model, sample, world, seen, tuned, record)
     what = "feed-forward" if refine else ""
     console.print(score_table(result, what))
-    told(console, write_reconstruction(model, result, out))
+    paths = write_reconstruction(model, result, out)
     if refine:
         if fine is not None:
             scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
         better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
         console.print(score_table(better, "refined"))
-        told(console, write_reconstruction(model, better, out / "refined"))
+        paths += write_reconstruction(model, better, out / "refined")
+    for path in paths:
+        console.print(f"wrote {path}", soft_wrap=True)
 
 
 def refined(
-    model: QueryGaussianModel,
-    scene: Scene,
-    start: Reconstruction,
-    seconds: float,
-    count: int | None,
-    inputs_only: bool,
-    seen: Sequence[int],
-    console: Console,
-) -> Reconstruction:
+    model: QueryGaussianModel, scene: Scene, start: Reconstruction, seconds: float,
+    count: int | None, inputs_only: bool, seen: Sequence[int], console: Console,
+) -> Reconstruction:  # fmt: skip
     """The reconstruction `start`, refined on photos of `scene` at its size; see `qgs.refine`."""
     from qgs.analysis.reconstruction import reconstruct, refinement_photos
     from qgs.engine.refining import refine
@@ -157,35 +157,9 @@ def refined(
         f"of {width} x {height} pixels, {before.count:,} -> {result.gaussians.count:,} Gaussians",
         highlight=False,
     )
-    record = {
-        "seconds": result.seconds,
-        "steps": result.steps,
-        "frames": frames,
-        "stopped_by": result.stopped_by,
-        "curve": [asdict(point) for point in result.curve],
-    }
+    record = {"seconds": result.seconds, "steps": result.steps, "frames": frames}
+    record |= {"stopped_by": result.stopped_by, "curve": [asdict(p) for p in result.curve]}
     return reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
-
-
-def told(console: Console, paths: Sequence[Path]) -> None:
-    """Name the files that were written."""
-    for path in paths:
-        console.print(f"wrote {path}", soft_wrap=True)
-
-
-def views_of(recipe: Recipe, scale: str | None) -> ViewsConfig:
-    """The recipe's views, in a world scaled by `scale`: "auto" or a factor, None for its own."""
-    if scale is None:
-        return recipe.views
-    if scale == "auto":
-        return recipe.views.model_copy(update={"scale": "auto"})
-    try:
-        factor = float(scale)
-    except ValueError:
-        factor = 0.0
-    if not 0 < factor < float("inf"):
-        raise ValueError(f"--scale must be auto or a factor above 0, such as 0.4; got {scale!r}")
-    return recipe.views.model_copy(update={"scale": "constant", "scale_factor": factor})
 
 
 def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:

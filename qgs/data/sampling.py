@@ -172,10 +172,9 @@ def auto_scale(c2w: Tensor, scene: str) -> Tensor:
             "use `scale: constant`"
         )
     warn_once(
-        f"the cameras of scene {scene!r} look at no common point (their axes are parallel, or it "
-        "lies behind or beside many of them), so views.scale: auto makes the largest distance from "
-        f"the first camera 1, a factor of {1 / float(distance):.4g}; if what they see comes out "
-        "too near or too far, give `scale: constant` and a scale_factor"
+        f"the cameras of scene {scene!r} look at no common point, so views.scale: auto makes the "
+        f"largest distance from the first one 1, a factor of {1 / float(distance):.4g}; if what "
+        "they see comes out too near or too far, give `scale: constant` and a scale_factor"
     )
     return 1 / distance
 

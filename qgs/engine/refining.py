@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
+from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.engine.distributed import StopRequest, stop_requests
@@ -16,10 +15,8 @@ from qgs.engine.growth import Leaves
 from qgs.engine.tracking import TrainingProgress
 from qgs.losses.photometric import mean_squared_error, mean_ssim
 from qgs.metrics.images import psnr
+from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views, map_tensors
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 _RATES = {
     "means": 7e-3,  # of the scene's size
@@ -71,8 +68,7 @@ def refine(
     count: int | None = None,
     compared: Views | None = None,
     renderer: nn.Module | None = None,
-    seed: int = 0,
-    console: "Console | None" = None,
+    console: Console | None = None,
 ) -> Refinement:
     """Go on from `gaussians` (1, G) by optimising them on the photos `views` (1, V).
 
@@ -85,10 +81,13 @@ def refine(
 
     Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
     """
-    _refuse_unusable(gaussians, views, seconds, count)
-    with _shown_on(console) as (progress, stop), torch.enable_grad():
-        run = _Run(gaussians, views, seconds, count, renderer, seed)
-        curve = [point for point in run.curve(compared, progress, stop) if compared is not None]
+    wanted = gaussians.count if count is None else count
+    _refuse_unusable(gaussians, views, seconds, wanted)
+    quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
+    with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
+        renderer = renderer or AutoRenderer(AutoRenderer.Config())
+        run = _Run(gaussians, views, seconds, wanted, renderer)
+        curve = list(run.curve(compared, progress, stop))
         name = stop.signal.name if stop.signal else None
         refined = map_tensors(Tensor.detach, run.leaves.gaussians())
         return Refinement(refined, curve, run.step, run.spent, name)
@@ -98,47 +97,38 @@ class _Run:
     """One refinement: its Gaussians, photos by level of resolution, and clock."""
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        views: Views,
-        seconds: float,
-        count: int | None,
-        renderer: nn.Module | None,
-        seed: int,
+        self, gaussians: Gaussians, views: Views, seconds: float, wanted: int, renderer: nn.Module
     ) -> None:
-        self.renderer = renderer or default_renderer()
-        self.wanted = count or gaussians.count
-        if self.wanted < gaussians.count:
-            gaussians = gaussians[:, gaussians.opacities[0].topk(self.wanted).indices]
+        self.renderer, self.wanted = renderer, wanted
+        if wanted < gaussians.count:
+            gaussians = gaussians[:, gaussians.opacities[0].topk(wanted).indices]
         self.start, self.size = gaussians.count, _size_of(gaussians, views.cameras)
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.leaves = Leaves(gaussians, self.rates)
         side = min(views.cameras.size)
-        parts = {part: part == 1 or side // part >= _LEAST_SIDE for part, _ in _LEVELS}
-        self.levels = [(resized(views, p), end) for p, end in _LEVELS if parts[p]]
+        levels = [level for level in _LEVELS if level[0] == 1 or side // level[0] >= _LEAST_SIDE]
+        self.levels = [(resized(views, part), end) for part, end in levels]
         self.seconds, self.step, self.spent, self.grown = seconds, 0, 0.0, 0
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(0)
         self.order: list[int] = []
 
     def curve(
-        self, compared: Views | None, progress: TrainingProgress | None, stop: StopRequest
+        self, compared: Views | None, progress: TrainingProgress, stop: StopRequest
     ) -> Iterator[CurvePoint]:
         """Optimise until the time is used or a stop is asked for; points of the curve between."""
-        yield self._point(compared)
-        due = 1
+        due = 0.0
         while self.spent < self.seconds and not stop:
+            if compared is not None and self.spent >= due:
+                due = (self.spent // (self.seconds / _POINTS) + 1) * self.seconds / _POINTS
+                yield self._point(compared)
             began = perf_counter()
             loss, quality = self._optimise()
             if self.step > 1:  # the first one compiles
                 self.spent += perf_counter() - began
-            if progress:
-                progress.update(
-                    self.step, loss, quality, self.step, self.spent, self.spent / self.seconds
-                )
-            if self.spent >= due * self.seconds / _POINTS and self.spent < self.seconds:
-                due = math.floor(self.spent / self.seconds * _POINTS) + 1
-                yield self._point(compared)
-        yield self._point(compared)
+            used = self.spent / self.seconds
+            progress.update(self.step, loss, quality, self.step, self.spent, used)
+        if compared is not None:
+            yield self._point(compared)
 
     def _optimise(self) -> tuple[float, float]:
         """One step on one photo, and growth where it is due; the loss and PSNR before it."""
@@ -173,11 +163,8 @@ class _Run:
             now = round(self.start * (self.wanted / self.start) ** share)
             self.leaves.grow(now, self.generator)
 
-    @torch.no_grad()
-    def _point(self, compared: Views | None) -> CurvePoint:
-        quality = math.nan
-        if compared is not None:
-            quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
+    def _point(self, compared: Views) -> CurvePoint:
+        quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
         return CurvePoint(self.spent, self.step, self.leaves.count, quality)
 
 
@@ -200,48 +187,22 @@ def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
     return float(psnr(rgb[0], views.images[0]).mean())
 
 
-def default_renderer() -> nn.Module:
-    """`qgs/auto` with its default options: gsplat on CUDA, else the CPU's kernels."""
-    from qgs.renderers.auto import AutoRenderer
-
-    return AutoRenderer(AutoRenderer.Config())
-
-
 def _size_of(gaussians: Gaussians, cameras: Cameras) -> float:
     """Median distance from a camera to a Gaussian, world units."""
     distances = torch.cdist(gaussians.means[0].detach(), cameras.c2w[0, :, :3, 3])
     return float(distances.median().clamp_min(1e-6))
 
 
-@contextmanager
-def _shown_on(console: "Console | None") -> Iterator[tuple[TrainingProgress | None, StopRequest]]:
-    with stop_requests(console is None) as stop:
-        if console is None:
-            yield None, stop
-        else:
-            with TrainingProgress(console) as progress:
-                yield progress, stop
-
-
-def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int | None) -> None:
-    scenes, photos = views.images.shape[:2]
-    if gaussians.means.shape[0] != 1 or scenes != 1:
+def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int) -> None:
+    given = (*gaussians.means.shape[:2], *views.images.shape[:2])
+    if given[0] != 1 or given[2] != 1 or 0 in given or not seconds > 0 or count < 1:
         raise ValueError(
-            "refinement takes one scene, Gaussians (1, G) and views (1, V); got "
-            f"{gaussians.means.shape[0]} scenes of Gaussians and {scenes} of views: select one"
-        )
-    if not photos or not gaussians.count:
-        raise ValueError(
-            f"refinement needs photos and Gaussians, got {photos} photos and {gaussians.count} "
-            "Gaussians"
-        )
-    if not seconds > 0 or (count is not None and count < 1):
-        raise ValueError(
-            "refinement needs more than 0 seconds and at least one Gaussian, got "
-            f"{seconds:g} seconds" + ("" if count is None else f" and {count} Gaussians")
+            "refinement takes Gaussians (1, G) and photos (1, V) of one scene, and some time; got "
+            "{} scenes of {} Gaussians, {} scenes of {} photos".format(*given)
+            + f", {seconds:g} seconds, {count} Gaussians wanted: give at least one of each"
         )
     if not all(bool(tensor.isfinite().all()) for tensor in vars(gaussians).values()):
         raise ValueError(
-            "some of the Gaussians are not finite: the model that predicted them is broken, or "
-            "its photos are far from what it was trained on"
+            "some Gaussians are not finite, so they cannot be refined: the model that predicted "
+            "them is broken, or its photos are far from what it was trained on"
         )

@@ -186,7 +186,8 @@ def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photo
         (("--refine-inputs",), "--refine-inputs needs --refine"),
         (("--refine", 0), "--refine must be a number of seconds above 0, got 0"),
         (("--refine", 1, "--refine-size", "64"), "--refine-size must be HxW"),
-        (("--scale", "big"), "--scale must be auto or a factor above 0.*'big'"),
+        (("--set", "views.scale=big"), "views.scale.*'big'"),
+        (("--set", "data.path=x"), "--set changes `views` alone here, got data.path=x"),
     ],
 )
 def test_options_of_a_refinement_that_make_no_sense_are_refused(
@@ -198,9 +199,11 @@ def test_options_of_a_refinement_that_make_no_sense_are_refused(
 
 
 def test_the_world_is_scaled_as_asked_for(checkpoint, photos, tmp_path, caplog):
-    for scale, factor in (("0.5", 0.5), ("auto", 1 / 0.6)):  # a row of 7, 0.1 apart, looks ahead
-        out = tmp_path / scale
-        assert run(checkpoint, photos, "--out", out, "--scale", scale).exception is None
+    cases = {"scale_factor=0.5": 0.5, "scale=auto": 1 / 0.6}  # a row of 7, 0.1 apart, looks ahead
+    for setting, factor in cases.items():
+        out = tmp_path / setting
+        options = ("--out", out, "--set", f"views.{setting}")
+        assert run(checkpoint, photos, *options).exception is None
         record = json.loads((out / "cameras.json").read_text())
         assert record["to_photos"]["scale"] == pytest.approx(factor)
     assert "look at no common point" in caplog.text

@@ -12,10 +12,12 @@ import torch
 
 import qgs
 from qgs.engine.growth import Leaves
-from qgs.engine.refining import default_renderer, mean_psnr, resized
+from qgs.engine.refining import mean_psnr, resized
 from qgs.geometry.poses import look_at
+from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views
 
+RENDERER = AutoRenderer(AutoRenderer.Config())
 RATES = dict.fromkeys(("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2)
 
 
@@ -58,7 +60,7 @@ def ring(views: int, side: int = 24) -> Cameras:
 def scene() -> tuple[Views, Views]:
     """Photos of a cloud of 60 Gaussians to optimise on, and others between them."""
     cameras = ring(9)
-    images = default_renderer()(cloud(60), cameras).rgb.clamp(0, 1)
+    images = RENDERER(cloud(60), cameras).rgb.clamp(0, 1)
     every = Views(images, cameras)
     return every.select([0, 1, 3, 4, 5, 7, 8]), every.select([2, 6])
 
@@ -68,11 +70,9 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene: tuple[Views, Vie
     start = cloud(40, seed=1)
     result = qgs.refine(start, photos, 150, compared=compared)
     assert result.steps == 151  # the first one, in which kernels compile, is not counted
-    assert result.curve[0].psnr == pytest.approx(
-        mean_psnr(start, compared, default_renderer()), abs=0.3
-    )
+    assert result.curve[0].psnr == pytest.approx(mean_psnr(start, compared, RENDERER), abs=0.3)
     assert result.curve[-1].psnr > result.curve[0].psnr + 6
-    final = mean_psnr(result.gaussians, compared, default_renderer())
+    final = mean_psnr(result.gaussians, compared, RENDERER)
     assert final == pytest.approx(result.curve[-1].psnr)
     assert [point.seconds for point in result.curve] == sorted(p.seconds for p in result.curve)
     assert not result.gaussians.means.requires_grad
@@ -80,7 +80,7 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene: tuple[Views, Vie
     torch.testing.assert_close(norms, torch.ones_like(norms))
 
 
-def test_the_same_seed_gives_the_same_and_what_was_given_stays(scene: tuple[Views, Views]) -> None:
+def test_the_same_start_gives_the_same_and_what_was_given_stays(scene: tuple[Views, Views]) -> None:
     start = cloud(20, seed=2)
     before = start.means.clone()
     first, second = (qgs.refine(start, scene[0], 90, count=50).gaussians for _ in range(2))
@@ -94,9 +94,9 @@ def test_there_are_as_many_as_wanted(scene: tuple[Views, Views], wanted: int) ->
     result = qgs.refine(start, scene[0], 200, count=wanted)
     assert result.gaussians.count == wanted
     if wanted < 30:
-        one_step = qgs.refine(start, scene[0], 1e-9, count=wanted).gaussians.opacities
+        two_steps = qgs.refine(start, scene[0], 1e-9, count=wanted).gaussians.opacities
         kept = start.opacities.topk(wanted).values
-        torch.testing.assert_close(one_step, kept, atol=0.03, rtol=0)
+        torch.testing.assert_close(two_steps, kept, atol=0.06, rtol=0)
 
 
 def test_an_interrupt_keeps_what_there_is(
@@ -111,20 +111,20 @@ def test_an_interrupt_keeps_what_there_is(
 
 def test_a_coarser_level_shows_the_same_scene() -> None:
     cameras = ring(3, side=64)
-    fine = default_renderer()(cloud(20), cameras).rgb
+    fine = RENDERER(cloud(20), cameras).rgb
     coarse = resized(Views(fine, cameras), 2)
     assert coarse.images.shape == (1, 3, 3, 32, 32)
-    assert mean_psnr(cloud(20), coarse, default_renderer()) > 32
+    assert mean_psnr(cloud(20), coarse, RENDERER) > 32
 
 
 def unusable() -> Iterator[Any]:
     photos, one = Views(torch.rand(1, 2, 3, 24, 24), ring(2)), cloud(4)
     two = Gaussians(*(x.expand(2, *x.shape[1:]) for x in vars(one).values()))
     broken = Gaussians(*(x * math.nan for x in vars(one).values()))
-    yield pytest.param(two, photos, {}, r"one scene.*got 2 scenes of Gaussians", id="scenes")
-    yield pytest.param(one, photos.select([]), {}, "got 0 photos and 4 Gaussians", id="photos")
-    yield pytest.param(one, photos, {"seconds": 0}, "more than 0 seconds", id="seconds")
-    yield pytest.param(one, photos, {"count": 0}, "and 0 Gaussians", id="count")
+    yield pytest.param(two, photos, {}, r"of one scene.*got 2 scenes of 4 Gaussians", id="scenes")
+    yield pytest.param(one, photos.select([]), {}, "1 scenes of 0 photos", id="photos")
+    yield pytest.param(one, photos, {"seconds": 0}, "0 seconds.*at least one of each", id="seconds")
+    yield pytest.param(one, photos, {"count": 0}, "0 Gaussians wanted", id="count")
     yield pytest.param(broken, photos, {}, "not finite", id="nan")
 
 
@@ -140,9 +140,9 @@ def test_moments_follow_their_gaussians() -> None:
     """After growth every Gaussian that was not touched learns on as before."""
     start = cloud(40)
     opacities = start.opacities.clone()
-    opacities[0, :5] = 0.001  # dead
-    opacities[0, 5:] = 0.01
-    opacities[0, 7] = 0.99  # drawn nearly always
+    opacities[0, :5] = 0.01  # dead
+    opacities[0, 5:] = 0.1
+    opacities[0, 7] = 0.99  # drawn more often
     leaves = Leaves(
         Gaussians(start.means, start.scales, start.quats, opacities, start.colors), RATES
     )
@@ -154,13 +154,13 @@ def test_moments_follow_their_gaussians() -> None:
     assert leaves.count == 44
     moved = [i for i in range(40) if not torch.equal(leaves.values["means"][i], before["means"][i])]
     assert moved == [0, 1, 2, 3, 4]
-    assert (leaves.values["opacity_logits"].sigmoid() >= 0.005 - 1e-6).all()
+    assert (leaves.values["opacity_logits"].sigmoid() >= 0.05 - 1e-6).all()
     (group,) = (g for g in leaves.optimizer.param_groups if g["name"] == "means")
     assert group["params"][0] is leaves.values["means"]
     moments = leaves.optimizer.state[group["params"][0]]["exp_avg"]
     assert moments.shape == (44, 3)
-    assert (moments[[0, 1, 2, 3, 4, 7, 40, 41, 42, 43]] == 0).all()
-    assert (moments[20:30] != 0).any()
+    assert (moments[[0, 1, 2, 3, 4, 40, 41, 42, 43]] == 0).all()
+    assert (moments[5:40] != 0).any()
     leaves.gaussians().means.sum().backward()
     leaves.optimizer.step()
 
