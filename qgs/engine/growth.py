@@ -46,14 +46,10 @@ class Leaves:
 
     def gaussians(self) -> Gaussians:
         """Gaussians (1, G) with gradients to `values`."""
-        values = self.values
-        return Gaussians(
-            values["means"][None],
-            values["log_scales"].exp()[None],
-            F.normalize(values["quats"], dim=-1)[None],
-            values["opacity_logits"].sigmoid()[None],
-            values["color_logits"].sigmoid()[None],
-        )
+        v = {name: value[None] for name, value in self.values.items()}
+        shape = v["log_scales"].exp(), F.normalize(v["quats"], dim=-1)
+        look = v["opacity_logits"].sigmoid(), v["color_logits"].sigmoid()
+        return Gaussians(v["means"], *shape, *look)
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:

@@ -18,15 +18,9 @@ from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views, map_tensors
 
-_RATES = {
-    "means": 7e-3,  # of the scene's size
-    "log_scales": 4e-2,
-    "quats": 1e-2,
-    "opacity_logits": 0.1,
-    "color_logits": 5e-2,
-}
-_LAST = {"means": 0.01}  # of the rate, at the end; others:
-_LAST_OF_OTHERS = 0.1
+_RATES = {"means": 7e-3, "log_scales": 4e-2, "quats": 1e-2}  # of means: of the scene's size
+_RATES |= {"opacity_logits": 0.1, "color_logits": 5e-2}
+_LAST, _LAST_OF_MEANS = 0.1, 0.01  # of the rates, at the end
 _SSIM = 0.25  # weight beside the mean squared error
 _SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos
 _GROWN, _SETTLED = 0.6, 0.8  # of the budget: the wanted number is there; none is moved any more
@@ -102,7 +96,9 @@ class _Run:
         self.renderer, self.wanted = renderer, wanted
         if wanted < gaussians.count:
             gaussians = gaussians[:, gaussians.opacities[0].topk(wanted).indices]
-        self.start, self.size = gaussians.count, _size_of(gaussians, views.cameras)
+        self.start, eyes = gaussians.count, views.cameras.c2w[0, :, :3, 3]
+        distances = torch.cdist(gaussians.means[0], eyes)
+        self.size = float(distances.median().clamp_min(1e-6))  # of the scene, in its units
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.leaves = Leaves(gaussians, self.rates)
         side = min(views.cameras.size)
@@ -130,12 +126,16 @@ class _Run:
         if compared is not None:
             yield self._point(compared)
 
+    def _point(self, compared: Views) -> CurvePoint:
+        quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
+        return CurvePoint(self.spent, self.step, self.leaves.count, quality)
+
     def _optimise(self) -> tuple[float, float]:
         """One step on one photo, and growth where it is due; the loss and PSNR before it."""
         used = min(self.spent / self.seconds, 1.0)
         for group in self.leaves.optimizer.param_groups:
             name = group["name"]
-            group["lr"] = self.rates[name] * _LAST.get(name, _LAST_OF_OTHERS) ** used
+            group["lr"] = self.rates[name] * (_LAST_OF_MEANS if name == "means" else _LAST) ** used
         views = next(views for views, end in self.levels if used < end or end == 1)
         if not self.order:
             self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
@@ -151,8 +151,7 @@ class _Run:
         self.leaves.optimizer.step()
         self.step += 1
         self._grow(used)
-        numbers = torch.stack([loss.detach(), error.detach()]).tolist()
-        return numbers[0], -10 * math.log10(max(numbers[1], 1e-10))
+        return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
 
     def _grow(self, used: float) -> None:
         """Relocate and add Gaussians where that is due after a step that began at `used`."""
@@ -162,10 +161,6 @@ class _Run:
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
             self.leaves.grow(now, self.generator)
-
-    def _point(self, compared: Views) -> CurvePoint:
-        quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
-        return CurvePoint(self.spent, self.step, self.leaves.count, quality)
 
 
 def resized(views: Views, part: int) -> Views:
@@ -185,12 +180,6 @@ def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
     """Mean PSNR in dB of renderings against `views` (1, V)."""
     rgb: Tensor = renderer(gaussians, views.cameras).rgb
     return float(psnr(rgb[0], views.images[0]).mean())
-
-
-def _size_of(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Median distance from a camera to a Gaussian, world units."""
-    distances = torch.cdist(gaussians.means[0].detach(), cameras.c2w[0, :, :3, 3])
-    return float(distances.median().clamp_min(1e-6))
 
 
 def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int) -> None:
