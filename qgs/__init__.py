@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from qgs.analysis.trace import trace
     from qgs.composer import compose
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
+    from qgs.engine.refining import refine
     from qgs.io.checkpoint import load, save
     from qgs.model import QueryGaussianModel
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
@@ -42,6 +43,7 @@ _ELSEWHERE = {
     "QueryGaussianModel": "qgs.model",
     "compose": "qgs.composer",
     "load": "qgs.io.checkpoint",
+    "refine": "qgs.engine.refining",
     "save": "qgs.io.checkpoint",
     "trace": "qgs.analysis.trace",
 }
@@ -59,6 +61,7 @@ __all__ = [
     "Views",
     "compose",
     "load",
+    "refine",
     "save",
     "trace",
 ]

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.sampling import Sample, make_sample, own_world
+from qgs.data.sampling import Sample, make_sample, own_world, training_frames, views_in
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
     depth_picture,
@@ -30,7 +30,7 @@ from qgs.memory import refuse_beyond_memory
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Gaussians, Rendering
+from qgs.types import Cameras, Gaussians, Rendering, Views
 from qgs.wording import listed
 
 ORBIT_FRAMES = 48
@@ -112,7 +112,7 @@ def choose_sample(
         "Take smaller photos (--size) or fewer of them (--inputs, --frames, --holdout).",
     )
     sample = make_sample(scene, *picked, views, mirror=False)
-    return sample, own_world(scene.cameras[list(picked[0])].c2w, views, scene.name)
+    return sample, own_world(scene, picked[0], views)
 
 
 def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
@@ -162,8 +162,8 @@ class ViewScore:
 class Reconstruction:
     """Gaussians (1, G) of a sample, and what its cameras see of them.
 
-    world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, None without.
-    likeness: how the views lie to those that the model was trained on, in words.
+    world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, refinement: of
+    Gaussians; None without. likeness: how the views lie to those that the model was trained on.
     """
 
     sample: Sample
@@ -172,6 +172,7 @@ class Reconstruction:
     scores: list[ViewScore]
     world: tuple[Tensor, Tensor]
     tuning: Mapping[str, Any] | None = None
+    refinement: Mapping[str, Any] | None = None
     likeness: str = ""
 
 
@@ -183,8 +184,12 @@ def reconstruct(
     seen: Collection[int] = (),
     tuned: Gaussians | None = None,
     tuning: Mapping[str, Any] | None = None,
+    refinement: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
-    """Gaussians of `sample`, rendered from its views. seen: in training. tuned: given ones."""
+    """Gaussians of `sample`, rendered from its views.
+
+    seen: in training. tuned: given Gaussians, by the tuning or the refinement that is recorded.
+    """
     gaussians: Gaussians = model(sample.inputs).gaussians if tuned is None else tuned
     rendering = model.render(gaussians, _cameras(sample))
     truth = sample.targets.images
@@ -201,7 +206,23 @@ def reconstruct(
         others = {name: values[index] for name, values in baselines.items()}
         value = quality[len(sample.input_frames) + index]
         scores.append(ViewScore(frame, kind, value, others))
-    return Reconstruction(sample, gaussians, rendering, scores, world, tuning)
+    return Reconstruction(sample, gaussians, rendering, scores, world, tuning, refinement)
+
+
+def refinement_photos(
+    scene: Scene, start: Reconstruction, inputs_only: bool
+) -> tuple[Sample, Views, list[int]]:
+    """The sample of `start` at the size of `scene`, and the photos to refine on with their frames.
+
+    These are the inputs, or all photos that are neither compared with nor held out of training.
+    """
+    inputs, targets = start.sample.input_frames, start.sample.target_frames
+    usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs} - {*targets}
+    frames = sorted(usable)
+    every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
+    photos, compared = every.select(slice(len(frames))), every.select(slice(len(frames), None))
+    own = photos.select([frames.index(frame) for frame in inputs])
+    return replace(start.sample, inputs=own, targets=compared), photos, frames
 
 
 def _cameras(sample: Sample) -> Cameras:
@@ -261,6 +282,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
         "scene": reconstruction.sample.scene,
         "tuning": reconstruction.tuning,
         "likeness": reconstruction.likeness,
+        "refinement": reconstruction.refinement,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,11 +13,13 @@ from qgs.cli.options import Checkpoint, Device, Size, parse_size
 from qgs.wording import listed
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
     from qgs.contracts import Component, Scene, Split
+    from qgs.model import QueryGaussianModel
 
 
 def reconstruct(
@@ -38,6 +40,25 @@ def reconstruct(
     tune: Annotated[
         int, typer.Option(min=0, help="Steps of token tuning on the input photos; 0 for none.")
     ] = 0,
+    refine: Annotated[
+        float | None,
+        typer.Option(help="Seconds of optimising the Gaussians on all photos not compared with."),
+    ] = None,
+    refine_size: Annotated[
+        str | None,
+        typer.Option(metavar="HxW", help="Size of the photos for --refine; default: the inputs'."),
+    ] = None,
+    refine_inputs: Annotated[
+        bool, typer.Option("--refine-inputs", help="Refine on the input photos alone.")
+    ] = False,
+    gaussians: Annotated[
+        int | None,
+        typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override of `views`, such as views.scale=auto; repeatable."),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
@@ -50,6 +71,7 @@ def reconstruct(
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
 
     Of a folder that the model was trained on, held-out photos are compared with where there are.
+    What --refine makes is written to OUT/refined, beside what the model predicted.
     """
     if out.is_file():
         raise FileExistsError(f"{out} is a file; choose a folder for --out")
@@ -58,13 +80,20 @@ def reconstruct(
             f"{out} is not empty; choose another --out, or add --overwrite to replace the files "
             "of the same names"
         )
+    if foreign := [text for text in overrides or () if not text.startswith("views.")]:
+        raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     chosen, compared = frame_list(frames, "--frames"), frame_list(holdout, "--holdout")
-    pixels = parse_size(size)
+    pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
+    refuse_unused(
+        refine,
+        {"--refine-size": fine, "--refine-inputs": refine_inputs or None, "--gaussians": gaussians},
+    )
 
     from rich.console import Console
 
     from qgs.analysis.reconstruction import choose_sample, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
+    from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
     from qgs.data.domain import KEY, Domain, verdict
     from qgs.engine.distributed import choose_device
@@ -78,6 +107,8 @@ def reconstruct(
     file, device = checkpoint_of(checkpoint), choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
     refuse_broken(model, file)
+    if overrides:
+        recipe = resolve(recipe.tree, overrides)
     registry, broken = load_sound_plugins()
     for problem in broken:
         console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
@@ -85,23 +116,65 @@ def reconstruct(
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
     sample, world = choose_sample(scene, recipe.views, inputs, chosen, compared)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    gaussians = record = None
+    tuned = record = None
     if tune:
         rate = recipe.evaluation.tuning_rate
         tuning = fit(model, sample.inputs, tuning_loss(recipe), tune, rate)
-        gaussians, before, after = tuning.prediction.gaussians, tuning.losses[0], tuning.losses[-1]
+        tuned, before, after = tuning.prediction.gaussians, tuning.losses[0], tuning.losses[-1]
         record = {"steps": tune, "rate": rate, "loss_before": before, "loss_after": after}
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
-    result = run(model, sample, world, seen, gaussians, record)
+    result = run(model, sample, world, seen, tuned, record)
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    sentence = verdict(load_extra(file).get(KEY), found)
-    result = replace(result, likeness=sentence)
-    console.print(score_table(result))
-    console.print(sentence, soft_wrap=True, highlight=False)
-    for path in write_reconstruction(model, result, out):
+    result = replace(result, likeness=verdict(load_extra(file).get(KEY), found))
+    console.print(score_table(result, "feed-forward" if refine else ""))
+    console.print(result.likeness, soft_wrap=True, highlight=False)
+    paths = write_reconstruction(model, result, out)
+    if refine:
+        if fine is not None:
+            scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
+        better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
+        console.print(score_table(better, "refined"))
+        paths += write_reconstruction(model, better, out / "refined")
+    for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
+
+
+def refined(
+    model: QueryGaussianModel, scene: Scene, start: Reconstruction, seconds: float,
+    count: int | None, inputs_only: bool, seen: Sequence[int], console: Console,
+) -> Reconstruction:  # fmt: skip
+    """The reconstruction `start`, refined on photos of `scene` at its size; see `qgs.refine`."""
+    from qgs.analysis.reconstruction import reconstruct, refinement_photos
+    from qgs.engine.refining import refine
+
+    sample, photos, frames = refinement_photos(scene, start, inputs_only)
+    before = start.gaussians
+    compared = sample.targets if sample.target_frames else None
+    result = refine(
+        before, photos, seconds, count=count, compared=compared,
+        renderer=model.renderer, console=console,
+    )  # fmt: skip
+    ended = f", ended by {result.stopped_by}" if result.stopped_by else ""
+    height, width = photos.cameras.size
+    console.print(
+        f"refined for {result.seconds:.1f} s{ended}: {result.steps} steps on {len(frames)} photos "
+        f"of {width} x {height} pixels, {before.count:,} -> {result.gaussians.count:,} Gaussians",
+        highlight=False,
+    )
+    record = {"seconds": result.seconds, "steps": result.steps, "frames": frames}
+    record |= {"stopped_by": result.stopped_by, "curve": [asdict(p) for p in result.curve]}
+    return reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
+
+
+def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:
+    """Raise ValueError for options of a refinement that is not asked for, or takes no time."""
+    given = [name for name, value in options.items() if value is not None]
+    if seconds is None and given:
+        raise ValueError(f"{listed(given)} needs --refine SECONDS: add it, such as --refine 30")
+    if seconds is not None and not 0 < seconds < float("inf"):
+        raise ValueError(f"--refine must be a number of seconds above 0, got {seconds:g}")
 
 
 def chosen_scene(
@@ -156,15 +229,19 @@ def frame_list(text: str | None, option: str) -> list[int] | None:
         ) from None
 
 
-def score_table(result: Reconstruction) -> Table:
-    """PSNR of every rendered view and of the baselines, inputs first, and the means by kind."""
+def score_table(result: Reconstruction, what: str = "") -> Table:
+    """PSNR of every rendered view and of the baselines, inputs first, and the means by kind.
+
+    what: said before the number of Gaussians.
+    """
     from rich.table import Table
 
     from qgs.analysis.reconstruction import KINDS
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
 
-    table = Table(title=f"{result.sample.scene}: {result.gaussians.count:,} Gaussians")
+    count = f"{result.gaussians.count:,} Gaussians"
+    table = Table(title=f"{result.sample.scene}: {f'{what}, {count}' if what else count}")
     table.add_column("view")
     shown = Psnr.column.shown
     for name in ("frames", Psnr.column.heading, *BASELINES):

@@ -19,11 +19,12 @@ class ViewsConfig(ComponentConfig):
     scene has, with a warning where that is below min."""
     frame: Literal["first_cam", "mean_cam"] = "first_cam"
     """The camera that becomes the identity: the first input, or the mean of the inputs."""
-    scale: Literal["constant", "distance"] = "constant"
+    scale: Literal["constant", "distance", "auto"] = "constant"
     """Translations are multiplied by `scale_factor`; with "distance", they are divided by the
-    largest distance from the first input camera to another one before."""
+    largest distance from the first input camera to another one before. "auto" takes one factor per
+    scene, which brings the point nearest to the optical axes of all its cameras to a depth of 1."""
     scale_factor: float = Field(default=0.15, gt=0)
-    """Factor of all translations, see `scale`."""
+    """Factor of all translations, see `scale`; no effect with "auto"."""
     mirror: float = Field(default=0.5, ge=0, le=1)
     """Probability of mirroring a training sample in x."""
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from qgs.contracts import SceneSource, ViewsConfig
 from qgs.data.stream import training_batches
-from qgs.geometry.precision import full_precision
+from qgs.geometry.poses import look_at_depth
 from qgs.types import Cameras
 
 SAMPLES = 256
@@ -26,7 +26,6 @@ TOLERANCE = 1.1
 """Views are outside where they leave the trained range by more than this factor."""
 KEY = "trained_on"
 """Where a checkpoint's extra metadata holds `Domain.text`."""
-_LEAST_ANGLE = math.radians(0.5)
 
 WORDS = {
     "views": "there are {} input views",
@@ -119,27 +118,10 @@ def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]
         axes = c2w[..., :3, 2]
         cosines = (axes @ axes.transpose(-2, -1)).amin((-2, -1)).clamp(-1, 1)
         yield "turn", cosines.arccos().rad2deg()
-    yield "depth", look_at_depth(torch.cat([inputs.c2w, targets.c2w], 1))
+    depths = torch.stack([look_at_depth(c2w) for c2w in torch.cat([inputs.c2w, targets.c2w], 1)])
+    yield "depth", torch.where(depths > 0, depths, math.inf)
     halves = inputs.size[1] / 2 / inputs.intrinsics[..., 0].double()
     yield "fov", 2 * halves.arctan().rad2deg()
-
-
-@full_precision
-def look_at_depth(c2w: Tensor) -> Tensor:
-    """Mean distance of cameras (B, V, 4, 4) to the point nearest to all their axes: (B,).
-
-    Infinite where the axes are parallel, by half a degree, or do not meet before the cameras.
-    """
-    centres, axes = c2w[..., :3, 3].double(), c2w[..., :3, 2].double()
-    across = (
-        torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[..., None] * axes[..., None, :]
-    )
-    matrix, right = across.sum(1), (across @ centres[..., None]).sum(1)
-    spread = torch.linalg.eigvalsh(matrix)[..., 0] / c2w.shape[1]
-    point = torch.linalg.lstsq(matrix, right).solution.transpose(-2, -1)
-    depth = ((point - centres) * axes).sum(-1).mean(-1)
-    known = (spread > math.sin(_LEAST_ANGLE / 2) ** 2) & (depth > 0)
-    return torch.where(known, depth, math.inf)
 
 
 def _inside(found: tuple[float, float], trained: tuple[float, float]) -> bool:

@@ -18,6 +18,7 @@ from qgs.data.scenes import warn_once
 from qgs.geometry.poses import (
     first_camera,
     largest_distance,
+    look_at_depth,
     mean_camera,
     mirrored,
     relative_to,
@@ -126,43 +127,77 @@ def make_sample(
     scene: Scene, input_frames: Frames, target_frames: Frames, views: ViewsConfig, mirror: bool
 ) -> Sample:
     """Decode frames, normalise poses in the scene's precision, mirror if asked; float32."""
-    frames = (*input_frames, *target_frames)
-    refuse_too_many(len(frames), scene)
-    wanted = sorted(set(frames))
-    place = {frame: i for i, frame in enumerate(wanted)}
-    order = [place[frame] for frame in frames]
-    images, masks = scene.images(wanted), scene.masks(wanted)
-    cameras = scene.cameras[list(frames)]
-    reference, scale = own_world(cameras.c2w[: len(input_frames)], views, scene.name)
-    c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
-    both = Views(
-        torch.from_numpy(images.numpy()[order])[None],
-        Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
-        None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
-    )
+    world = own_world(scene, input_frames, views)
+    both = views_in(world, scene, (*input_frames, *target_frames))
     both = mirrored_views(both) if mirror else both
     count = len(input_frames)
     inputs, targets = both.select(slice(0, count)), both.select(slice(count, None))
     return Sample(scene.name, inputs, targets, input_frames, target_frames)
 
 
-def own_world(c2w: Tensor, views: ViewsConfig, scene: str = "") -> tuple[Tensor, Tensor]:
-    """The world in which a model sees inputs with poses c2w (V, 4, 4): reference pose and scale.
+def views_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Views:
+    """Views (1, F) of these frames in a world as of `own_world`, float32."""
+    refuse_too_many(len(frames), scene)
+    wanted = sorted(set(frames))
+    place = {frame: i for i, frame in enumerate(wanted)}
+    order = [place[frame] for frame in frames]
+    images, masks = scene.images(wanted), scene.masks(wanted)
+    cameras = scene.cameras[list(frames)]
+    reference, scale = world
+    c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
+    return Views(
+        torch.from_numpy(images.numpy()[order])[None],
+        Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
+        None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
+    )
+
+
+def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[Tensor, Tensor]:
+    """The world in which a model sees these inputs of `scene`: reference pose and scale.
 
     A point p of it is, in the scene's world, the reference (4, 4) applied to p / scale (0-d).
-    Raises ValueError for `scale: distance` when the input cameras stand on one point.
+    Raises ValueError for `scale: distance` when the input cameras stand on one point, and as
+    `auto_scale`.
     """
+    every = scene.cameras.c2w
+    c2w = every[list(input_frames)]
     reference = (first_camera if views.frame == "first_cam" else mean_camera)(c2w)
+    if views.scale == "auto":
+        return reference, auto_scale(every, scene.name)
     factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
     if views.scale == "distance":
         distance = largest_distance(relative_to(reference, c2w))
         if not distance > 0:
             raise ValueError(
-                f"views.scale is 'distance', but the input cameras of scene {scene!r} stand on one "
-                "point: use at least two inputs that moved, or `scale: constant`"
+                f"views.scale is 'distance', but the input cameras of scene {scene.name!r} stand "
+                "on one point: use at least two inputs that moved, or `scale: constant`"
             )
         factor = factor / distance
     return reference, factor
+
+
+def auto_scale(c2w: Tensor, scene: str) -> Tensor:
+    """The factor that brings what all cameras c2w (F, 4, 4) of `scene` look at to a depth of 1.
+
+    Where they look at nothing in common (see `look_at_depth`), a warning says so, and the largest
+    distance from the first camera to another one becomes 1. 0-d. Raises ValueError when all stand
+    on one point.
+    """
+    depth = look_at_depth(c2w)
+    if depth > 0:
+        return 1 / depth
+    distance = largest_distance(c2w)
+    if not distance > 0:
+        raise ValueError(
+            f"views.scale is 'auto', but all cameras of scene {scene!r} stand on one point: "
+            "use `scale: constant`"
+        )
+    warn_once(
+        f"the cameras of scene {scene!r} look at no common point, so views.scale: auto makes the "
+        f"largest distance from the first one 1, a factor of {1 / float(distance):.4g}; if what "
+        "they see comes out too near or too far, give `scale: constant` and a scale_factor"
+    )
+    return 1 / distance
 
 
 def mirrored_views(views: Views) -> Views:

@@ -197,7 +197,7 @@ class Evaluation:
         yield (
             f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
             f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
-            f"{poses['scale']} {poses['scale_factor']}"
+            f"{poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         )
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_MOST_MISSING])
         if len(self.missing) > _MOST_MISSING:

@@ -1,10 +1,14 @@
 """Poses in the frame and scale that the model expects (TokenGS release)."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.precision import full_precision
+
+_PARALLEL = 3e-4  # mean squared sine of the axes' angles to their mean; 1 degree
 
 
 @full_precision
@@ -54,6 +58,27 @@ def largest_distance(c2w: Tensor) -> Tensor:
     """Largest distance from the first camera to another one. c2w (..., V, 4, 4) -> (...)."""
     centres = c2w[..., :3, 3]
     return (centres - centres[..., :1, :]).norm(dim=-1).amax(-1)
+
+
+@full_precision
+def look_at_depth(c2w: Tensor) -> Tensor:
+    """Median depth at which cameras c2w (V, 4, 4) see the point nearest to their optical axes.
+
+    The point is that of least squared distances. 0 where there is none: the axes are parallel to
+    within about a degree, or for more than every fourth camera the point lies behind it or more
+    than 30 degrees off its axis. 0-d.
+    """
+    axes, centres = c2w[:, :3, 2], c2w[:, :3, 3]
+    across = torch.eye(3).to(c2w) - axes[:, :, None] * axes[:, None]
+    middle = centres.mean(0)
+    normal, right = across.mean(0), (across @ (centres - middle)[..., None]).mean(0)[:, 0]
+    if torch.linalg.eigvalsh(normal)[0] < _PARALLEL:
+        return c2w.new_zeros(())
+    point = middle + torch.linalg.solve(normal, right)
+    ways = point - centres
+    depths = (ways * axes).sum(-1)
+    ahead = depths > math.cos(math.radians(30)) * ways.norm(dim=-1)
+    return depths.median() if ahead.float().mean() >= 0.75 else c2w.new_zeros(())
 
 
 @full_precision

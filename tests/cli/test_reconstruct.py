@@ -1,4 +1,5 @@
 import json
+import re
 from functools import partial
 
 import numpy as np
@@ -144,3 +145,65 @@ def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tm
     files = [(tmp_path / name / "gaussians.ply").read_bytes() for name in ("plain", "tuned")]
     assert files[0] != files[1]
     assert checkpoint.read_bytes() == weights
+
+
+def test_a_refined_scene_lies_beside_the_prediction(checkpoint, photos, tmp_path):
+    more = ("--refine", 0.5, "--gaussians", 50, "--refine-size", "20x24")
+    result = run(checkpoint, photos, "--out", tmp_path, *more)
+    assert result.exception is None, result.exception
+    for said in ("feed-forward, 32 Gaussians", "refined, 50 Gaussians", "on 4 photos of 24 x 20"):
+        assert said in " ".join(result.output.split())
+    first, refined = (
+        json.loads((tmp_path / name / "cameras.json").read_text()) for name in (".", "refined")
+    )
+    assert [view["frame"] for view in first["views"]] == [1, 5, 2, 3, 4]
+    assert [view["frame"] for view in refined["views"]] == [1, 5, 2, 3, 4]
+    assert (first["views"][0]["size"], refined["views"][0]["size"]) == ([16, 16], [20, 24])
+    assert first["refinement"] is None
+    assert refined["refinement"]["frames"] == [0, 1, 5, 6]
+    assert refined["refinement"]["curve"][-1]["gaussians"] == 50
+    assert refined["to_photos"] == first["to_photos"]
+    assert PlyData.read(tmp_path / "gaussians.ply")["vertex"].count == 32
+    assert PlyData.read(tmp_path / "refined" / "gaussians.ply")["vertex"].count == 50
+
+
+def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photos, tmp_path):
+    data = {"type": "qgs/photos", "path": str(photos), "image_size": [16, 16], "holdout": 3}
+    file = tmp_path / "checkpoint.safetensors"
+    qgs.save(qgs.compose({**RECIPE, "data": data}), file)
+    cases = {"all": ((), [0, 2, 5, 6]), "inputs": (("--refine-inputs",), [0, 6])}
+    for name, (more, frames) in cases.items():
+        chosen = ("--frames", "0,6", "--holdout", "1,3", "--refine", 0.05)
+        assert run(file, photos, "--out", tmp_path / name, *chosen, *more).exception is None
+        record = json.loads((tmp_path / name / "refined" / "cameras.json").read_text())
+        assert record["refinement"]["frames"] == frames  # 4 was held out of training
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--gaussians", 50), "--gaussians needs --refine SECONDS"),
+        (("--refine-inputs",), "--refine-inputs needs --refine"),
+        (("--refine", 0), "--refine must be a number of seconds above 0, got 0"),
+        (("--refine", 1, "--refine-size", "64"), "--refine-size must be HxW"),
+        (("--set", "views.scale=big"), "views.scale.*'big'"),
+        (("--set", "data.path=x"), "--set changes `views` alone here, got data.path=x"),
+    ],
+)
+def test_options_of_a_refinement_that_make_no_sense_are_refused(
+    checkpoint, photos, tmp_path, options, said
+):
+    result = run(checkpoint, photos, "--out", tmp_path / "out", *options)
+    assert re.search(said, str(result.exception))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_world_is_scaled_as_asked_for(checkpoint, photos, tmp_path, caplog):
+    cases = {"scale_factor=0.5": 0.5, "scale=auto": 1 / 0.6}  # a row of 7, 0.1 apart, looks ahead
+    for setting, factor in cases.items():
+        out = tmp_path / setting
+        options = ("--out", out, "--set", f"views.{setting}")
+        assert run(checkpoint, photos, *options).exception is None
+        record = json.loads((out / "cameras.json").read_text())
+        assert record["to_photos"]["scale"] == pytest.approx(factor)
+    assert "look at no common point" in caplog.text

@@ -9,6 +9,7 @@ from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views
 from qgs.data.stream import training_batches
+from qgs.geometry.poses import look_at, look_at_depth
 from qgs.types import Cameras, Views
 
 
@@ -187,3 +188,45 @@ def test_a_gap_below_the_smallest_is_told_once(caplog):
         "scene 'line7' has 7 frames for inputs, fewer than views.gap [10, 40] asks for: its gap is "
         "6"
     ]
+
+
+class Around(Line):
+    """Cameras on a circle about the origin, at a distance of 4, that look at it."""
+
+    @property
+    def cameras(self) -> Cameras:
+        angles = torch.linspace(0, 3, self.count, dtype=torch.float64)
+        eyes = 4 * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
+        c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand_as(eyes).double())
+        return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
+
+
+def test_auto_brings_what_all_cameras_look_at_to_depth_1(caplog):
+    views = ViewsConfig(inputs=2, scale="auto", scale_factor=7.0)
+    sample = make_sample(Around(9), (2, 3), (5,), views, False)
+    for side in (sample.inputs, sample.targets):
+        seen = side.cameras.w2c[0] @ torch.tensor([0.0, 0, 1, 1])
+        torch.testing.assert_close(seen[:, 2], torch.ones(len(seen)))
+    apart = make_sample(Line(9), (2, 3), (5,), views, False).inputs.cameras.c2w[0, 1, 0, 3]
+    assert apart == pytest.approx(1 / 8)  # of the scene's extent: the axes are parallel
+    assert "'line9' look at no common point" in caplog.text
+    with pytest.raises(ValueError, match="all cameras of scene 'line5' stand on one point"):
+        make_sample(Line(5, step=0.0), (0, 3), (1,), views, False)
+
+
+def test_a_point_behind_or_beside_the_cameras_is_not_looked_at():
+    around = Around(9).cameras.c2w
+    assert look_at_depth(around) == pytest.approx(4)
+    outwards = around @ torch.diag(torch.tensor([-1.0, 1, -1, 1])).double()
+    assert look_at_depth(outwards) == 0
+    one_astray = torch.cat([around, outwards[:1]])
+    assert look_at_depth(one_astray) == pytest.approx(4, rel=0.01)
+    sides = torch.tensor([-20.0, 20, 0])
+    walk = torch.eye(4).repeat(3, 1, 1)
+    walk[:, 0, 3] = 10 * sides
+    walk[:, :3, :3] = look_at(
+        torch.zeros(3, 3), torch.stack([-sides / 40, 0 * sides, 1 + 0 * sides], -1),
+        torch.tensor([0.0, 1, 0]).expand(3, 3),
+    )[:, :3, :3]  # fmt: skip
+    assert look_at_depth(walk[:2]) == pytest.approx(200 * 5**0.5)
+    assert look_at_depth(walk[:, :3]) == look_at_depth(walk)

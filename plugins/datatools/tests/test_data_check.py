@@ -2,7 +2,11 @@ import re
 import shutil
 
 import pytest
+import torch
 from commands import run_qgs
+from qgs_datatools.check import CheckReport, SceneReport
+
+from qgs.geometry.poses import look_at
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +36,33 @@ def test_a_sound_set_has_exit_code_0_and_a_table(sound):
         r"scene +format +frames +decodable +missing +bad poses +epipolar px", lines[0].strip()
     )
     assert re.fullmatch(r"room +nerfstudio +6 +6 +0 +0 +0\.\d\d", lines[1].strip())
+    assert lines[-2] == (
+        "note: views.scale: auto finds no common point that the cameras look at in room"
+    )
     assert lines[-1] == f"{sound}: 1 scene, 0 errors, 0 warnings"
+
+
+def around(name, radius):
+    """A scene of cameras that look at the origin from a circle."""
+    angles = torch.linspace(0, 2, 7)
+    eyes = radius * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
+    c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand(7, 3))
+    return SceneReport(name, name, "colmap", c2w=c2w[:, :3].numpy())
+
+
+@pytest.mark.parametrize(
+    ("scenes", "said"),
+    [
+        ([around("a", 4)], "is a factor of 0.25"),
+        ([around("a", 4), around("b", 2)], "is a factor of 0.375, from 0.25 to 0.5"),
+        (
+            [around("a", 4), SceneReport("walk", "walk", "colmap")],
+            "is a factor of 0.25 and finds no common point that the cameras look at in walk",
+        ),
+    ],
+)
+def test_the_factor_of_an_automatic_scale_is_told(scenes, said):
+    assert CheckReport("", scenes, [], [], 0, []).auto_scale == f"views.scale: auto {said}"
 
 
 def test_errors_have_exit_code_1_and_one_line_each(broken):

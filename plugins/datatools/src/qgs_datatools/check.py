@@ -8,9 +8,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 from upath import UPath
 
 from qgs.data.photos import READERS, Format, read_listing
+from qgs.geometry.poses import look_at_depth
 from qgs.wording import listed
 from qgs_datatools.cameras import camera_findings, sharing_findings
 from qgs_datatools.candidates import Candidate
@@ -66,6 +68,11 @@ class SceneReport:
         return len(errors_of(self.findings))
 
     @property
+    def look_at_depth(self) -> float:
+        """Depth of what the cameras look at, scene units; 0 where that is no common point."""
+        return float(look_at_depth(torch.from_numpy(self.c2w))) if len(self.c2w) > 1 else 0.0
+
+    @property
     def epipolar(self) -> str:
         """Median distance of matches to epipolar lines in pixels, or why there is none."""
         if self.geometry is None:
@@ -85,6 +92,20 @@ class CheckReport:
     indices: Sequence[str]
     judged: int
     notes: Sequence[str]
+
+    @property
+    def auto_scale(self) -> str:
+        """The factors of `views.scale: auto` in words; empty without scenes."""
+        depths = [scene.look_at_depth for scene in self.scenes]
+        factors = sorted(1 / depth for depth in depths if depth)
+        none = [scene.name for scene in self.scenes if not scene.look_at_depth]
+        said = []
+        if factors:
+            middle, ends = np.median(factors), f", from {factors[0]:.4g} to {factors[-1]:.4g}"
+            said += [f"is a factor of {middle:.4g}{ends if len(factors) > 1 else ''}"]
+        if none:
+            said += [f"finds no common point that the cameras look at in {listed(none)}"]
+        return f"views.scale: auto {' and '.join(said)}" if said else ""
 
     @property
     def findings(self) -> list[Finding]:

@@ -81,7 +81,7 @@ def _print(console: Console, result: CheckReport) -> None:
         _line(console, str(finding))
     for summary in result.indices:
         _line(console, f"index {summary}")
-    for note in result.notes:
+    for note in [*result.notes, *filter(None, [result.auto_scale])]:
         _line(console, f"note: {note}")
     warnings = len(result.findings) - result.errors
     counts = {"scene": len(result.scenes), "error": result.errors, "warning": warnings}

@@ -1,0 +1,197 @@
+"""Refinement: Gaussians of one scene, optimised on its photos as 3D Gaussian splatting does."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import torch
+import torch.nn.functional as F
+from rich.console import Console
+from torch import Tensor, nn
+
+from qgs.engine.distributed import StopRequest, stop_requests
+from qgs.engine.growth import Leaves
+from qgs.engine.tracking import TrainingProgress
+from qgs.losses.photometric import mean_squared_error, mean_ssim
+from qgs.metrics.images import psnr
+from qgs.renderers import AutoRenderer
+from qgs.types import Cameras, Gaussians, Views, map_tensors
+
+_RATES = {"means": 7e-3, "log_scales": 4e-2, "quats": 1e-2}  # of means: of the scene's size
+_RATES |= {"opacity_logits": 0.1, "color_logits": 5e-2}
+_LAST, _LAST_OF_MEANS = 0.1, 0.01  # of the rates, at the end
+_SSIM = 0.25  # weight beside the mean squared error
+_SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos
+_GROWN, _SETTLED = 0.6, 0.8  # of the budget: the wanted number is there; none is moved any more
+_STEPS_BETWEEN_GROWTHS = 40
+_LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))  # part of the resolution, up to this part of the budget
+_LEAST_SIDE = 64  # pixels: no level is smaller
+_POINTS = 12  # of the curve
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """How far a refinement was. psnr: dB, mean over the photos that it is compared with."""
+
+    seconds: float
+    step: int
+    gaussians: int
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Refined Gaussians (1, G). curve: from the start on; empty without photos to compare with.
+
+    seconds: on the clock, evaluations left out. stopped_by: name of the signal that ended it early.
+    """
+
+    gaussians: Gaussians
+    curve: Sequence[CurvePoint]
+    steps: int
+    seconds: float
+    stopped_by: str | None = None
+
+
+def refine(
+    gaussians: Gaussians,
+    views: Views,
+    seconds: float,
+    *,
+    count: int | None = None,
+    compared: Views | None = None,
+    renderer: nn.Module | None = None,
+    console: Console | None = None,
+) -> Refinement:
+    """Go on from `gaussians` (1, G) by optimising them on the photos `views` (1, V).
+
+    seconds: of optimisation, counted after the first step, in which kernels compile. count:
+    Gaussians wanted at the end, as many as given by default; more grow within the first part of the
+    time, of fewer the most opaque are kept. compared: photos (1, W) for the curve, never optimised
+    on. renderer: `qgs/auto` by default. console: where progress is shown; nowhere by default.
+    The first Ctrl-C finishes the step and returns what there is. Any world will do: its size is
+    measured by the distance of the Gaussians from the cameras.
+
+    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
+    """
+    wanted = gaussians.count if count is None else count
+    _refuse_unusable(gaussians, views, seconds, wanted)
+    quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
+    with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
+        renderer = renderer or AutoRenderer(AutoRenderer.Config())
+        run = _Run(gaussians, views, seconds, wanted, renderer)
+        curve = list(run.curve(compared, progress, stop))
+        name = stop.signal.name if stop.signal else None
+        refined = map_tensors(Tensor.detach, run.leaves.gaussians())
+        return Refinement(refined, curve, run.step, run.spent, name)
+
+
+class _Run:
+    """One refinement: its Gaussians, photos by level of resolution, and clock."""
+
+    def __init__(
+        self, gaussians: Gaussians, views: Views, seconds: float, wanted: int, renderer: nn.Module
+    ) -> None:
+        self.renderer, self.wanted = renderer, wanted
+        if wanted < gaussians.count:
+            gaussians = gaussians[:, gaussians.opacities[0].topk(wanted).indices]
+        self.start, eyes = gaussians.count, views.cameras.c2w[0, :, :3, 3]
+        distances = torch.cdist(gaussians.means[0], eyes)
+        self.size = float(distances.median().clamp_min(1e-6))  # of the scene, in its units
+        self.rates = {**_RATES, "means": _RATES["means"] * self.size}
+        self.leaves = Leaves(gaussians, self.rates)
+        side = min(views.cameras.size)
+        levels = [level for level in _LEVELS if level[0] == 1 or side // level[0] >= _LEAST_SIDE]
+        self.levels = [(resized(views, part), end) for part, end in levels]
+        self.seconds, self.step, self.spent, self.grown = seconds, 0, 0.0, 0
+        self.generator = torch.Generator().manual_seed(0)
+        self.order: list[int] = []
+
+    def curve(
+        self, compared: Views | None, progress: TrainingProgress, stop: StopRequest
+    ) -> Iterator[CurvePoint]:
+        """Optimise until the time is used or a stop is asked for; points of the curve between."""
+        due = 0.0
+        while self.spent < self.seconds and not stop:
+            if compared is not None and self.spent >= due:
+                due = (self.spent // (self.seconds / _POINTS) + 1) * self.seconds / _POINTS
+                yield self._point(compared)
+            began = perf_counter()
+            loss, quality = self._optimise()
+            if self.step > 1:  # the first one compiles
+                self.spent += perf_counter() - began
+            used = self.spent / self.seconds
+            progress.update(self.step, loss, quality, self.step, self.spent, used)
+        if compared is not None:
+            yield self._point(compared)
+
+    def _point(self, compared: Views) -> CurvePoint:
+        quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
+        return CurvePoint(self.spent, self.step, self.leaves.count, quality)
+
+    def _optimise(self) -> tuple[float, float]:
+        """One step on one photo, and growth where it is due; the loss and PSNR before it."""
+        used = min(self.spent / self.seconds, 1.0)
+        for group in self.leaves.optimizer.param_groups:
+            name = group["name"]
+            group["lr"] = self.rates[name] * (_LAST_OF_MEANS if name == "means" else _LAST) ** used
+        views = next(views for views, end in self.levels if used < end or end == 1)
+        if not self.order:
+            self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
+        photo = views.select([self.order.pop()])
+        gaussians = self.leaves.gaussians()
+        rgb = self.renderer(gaussians, photo.cameras).rgb
+        error = mean_squared_error(rgb, photo.images)
+        loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
+        spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
+        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread
+        self.leaves.optimizer.zero_grad()
+        loss.backward()
+        self.leaves.optimizer.step()
+        self.step += 1
+        self._grow(used)
+        return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
+
+    def _grow(self, used: float) -> None:
+        """Relocate and add Gaussians where that is due after a step that began at `used`."""
+        regular = self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED
+        if regular or (used >= _GROWN and self.leaves.count < self.wanted):
+            self.grown = self.step
+            share = min(used / _GROWN, 1.0)
+            now = round(self.start * (self.wanted / self.start) ** share)
+            self.leaves.grow(now, self.generator)
+
+
+def resized(views: Views, part: int) -> Views:
+    """The views at 1/part of their resolution, by means over areas."""
+    if part == 1:
+        return views
+    height, width = views.cameras.size
+    size = height // part, width // part
+    images = F.interpolate(views.images[0], size=size, mode="area")[None]
+    factors = [size[1] / width, size[0] / height]
+    intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
+    return Views(images, Cameras(views.cameras.c2w, intrinsics, size))
+
+
+@torch.no_grad()
+def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
+    """Mean PSNR in dB of renderings against `views` (1, V)."""
+    rgb: Tensor = renderer(gaussians, views.cameras).rgb
+    return float(psnr(rgb[0], views.images[0]).mean())
+
+
+def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int) -> None:
+    given = (*gaussians.means.shape[:2], *views.images.shape[:2])
+    if given[0] != 1 or given[2] != 1 or 0 in given or not seconds > 0 or count < 1:
+        raise ValueError(
+            "refinement takes Gaussians (1, G) and photos (1, V) of one scene, and some time; got "
+            "{} scenes of {} Gaussians, {} scenes of {} photos".format(*given)
+            + f", {seconds:g} seconds, {count} Gaussians wanted: give at least one of each"
+        )
+    if not all(bool(tensor.isfinite().all()) for tensor in vars(gaussians).values()):
+        raise ValueError(
+            "some Gaussians are not finite, so they cannot be refined: the model that predicted "
+            "them is broken, or its photos are far from what it was trained on"
+        )

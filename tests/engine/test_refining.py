@@ -1,0 +1,173 @@
+"""Refinement: Gaussians come nearer to the photos of their scene, on a clock that tests turn."""
+
+import math
+import os
+import signal
+from collections.abc import Callable, Iterator
+from itertools import count
+from typing import Any
+
+import pytest
+import torch
+
+import qgs
+from qgs.engine.growth import Leaves
+from qgs.engine.refining import mean_psnr, resized
+from qgs.geometry.poses import look_at
+from qgs.renderers import AutoRenderer
+from qgs.types import Cameras, Gaussians, Views
+
+RENDERER = AutoRenderer(AutoRenderer.Config())
+RATES = dict.fromkeys(("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2)
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], Any]], None]:
+    """Every step takes a second; a function given to this is called at each reading."""
+    hooks: list[Callable[[int], Any]] = []
+    readings = count()
+
+    def read() -> float:
+        now = next(readings)
+        for hook in hooks:
+            hook(now)
+        return float(now)
+
+    monkeypatch.setattr("qgs.engine.refining.perf_counter", read)
+    return hooks.append
+
+
+def cloud(number: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    means = 0.3 * torch.randn(1, number, 3, generator=generator)
+    scales = 0.05 + 0.1 * torch.rand(1, number, 3, generator=generator)
+    quats = torch.nn.functional.normalize(torch.randn(1, number, 4, generator=generator), dim=-1)
+    opacities = 0.3 + 0.6 * torch.rand(1, number, generator=generator)
+    return Gaussians(means, scales, quats, opacities, torch.rand(1, number, 3, generator=generator))
+
+
+def ring(views: int, side: int = 24) -> Cameras:
+    """Cameras (1, views) on a quarter of a circle of radius 2 about the origin."""
+    angles = torch.linspace(0, math.pi / 2, views)
+    eyes = 2 * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
+    c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand(views, 3))
+    middle = [side / 2, side / 2]
+    intrinsics = torch.tensor([side, side, *middle]).float().expand(1, views, 4)
+    return Cameras(c2w[None], intrinsics, (side, side))
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Views, Views]:
+    """Photos of a cloud of 60 Gaussians to optimise on, and others between them."""
+    cameras = ring(9)
+    images = RENDERER(cloud(60), cameras).rgb.clamp(0, 1)
+    every = Views(images, cameras)
+    return every.select([0, 1, 3, 4, 5, 7, 8]), every.select([2, 6])
+
+
+def test_photos_that_are_not_optimised_on_are_met_better(scene: tuple[Views, Views]) -> None:
+    photos, compared = scene
+    start = cloud(40, seed=1)
+    result = qgs.refine(start, photos, 150, compared=compared)
+    assert result.steps == 151  # the first one, in which kernels compile, is not counted
+    assert result.curve[0].psnr == pytest.approx(mean_psnr(start, compared, RENDERER), abs=0.3)
+    assert result.curve[-1].psnr > result.curve[0].psnr + 6
+    final = mean_psnr(result.gaussians, compared, RENDERER)
+    assert final == pytest.approx(result.curve[-1].psnr)
+    assert [point.seconds for point in result.curve] == sorted(p.seconds for p in result.curve)
+    assert not result.gaussians.means.requires_grad
+    norms = result.gaussians.quats.norm(dim=-1)
+    torch.testing.assert_close(norms, torch.ones_like(norms))
+
+
+def test_the_same_start_gives_the_same_and_what_was_given_stays(scene: tuple[Views, Views]) -> None:
+    start = cloud(20, seed=2)
+    before = start.means.clone()
+    first, second = (qgs.refine(start, scene[0], 90, count=50).gaussians for _ in range(2))
+    assert torch.equal(first.means, second.means)
+    assert torch.equal(start.means, before)
+
+
+@pytest.mark.parametrize("wanted", [90, 12, 30])
+def test_there_are_as_many_as_wanted(scene: tuple[Views, Views], wanted: int) -> None:
+    start = cloud(30)
+    result = qgs.refine(start, scene[0], 200, count=wanted)
+    assert result.gaussians.count == wanted
+    if wanted < 30:
+        two_steps = qgs.refine(start, scene[0], 1e-9, count=wanted).gaussians.opacities
+        kept = start.opacities.topk(wanted).values
+        torch.testing.assert_close(two_steps, kept, atol=0.06, rtol=0)
+
+
+def test_an_interrupt_keeps_what_there_is(
+    scene: tuple[Views, Views], clock: Callable[[Callable[[int], Any]], None]
+) -> None:
+    clock(lambda now: os.kill(os.getpid(), signal.SIGINT) if now == 11 else None)
+    result = qgs.refine(cloud(30), scene[0], 1000)
+    assert result.stopped_by == "SIGINT"
+    assert result.steps == 7  # that of the twelfth reading is finished
+    assert result.gaussians.count == 30
+
+
+def test_a_coarser_level_shows_the_same_scene() -> None:
+    cameras = ring(3, side=64)
+    fine = RENDERER(cloud(20), cameras).rgb
+    coarse = resized(Views(fine, cameras), 2)
+    assert coarse.images.shape == (1, 3, 3, 32, 32)
+    assert mean_psnr(cloud(20), coarse, RENDERER) > 32
+
+
+def unusable() -> Iterator[Any]:
+    photos, one = Views(torch.rand(1, 2, 3, 24, 24), ring(2)), cloud(4)
+    two = Gaussians(*(x.expand(2, *x.shape[1:]) for x in vars(one).values()))
+    broken = Gaussians(*(x * math.nan for x in vars(one).values()))
+    yield pytest.param(two, photos, {}, r"of one scene.*got 2 scenes of 4 Gaussians", id="scenes")
+    yield pytest.param(one, photos.select([]), {}, "1 scenes of 0 photos", id="photos")
+    yield pytest.param(one, photos, {"seconds": 0}, "0 seconds.*at least one of each", id="seconds")
+    yield pytest.param(one, photos, {"count": 0}, "0 Gaussians wanted", id="count")
+    yield pytest.param(broken, photos, {}, "not finite", id="nan")
+
+
+@pytest.mark.parametrize(("gaussians", "views", "options", "message"), [*unusable()])
+def test_what_cannot_be_refined_is_refused(
+    gaussians: Gaussians, views: Views, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        qgs.refine(gaussians, views, **{"seconds": 1, **options})
+
+
+def test_moments_follow_their_gaussians() -> None:
+    """After growth every Gaussian that was not touched learns on as before."""
+    start = cloud(40)
+    opacities = start.opacities.clone()
+    opacities[0, :5] = 0.01  # dead
+    opacities[0, 5:] = 0.1
+    opacities[0, 7] = 0.99  # drawn more often
+    leaves = Leaves(
+        Gaussians(start.means, start.scales, start.quats, opacities, start.colors), RATES
+    )
+    loss = leaves.gaussians().means.sum() + leaves.gaussians().opacities.sum()
+    loss.backward()
+    leaves.optimizer.step()
+    before = {name: value.detach().clone() for name, value in leaves.values.items()}
+    leaves.grow(44, torch.Generator().manual_seed(0))
+    assert leaves.count == 44
+    moved = [i for i in range(40) if not torch.equal(leaves.values["means"][i], before["means"][i])]
+    assert moved == [0, 1, 2, 3, 4]
+    assert (leaves.values["opacity_logits"].sigmoid() >= 0.05 - 1e-6).all()
+    (group,) = (g for g in leaves.optimizer.param_groups if g["name"] == "means")
+    assert group["params"][0] is leaves.values["means"]
+    moments = leaves.optimizer.state[group["params"][0]]["exp_avg"]
+    assert moments.shape == (44, 3)
+    assert (moments[[0, 1, 2, 3, 4, 40, 41, 42, 43]] == 0).all()
+    assert (moments[5:40] != 0).any()
+    leaves.gaussians().means.sum().backward()
+    leaves.optimizer.step()
+
+
+def test_where_none_is_alive_none_is_moved() -> None:
+    start = cloud(6)
+    dead = Gaussians(start.means, start.scales, start.quats, 0 * start.opacities, start.colors)
+    leaves = Leaves(dead, RATES)
+    leaves.grow(9, torch.Generator())
+    assert leaves.count == 6
