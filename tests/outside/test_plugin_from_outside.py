@@ -31,6 +31,14 @@ def test_qgs_comes_from_its_wheel(fresh: FreshEnvironment, tmp_path: Path) -> No
     assert not list(fresh.folder.rglob(ROOT.name)), "nothing of the source tree"
 
 
+def test_recipes_come_with_the_wheel(fresh: FreshEnvironment, tmp_path: Path) -> None:
+    assert "tiny/locus.yaml" in fresh.run("qgs recipes", tmp_path)
+    listed = fresh.run("qgs compose rooms/locus_64.yaml", tmp_path)
+    assert f"{fresh.folder}" in listed
+    fresh.run("qgs recipes rooms/locus_64.yaml --out mine", tmp_path)
+    assert f"{fresh.folder}" not in fresh.run("qgs compose mine/rooms/locus_64.yaml", tmp_path)
+
+
 def test_its_tests_pass(fresh: FreshEnvironment, plugin: Path) -> None:
     output = fresh.run("python -m pytest -q", plugin)
     assert " passed" in output
