@@ -47,6 +47,14 @@ def test_every_recipe_resolves_to_itself_and_builds_without_memory(file: str) ->
     assert {parameter.device.type for parameter in model.parameters()} == {"meta"}
     assert model.recipe == recipe.tree
     assert recipe.build_losses().keys() == recipe.tree["losses"].keys() != set()
+    assert recipe.warnings == []
+
+
+def test_a_radius_that_nothing_reads_is_told() -> None:
+    bandwidth = "model.decoder.cross_attention.bandwidth=fixed"
+    (warning,) = resolve(RECIPES / "ablations/anchor_offset.yaml", [bandwidth]).warnings
+    assert warning.startswith("nothing reads anchor.raw_radius, which `locus/anchored`")
+    assert "set `model.queries.radius: false` and set `model.decoder.refinement.rad" in warning
 
 
 @pytest.mark.parametrize("pair", PAIRS)

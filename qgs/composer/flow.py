@@ -80,6 +80,9 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
     """
     steps = list(_execution_order(parts, depth))
     told, whole = set[tuple[str, ...]](), True
+    chosen_parts = [part for part in parts.values() if part]  # asked once, not for every layer
+    needs = {id(part): part.component.requires(part.config) for part in chosen_parts}
+    gives = {id(part): part.component.provides(part.config) for part in chosen_parts}
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     branch, branch_layer = dict(state), None
     for position, (chosen, layer) in enumerate(steps):
@@ -89,7 +92,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
             whole = False
             continue
         fields = state if layer is None else branch
-        origin, needed = chosen.place.origin, chosen.component.requires(chosen.config)
+        origin, needed = chosen.place.origin, needs[id(chosen)]
         missing = {name: spec for name, spec in needed.items() if name not in fields}
         if missing and whole and (key := (chosen.path, *missing)) not in told:
             told.add(key)
@@ -105,8 +108,8 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
             if fields[name][0] != needed[name]:
                 reason, fix = _mismatch(name, needed[name], chosen, *fields[name])
                 problems.add(origin, chosen.path, reason, fix)
-        provided = chosen.component.provides(chosen.config)
-        fields |= {name: (spec, chosen) for name, spec in provided.items() if name not in missing}
+        provided = gives[id(chosen)].items()
+        fields |= {name: (spec, chosen) for name, spec in provided if name not in missing}
 
 
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
