@@ -108,7 +108,7 @@ def test_a_checkpoint_of_other_types_is_refused_and_half_precision_is_widened(co
     rewrite(file, lambda t: t.update({WEIGHT: t[WEIGHT].half()}))
     assert qgs.load(file).queries.state_dict()["features"].dtype == torch.float32
     rewrite(file, lambda t: t.update({n: x.float().view(torch.int32) for n, x in t.items()}))
-    with pytest.raises(CheckpointError, match="type of .*: torch.int32 in the file"):
+    with pytest.raises(CheckpointError, match=r"type of .*: torch\.int32 in the file"):
         qgs.load(file)
 
 
