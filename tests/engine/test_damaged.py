@@ -57,7 +57,7 @@ def as_integers(name: str) -> Callable[[dict[str, torch.Tensor]], None]:
     return lambda tensors: tensors.update({name: tensors[name].view(torch.int32)})
 
 
-def with_nan(name: str) -> Callable[[dict[str, torch.Tensor]], None]:
+def with_nan(name: str) -> Callable[[dict[str, torch.Tensor]], Any]:
     return lambda tensors: tensors[name].view(-1)[:1].fill_(torch.nan)
 
 
