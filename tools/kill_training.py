@@ -175,6 +175,10 @@ def kill_command(options: argparse.Namespace) -> int:
             inside += 0 < len(found.keys() & whole.keys()) < len(whole)
             parts = [name for name in found.keys() & whole.keys() if found[name] != whole[name]]
             damaged += bool(parts) or files_of(run) != before
+            if code == 0 and found != whole:
+                differing = sorted(n for n in found | whole if found.get(n) != whole.get(n))
+                print(f"ended, after {kills} kills, with other files than without: {differing}")
+                return 1
             if out.exists() and found == whole:
                 shutil.rmtree(out)
         os.waitpid(in_child(command, subject, out), 0)
