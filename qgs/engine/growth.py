@@ -56,13 +56,14 @@ class Leaves:
         """Relocate the dead, and add Gaussians up to `count`; those drawn by opacity are split.
 
         Parents and copies share the parent's opacity and shrink, so that the rendering stays.
-        Moments of all of them start anew. Nothing happens when none is alive.
+        Moments of all of them start anew. Where all are faint, none is dead.
         """
         opacities = self.values["opacity_logits"].sigmoid()
-        dead = (opacities < DEAD).nonzero()[:, 0]
+        faint = (opacities < DEAD) & (opacities >= DEAD).any()
+        dead = faint.nonzero()[:, 0]
         needed = len(dead) + max(count - self.count, 0)
-        weights = torch.where(opacities < DEAD, 0, opacities).cpu()
-        if not needed or not weights.any():
+        weights = torch.where(faint, 0, opacities).cpu()
+        if not needed:
             return
         parents = torch.multinomial(weights, needed, replacement=True, generator=generator)
         parents = parents.to(opacities.device)

@@ -123,6 +123,8 @@ class _Run:
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
             progress.update(self.step, loss, quality, self.step, self.spent, used)
+        if not stop and self.leaves.count < self.wanted:  # a budget of a few steps
+            self.leaves.grow(self.wanted, self.generator)
         if compared is not None:
             yield self._point(compared)
 

@@ -186,7 +186,7 @@ def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photo
         (("--refine-inputs",), "--refine-inputs needs --refine"),
         (("--refine", 0), "--refine must be a number of seconds above 0, got 0"),
         (("--refine", 1, "--refine-size", "64"), "--refine-size must be HxW"),
-        (("--set", "views.scale=big"), "views.scale.*'big'"),
+        (("--set", "views.scale=big"), "(?s)views.scale.*'big'"),
         (("--set", "data.path=x"), "--set changes `views` alone here, got data.path=x"),
     ],
 )

@@ -169,5 +169,7 @@ def test_where_none_is_alive_none_is_moved() -> None:
     start = cloud(6)
     dead = Gaussians(start.means, start.scales, start.quats, 0 * start.opacities, start.colors)
     leaves = Leaves(dead, RATES)
+    before = leaves.values["means"].detach().clone()
     leaves.grow(9, torch.Generator())
-    assert leaves.count == 6
+    assert leaves.count == 9
+    assert torch.equal(leaves.values["means"][:6], before)
