@@ -35,8 +35,8 @@ DISTRIBUTIONS = {
 """Of modules that are not named as theirs, or that another one brings along."""
 
 LOADERS = ("import_module", "find_spec", "importorskip")
-BY_ACCELERATE = {"tensorboard", "wandb"}
-"""Named to accelerate, which imports them."""
+BY_OTHERS = {"tensorboard", "wandb", "huggingface-hub"}
+"""Imported by accelerate, and by fsspec for hf://."""
 
 OF_DEVELOPMENT = ("docs", "test")
 """Extras whose packages are mostly commands."""
@@ -158,7 +158,7 @@ def test_what_is_required_is_imported(name: str) -> None:
     package = SOURCES[name]
     used = {found for module in package.files for found in package.third_party(module)}
     assert package.required - AHEAD.get(name, set()) <= used
-    assert package.extras(*OF_DEVELOPMENT) <= used | BY_ACCELERATE
+    assert package.extras(*OF_DEVELOPMENT) <= used | BY_OTHERS
 
 
 @pytest.mark.parametrize("name", SOURCES)

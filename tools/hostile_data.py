@@ -124,7 +124,7 @@ def _chunks(folder: Path, chance: random.Random) -> Any:
 
 class _Payload:
     def __reduce__(self) -> tuple[Any, ...]:
-        return os.system, ("touch /tmp/qgs-fuzz-ran",)
+        return os.system, ("touch qgs-fuzz-ran",)
 
 
 def _record(folder: Path, record: dict[str, Any], chance: random.Random) -> str:

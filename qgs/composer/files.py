@@ -75,7 +75,7 @@ def found_recipe(file: Path, name: str | Path) -> Path:
     home = recipe_folder()
     for folder in (home, home.parent):
         shipped = Path(os.path.normpath(folder / name))
-        if not file.exists() and shipped.is_relative_to(home) and shipped.is_file():
+        if not os.path.exists(file) and shipped.is_relative_to(home) and os.path.isfile(shipped):
             return shipped
     return file
 

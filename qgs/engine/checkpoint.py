@@ -252,10 +252,13 @@ class Weights:
 
     @torch.no_grad()
     def load_state(self, state: State) -> None:
-        tensors = unique_tensors(self._module)
-        refuse_other_tensors(state, tensors)
-        for name, tensor in tensors.items():
+        self.refuse_unlike(state)
+        for name, tensor in unique_tensors(self._module).items():
             tensor.copy_(placed_like(state[name], tensor))
+
+    def refuse_unlike(self, state: State) -> None:
+        """Raise CheckpointError for other names, shapes and types than the module's."""
+        refuse_other_tensors(state, unique_tensors(self._module))
 
 
 def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from qgs.composer import Recipe
 from qgs.data.sampling import Batch
 from qgs.engine.causes import blamed
-from qgs.engine.checkpoint import Saver, Weights, refuse_other_tensors
+from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
@@ -336,7 +336,7 @@ class GoodWeights:
         self._psnr, self._best = (None if value is None else float(value) for value in quality)
         for i, step in enumerate(state["steps"]):
             copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
-            refuse_other_tensors(copy, self._weights.state() if self._keep else copy)
+            self._weights.refuse_unlike(copy)
             self._copies.append((int(step), copy if self._keep else {}))
         self.step, self.tensors = self._copies[0]
 

@@ -113,7 +113,7 @@ BROKEN_PLUGINS = {
     ),
     "nothing in it": (
         "plugin = Plugin('bad', 1, ())",
-        "is empty: it lists neither `components` nor `layouts`",
+        "is empty: it lists no `components`, `layouts` or `models`",
     ),
     "other name": ("plugin = Plugin('qgs', 1, ())", "calls itself `qgs`"),
     "taken component name": (

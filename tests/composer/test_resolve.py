@@ -276,7 +276,7 @@ def test_null_type_is_the_default_of_the_slot():
 def test_recipe_without_data_and_mapping_with_a_value_that_yaml_cannot_hold():
     with pytest.raises(ValueError, match="this recipe has no data"):
         resolve(SMALL).build_data()
-    with pytest.raises(ValueError, match="a recipe holds mappings"):
+    with pytest.raises(ValueError, match="a recipe holds no Tensor"):
         resolve({"recipe": 1, "seed": torch.zeros(1)})
 
 

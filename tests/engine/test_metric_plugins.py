@@ -167,7 +167,7 @@ def test_contests_and_their_report_show_it(judged: Judged) -> None:
     table = shown(table_of([entry]))
     assert "MAE ↓" in table
     assert table.count(f"{scores['error']:.5f}") == 1
-    report = report_of([entry], 1.0, 0)
+    report = report_of([entry], "title", "lede", {})
     assert report.columns["error"].heading == "MAE"
     assert report.contenders[0].scores["error"] == scores["error"]
 
