@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -162,10 +162,11 @@ def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
     found = list(data.shape) if _is_plain(data) else _described(data)
     wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
     _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
+    assert isinstance(data, Tensor)
     return data.detach()
 
 
-def _is_plain(data: Any) -> bool:
+def _is_plain(data: Any) -> TypeGuard[Tensor]:
     """Whether `data` is a tensor of numbers that are there: not sparse, quantised or expanded."""
     return (
         isinstance(data, Tensor)

@@ -72,7 +72,8 @@ def _cameras(data: Any) -> list[Mapping[str, Any]]:
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
     if not isinstance(given, list):
-        poses, matrices, names = (top.get(key) for key in ("c2w", "K", "images"))
+        columns: Any = [top.get(key) for key in ("c2w", "K", "images")]
+        poses, matrices, names = columns
         poses = poses if isinstance(poses, list) else []
         shared = np.ndim(numbers(matrices)) < 3
         matrices = [matrices] * len(poses) if shared else matrices

@@ -90,8 +90,10 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
     values = {**data, **entry}
     name = image_name(path)
-    sides = [_number(values, key) for key in ("h", "w")]
-    given, wrong = (None, ()) if None in sides else listed_size(*sides)
+    height, width = (_number(values, key) for key in ("h", "w"))
+    given, wrong = (
+        listed_size(height, width) if height is not None and width is not None else (None, ())
+    )
     size, problems = given or size, [*wrong]
 
     def read(value: Callable[[], Value], otherwise: Value) -> Value:

@@ -91,8 +91,9 @@ def said(error: Exception) -> str:
 def _other_errors(photo: Photo, size: Size) -> Iterator[tuple[str, str]]:
     """What is wrong with the mask and the depth map of a photo of `size`, and what to do."""
     mask, depth = photo.listed.mask, photo.listed.depth
-    of_file = mask is not None and photo.mask_exists and mask != photo.listed.path
-    read_mask = photo.read_mask or (partial(open_mask, mask) if of_file else None)
+    read_mask = photo.read_mask
+    if mask is not None and photo.mask_exists and mask != photo.listed.path:
+        read_mask = partial(open_mask, mask)
     read_depth = partial(open_depth, depth, 1.0) if depth is not None else None
     for kind, file, read in (("mask", mask, read_mask), ("depth map", depth, read_depth)):
         try:
