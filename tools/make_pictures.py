@@ -86,7 +86,7 @@ def write_webp(frames: Sequence[Picture], path: Path) -> None:
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="The pictures of README.md and docs/.")
     parser.add_argument("--tokengs", default="rooms/tokengs-64")
     parser.add_argument("--locus", default="rooms/locus-64")
     parser.add_argument("--scene", type=int, default=2, help="Number of the test room.")
