@@ -1,6 +1,6 @@
 """The pictures of README.md and docs/, drawn from trained models.
 
-    python tools/make_pictures.py [--tokengs CHECKPOINT] [--locus CHECKPOINT] [--scene 2]
+    python tools/make_pictures.py [--tokengs CHECKPOINT] [--locus CHECKPOINT] [--scene 0]
 
 Writes docs/images/first_sight.webp (a room that no model has seen: the photos, a walk through each
 model's Gaussians, LocusGS's anchors) and docs/images/anchors.png (the anchors layer by layer).
@@ -89,7 +89,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="The pictures of README.md and docs/.")
     parser.add_argument("--tokengs", default="rooms/tokengs-64")
     parser.add_argument("--locus", default="rooms/locus-64")
-    parser.add_argument("--scene", type=int, default=2, help="Number of the test room.")
+    parser.add_argument("--scene", type=int, default=0, help="Number of the test room.")
     arguments = parser.parse_args()
     models = [qgs.load(arguments.tokengs), qgs.load(arguments.locus)]
     assert models[1].recipe is not None
