@@ -82,12 +82,12 @@ def verdict(trained: str | None, found: Domain) -> str:
 
     The model need not know their content either: only the cameras are compared.
     """
-    if trained is None:
+    domain = Domain.read(trained) if trained else Domain()
+    if not domain.ranges:
         return (
             "whether the photos are like those that this model was trained on is not known: its "
             "checkpoint does not tell, since an older qgs or other code trained it"
         )
-    domain = Domain.read(trained)
     if apart := domain.differences(found):
         return (
             f"the photos lie outside what this model was trained on: {', '.join(apart)}. Expect a "

@@ -76,7 +76,8 @@ def test_the_sentence() -> None:
         "(trained: 2), the input cameras stand 3 apart (trained: 0.2 to 0.4), their axes differ by "
         "90 degrees (trained: 11.4), their field of view is 152 degrees wide (trained: 90). Expect"
     )
-    assert "is not known: its checkpoint does not tell" in verdict(None, within)
+    for unknown in (None, Domain().text):
+        assert "is not known: its checkpoint does not tell" in verdict(unknown, within)
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:
