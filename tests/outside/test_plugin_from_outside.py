@@ -68,7 +68,7 @@ def test_a_broken_plugin_beside_it_harms_nobody(fresh: FreshEnvironment, plugin:
     assert "RuntimeError: no luck" in listed
     fresh.run("qgs compose recipe.yaml", plugin)
     refused = fresh.run("! qgs compose qgs-broken/recipe.yaml", workshop)
-    assert "recipe.yaml:3: plugins.1" in refused
+    assert "recipe.yaml:4: plugins.1" in refused
     assert "qgs-broken 0.1.0" in refused
 
 
