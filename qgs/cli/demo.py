@@ -72,7 +72,8 @@ def _show_trained(
 
     console.print("Reconstructing scenes that no model has seen", style="dim")
     try:
-        entries = trained.judge(models, photos, device)
+        files = trained.checkpoints(models)
+        entries = trained.judge(files, photos, device)
     except FileNotFoundError as error:
         error.add_note("without trained models: qgs demo --train, which takes some minutes")
         raise
@@ -82,7 +83,7 @@ def _show_trained(
     report = contest.report_of(entries, " on your photos" if photos else "", lede, {})
     console.print(contest.table_of(entries))
     if photos is not None:
-        told = trained.likeness(models, report.samples)
+        told = trained.likeness(files, report.samples)
         report = replace(report, facts={**report.facts, "Likeness": "; ".join(told)})
         console.print("\n".join(told), soft_wrap=True, highlight=False, markup=False)
     _write(report, entries, target, console)

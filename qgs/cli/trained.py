@@ -1,7 +1,7 @@
 """Judging trained models, side by side, on the data of their recipe or on a user's photos."""
 
-from collections.abc import Sequence
-from pathlib import PurePosixPath
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 from qgs.cli import contest
 from qgs.composer import Recipe, resolve
@@ -21,13 +21,16 @@ HOLDOUT = 8
 """Every n-th of a user's photos is held out; of fewer photos the middle one."""
 
 
-def judge(names: Sequence[str], photos: str | None, device: str) -> list[contest.Entry]:
-    """The models `names` (see `checkpoint_of`) on unseen scenes, or on held-out photos.
+def checkpoints(names: Sequence[str]) -> dict[str, Path]:
+    """The files of the models `names` (see `checkpoint_of`), by short name."""
+    return {_label(name): checkpoint_of(name) for name in names}
 
-    Raises as `checkpoint_of`, `load` and the data do, and ValueError where the recipes do not judge
-    alike.
+
+def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[contest.Entry]:
+    """The models in `files`, of `checkpoints`, on unseen scenes, or on held-out photos.
+
+    Raises as `load` and the data do, and ValueError where the recipes do not judge alike.
     """
-    files = {_label(name): checkpoint_of(name) for name in names}
     recipes = {name: load_recipe(file) for name, file in files.items()}
     if photos is not None:
         recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
@@ -40,15 +43,14 @@ def judge(names: Sequence[str], photos: str | None, device: str) -> list[contest
     return entries
 
 
-def likeness(names: Sequence[str], samples: Sequence[Sample]) -> list[str]:
-    """How `samples` lie to what each of the models `names` was trained on, a sentence once."""
+def likeness(files: Mapping[str, Path], samples: Sequence[Sample]) -> list[str]:
+    """How `samples` lie to what each model in `files` was trained on, a sentence once."""
     found = Domain()
     for sample in samples:
         found.see(sample.inputs.cameras, sample.targets.cameras)
     told: dict[str, list[str]] = {}
-    for name in names:
-        sentence = verdict(load_extra(checkpoint_of(name)).get(KEY), found)
-        told.setdefault(sentence, []).append(_label(name))
+    for name, file in files.items():
+        told.setdefault(verdict(load_extra(file).get(KEY), found), []).append(name)
     return [f"{', '.join(models)}: {sentence}" for sentence, models in told.items()]
 
 
