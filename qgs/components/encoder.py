@@ -1,10 +1,10 @@
 """`qgs/multiview_vit`: a small ViT over the patches of all views together (TokenGS release)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import torch
-from einops import rearrange
+from einops import rearrange, repeat
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -92,6 +92,17 @@ class MultiViewViT(Encoder):
                 f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
             )
 
+    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Weights of smaller patches serve larger ones, if their side is a multiple.
+
+        A patch of f x f times the pixels then gives the token of the small one on means of f x f.
+        """
+        own = self.state_dict()
+        return {
+            name: _larger(kernel, own[name].shape[-1]) if name in _PATCH_KERNELS else kernel
+            for name, kernel in learned.items()
+        }
+
     def forward(self, views: Views) -> ImageMemory:
         """The memory of all views; raises ValueError when the patch does not divide the images."""
         view_count, _, height, width = views.images.shape[1:]
@@ -120,6 +131,17 @@ class MultiViewViT(Encoder):
         x_XPD = self.rgb_embedding(imagenet_normalised(images).flatten(0, 1))
         x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
         return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=images.shape[0])
+
+
+_PATCH_KERNELS = ("rgb_embedding.proj.weight", "ray_embedding.proj.weight")
+
+
+def _larger(kernel: Tensor, side: int) -> Tensor:
+    """A kernel (D, C, p, p) for patches of `side`, a multiple of p; of others, as it is."""
+    if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
+        return kernel
+    factor = side // kernel.shape[-1]
+    return repeat(kernel / factor**2, "d c h w -> d c (h fh) (w fw)", fh=factor, fw=factor)
 
 
 def imagenet_normalised(images: Tensor) -> Tensor:

@@ -1,7 +1,10 @@
 """Slot `encoder`: posed photos to image memory."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar
+
+from torch import Tensor
 
 from qgs.contracts.component import ComponentConfig, Fields, FieldSpec, ModelComponent
 from qgs.types import ImageMemory, Views
@@ -31,6 +34,13 @@ class Encoder(ModelComponent):
     def provides(cls, config: ComponentConfig) -> Fields:
         """Every encoder fills the whole ImageMemory."""
         return MEMORY_FIELDS
+
+    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A state dict for this encoder, made of one `learned` with patches of another size.
+
+        Weights that it cannot bring to its own shapes stay as they are, and are then refused.
+        """
+        return dict(learned)
 
     @abstractmethod
     def forward(self, views: Views) -> ImageMemory:

@@ -1,4 +1,4 @@
-"""What a run saves and continues from; starting from the weights of another one."""
+"""What a run saves and continues from."""
 
 import json
 import math
@@ -21,11 +21,10 @@ from qgs.composer.recipe import flat
 from qgs.data.domain import KEY, SAMPLES, Domain
 from qgs.data.sampling import Batch
 from qgs.engine.distributed import placed_like, sharded, whole
-from qgs.engine.folder import RunFolder, checkpoint_of
+from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import (
     CheckpointError,
     load_extra,
-    load_recipe,
     load_weights,
     opened_tensors,
     read_tensors,
@@ -36,7 +35,6 @@ from qgs.io.checkpoint import (
 from qgs.io.differences import (
     differing_tensors,
     differing_types,
-    options_beside_weights,
     shapes_of,
 )
 from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
@@ -412,57 +410,3 @@ def refuse_other_data(saved: State, now: State, folder: RunFolder) -> None:
             f"the data lists other training scenes than when the run in {folder.path} was saved: "
             "bring back what was added or removed, or start a new run"
         )
-
-
-_QUERIES = "queries."
-
-
-def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
-    """Give `model`, freshly built from `recipe`, the weights that `recipe.init_from` names, if any.
-
-    `init_from` is a checkpoint, the folder of a run, a shipped model or a URL. Queries
-    grow or shrink by their own rule (`Queries.resized`) with random numbers of the recipe's seed;
-    everything else must have the same names and shapes.
-
-    Returns what was done, line by line, with the options that make the same weights predict other
-    Gaussians. Raises FileNotFoundError, CheckpointError with every difference and what would fit.
-    """
-    if recipe.init_from is None:
-        return []
-    path = checkpoint_of(recipe.init_from)
-    learned_by = load_recipe(path)
-    learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
-    options = [
-        f"{option}: {theirs} (here {ours})"
-        for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()
-        if option != "model.queries.count"
-    ]
-    found = _differences(learned, model, learned_by.build_model("meta").queries.count)
-    if found:
-        first = (
-            f"init_from: {path} does not fit this recipe; only the number of queries may differ:"
-        )
-        trained = "options of the model that the checkpoint was trained with:"
-        raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
-    queries = {k.removeprefix(_QUERIES): v for k, v in learned.items() if k.startswith(_QUERIES)}
-    resized = model.queries.resized(queries, torch.Generator().manual_seed(recipe.seed))
-    weights = learned | {_QUERIES + name: values for name, values in resized.items()}
-    load_weights(model, weights, str(path))
-    done = [f"weights start from {path}"]
-    for name, values in weights.items():
-        if values.shape != learned[name].shape:
-            old, new = len(learned[name]), len(values)
-            kept = f"{old} kept, {new - old} noisy copies of them"
-            done.append(f"{name}: {old} -> {new}, {'the first are kept' if new < old else kept}")
-    return done + [f"learned with {option}" for option in options]
-
-
-def _differences(learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int) -> list[str]:
-    """In what the weights of a model of `count` queries differ, besides that number."""
-    own, theirs = shapes_of(unique_tensors(model)), shapes_of(learned)
-    for name in own.keys() & theirs.keys():
-        ours, shape = own[name], theirs[name]
-        per_query = ours[:1] == (model.queries.count,) and shape[:1] == (count,)
-        if name.startswith(_QUERIES) and per_query and ours[1:] == shape[1:]:
-            del own[name], theirs[name]
-    return differing_tensors(theirs, own)

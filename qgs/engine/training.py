@@ -27,7 +27,6 @@ from qgs.engine.checkpoint import (
     OptimizerState,
     RandomStates,
     Saver,
-    initialise,
     refuse_other_data,
     saved_state,
 )
@@ -46,6 +45,7 @@ from qgs.engine.distributed import (
 from qgs.engine.fit import explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.engine.guard import Guard, not_finite
+from qgs.engine.initial import initialise
 from qgs.engine.objective import Objective, Outcome
 from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation

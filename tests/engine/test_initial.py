@@ -13,7 +13,7 @@ from training_runs import Tiny, same
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Queries
-from qgs.engine.checkpoint import initialise
+from qgs.engine.initial import initialise
 from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointError, save
 from qgs.io.published import exact_names_of
@@ -124,6 +124,25 @@ def test_queries_may_have_a_rule_of_their_own(
     assert torch.equal(features, old_weights(recipe)["queries.features"].repeat(2, 1))
 
 
+def test_larger_patches_give_the_tokens_of_coarser_images(learned: Tiny) -> None:
+    recipe = learned("tokengs", "model.encoder.patch_size=16", "data.image_size=[64, 64]")
+    model, told = started(recipe)
+    coarse = resolve(recipe.tree, ["model.encoder.patch_size=8", "data.image_size=[32, 32]"])
+    images = torch.rand(1, 2, 3, 32, 32)
+    fine = images.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    tokens = model.encoder.rgb_embedding(fine[0])
+    assert torch.allclose(tokens, started(coarse)[0].encoder.rgb_embedding(images[0]), atol=1e-5)
+    name = "encoder.ray_embedding.proj.weight"
+    assert f"{name}: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
+
+
+def test_patches_that_are_no_multiple_are_refused(learned: Tiny) -> None:
+    recipe = learned("tokengs", "model.encoder.patch_size=4")
+    with pytest.raises(CheckpointError, match=r"size of patches may differ") as caught:
+        initialise(recipe.build_model(), recipe)
+    assert "shape of encoder.rgb_embedding.proj.weight" in str(caught.value)
+
+
 def test_every_difference_is_told_with_the_options_that_fit(learned: Tiny) -> None:
     options = (GAUSSIANS, "queries.count=48", "head.norm=false")
     recipe = learned("tokengs", *(f"model.{option}" for option in options))
@@ -140,7 +159,7 @@ def test_every_difference_is_told_with_the_options_that_fit(learned: Tiny) -> No
         "model.head.norm: true (here false)",
     ):
         assert words in str(caught.value)
-    assert "queries" not in str(caught.value).split("only the number of queries may differ")[1]
+    assert "queries" not in str(caught.value).split("to a multiple, the size of patches may differ")[1]
     assert same(model.state_dict(), before)
 
 

@@ -14,7 +14,7 @@ from upath import UPath
 import qgs
 from qgs.composer import resolve
 from qgs.composer.registry import load_sound_plugins
-from qgs.engine.checkpoint import initialise
+from qgs.engine.initial import initialise
 from qgs.io.checkpoint import load_extra, save
 from qgs.io.models import checkpoint_path
 from qgs.io.transfer import export_half
