@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from qgs.metrics.baselines import BASELINES
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering, Views
-from qgs.wording import listed
+from qgs.wording import listed, numbered
 
 ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
@@ -53,12 +53,14 @@ def choose_frames(
     frames: Sequence[int] | None = None,
     compare: Sequence[int] | None = None,
     held_out: Sequence[int] = (),
+    label: Callable[[int], str] = str,
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Input frames and novel frames, from 0 to total - 1.
 
     frames: the inputs; None spreads `inputs` of them, ends included, over the middle `span` frames.
     compare: the novel ones; None spreads at most NOVEL between the inputs. held_out: frames that
-    training left out; inputs are then chosen from the others, and these are compared.
+    training left out; inputs are then chosen from the others, and these are compared. label: what
+    messages call a frame.
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
     usable = [frame for frame in range(total) if frame not in held_out]
@@ -70,23 +72,27 @@ def choose_frames(
         span = min(max(span, inputs), len(usable))
         first = (len(usable) - span) // 2
         frames = _evenly(usable[first : first + span], inputs)
-    _refuse_missing(frames, total)
+    _refuse_missing(frames, total, label)
     if compare is None:
         between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
         compare = _evenly(between, min(NOVEL, len(between)))
-    _refuse_missing(compare, total)
+    _refuse_missing(compare, total, label)
     every = [*frames, *compare]
     twice = sorted({frame for frame in every if every.count(frame) > 1})
     if twice:
-        raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
+        raise ValueError(
+            f"named twice: frame {listed(map(label, twice))}; inputs and compared frames must "
+            "differ"
+        )
     return tuple(frames), tuple(compare)
 
 
-def _refuse_missing(frames: Sequence[int], total: int) -> None:
+def _refuse_missing(frames: Sequence[int], total: int, label: Callable[[int], str]) -> None:
     missing = [frame for frame in frames if not 0 <= frame < total]
     if missing:
-        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
+        there = f"{label(0)} to {label(total - 1)}"
+        raise ValueError(f"frames that do not exist: {listed(missing)}; the photos are {there}")
 
 
 def choose_sample(
@@ -98,7 +104,9 @@ def choose_sample(
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
     """The views of `scene` that `choose_frames` picks, and their world as of `own_world`."""
     wanted, span = inputs or views.inputs, views.gap[1] + 1
-    picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
+    picked = choose_frames(
+        len(scene), wanted, span, frames, compare, held_out=scene.held_out, label=scene.label
+    )
     (height, width), shown = scene.cameras.size, len(picked[0]) + len(picked[1])
     finer_by = max(1, round(ORBIT_SIDE / max(height, width))) ** 2
     refuse_beyond_memory(
@@ -268,7 +276,10 @@ def _write_views(reconstruction: Reconstruction, out: Path) -> None:
         write_png(rows["depth"][i], out / "depth" / name)
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
     quality = [f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}" for score in scores]
-    titles = [f"frame {scores[i].frame}, {kinds[i]}\n{quality[i]}" for i in shown]
+    files = [Path(sample.names.get(s.frame, "")).name for s in scores]
+    titles = [
+        f"frame {numbered(scores[i].frame, files[i])}\n{kinds[i]}, {quality[i]}" for i in shown
+    ]
     chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
     overview = figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
     write_png(overview, out / "overview.png")
@@ -276,6 +287,7 @@ def _write_views(reconstruction: Reconstruction, out: Path) -> None:
 
 def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, Any]:
     reference, scale = reconstruction.world
+    names = reconstruction.sample.names
     cameras = _plain(_cameras(reconstruction.sample))
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
@@ -289,7 +301,8 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
             "scale": float(scale),
         },
         "views": [
-            {"frame": s.frame, "kind": s.kind, "psnr": round(s.psnr, 3), **camera}
+            {"frame": s.frame, "photo": names.get(s.frame), "kind": s.kind}
+            | {"psnr": round(s.psnr, 3), **camera}
             for s, camera in zip(reconstruction.scores, cameras, strict=True)
         ],
         "orbit": _plain(path),

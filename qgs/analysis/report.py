@@ -138,7 +138,7 @@ def scene_columns(
 ) -> dict[str, Any]:
     """Name, inputs and columns of pictures of a scene. depth: the true one (T, 1, H, W)."""
     shown = sample.targets.select(slice(TARGETS))
-    frames = [f"frame {frame}" for frame in (*sample.input_frames, *sample.target_frames)]
+    frames = [f"frame {sample.label(f)}" for f in (*sample.input_frames, *sample.target_frames)]
     inputs = len(sample.input_frames)
     truth = shown.images[0]
     columns = {"Truth": _photos(truth, frames[inputs:])}

@@ -227,7 +227,7 @@ def _long_enough(
     frames = {key: len(opener(key, file)) for key, file in by_file}
     short = {key: count for key, count in frames.items() if count < config.min_frames}
     if short:
-        names = ", ".join(f"{key} ({count})" for key, count in short.items())
+        names = listed(f"{key} ({count})" for key, count in short.items())
         warn_once(
             f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
             f"{config.min_frames} frames (min_frames) and are left out: {names}"

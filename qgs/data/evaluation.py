@@ -207,11 +207,13 @@ def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
     if scene.missing:
         raise ValueError(
             f"{len(scene.missing)} of its listed images do not exist, so that positions "
-            f"of the index would mean other frames: {listed(scene.missing)}"
+            f"of the index would mean other frames: {listed(scene.missing, 3)}"
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
-        numbers = ", ".join(map(str, outside))
-        which = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
-        raise ValueError(f"{which} out of range, it has frames 0 to {len(scene) - 1}")
+        which = f"frame{'s' if len(outside) > 1 else ''} {listed(outside)}"
+        ends = f"frames {scene.label(0)} to {scene.label(len(scene) - 1)}"
+        raise ValueError(
+            f"{which} {'are' if len(outside) > 1 else 'is'} out of range, it has {ends}"
+        )
     return tuple(entry.context), tuple(entry.target)

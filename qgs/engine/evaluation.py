@@ -193,7 +193,8 @@ class _Judge:
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         if broken:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
-        return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
+        frames = (sample.input_frames, sample.target_frames)
+        return SceneScore(sample.scene, [frames], values, sample.names)
 
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
         targets = sample.targets.to(self._device)
@@ -239,7 +240,8 @@ def _by_scene(
         common = [key for key in found[0] if all(key in values for values in found)]
         means = {key: sum(values[key] for values in found) / len(found) for key in common}
         views = [frames for sample in samples[name] for frames in sample.views]
-        scores.append(SceneScore(name, views, means))
+        names = {frame: n for sample in samples[name] for frame, n in sample.names.items()}
+        scores.append(SceneScore(name, views, means, names))
     return scores, [failures[name] for name in wanted if name in failures]
 
 
