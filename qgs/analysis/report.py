@@ -242,14 +242,14 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
         }
         for caption, part in parts.items():
             if part is not None:
-                maps = patch_maps(part[0, :, 0].mean(0), record.grid)
+                maps = patch_maps(part[0, :, 0], record.grid)
                 picture = side_by_side(attention_pictures(photos, maps))
                 figures.setdefault(contender.name, []).append(Tile(picture, caption))
     return ReportSection(
         "What one query reads",
         "Cross-attention of the heaviest token over the patches of both input views in the last "
         "layer, averaged over heads, dark to bright within each picture. A geometry bias, where "
-        "there is one, is added to the content logits before the softmax.",
+        "there is one, is added to the content logits before the softmax; what it hides is pale.",
         figures,
         width=240,
     )
