@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.contracts import Scene, ViewsConfig
+from qgs.contracts import Head, Scene, ViewsConfig
+from qgs.data.domain import Domain, verdict
+from qgs.data.images import framing
 from qgs.data.sampling import Sample, make_sample, own_world, training_frames, views_in
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
@@ -27,8 +29,9 @@ from qgs.geometry.poses import look_at
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
 from qgs.memory import refuse_beyond_memory
-from qgs.metrics.baselines import BASELINES
+from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
+from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering, Views
 from qgs.wording import listed, numbered
@@ -53,14 +56,12 @@ def choose_frames(
     frames: Sequence[int] | None = None,
     compare: Sequence[int] | None = None,
     held_out: Sequence[int] = (),
-    label: Callable[[int], str] = str,
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Input frames and novel frames, from 0 to total - 1.
 
     frames: the inputs; None spreads `inputs` of them, ends included, over the middle `span` frames.
     compare: the novel ones; None spreads at most NOVEL between the inputs. held_out: frames that
-    training left out; inputs are then chosen from the others, and these are compared. label: what
-    messages call a frame.
+    training left out; inputs are then chosen from the others, and these are compared.
     Raises ValueError for frames that do not exist, come twice, or are both input and novel.
     """
     usable = [frame for frame in range(total) if frame not in held_out]
@@ -72,27 +73,25 @@ def choose_frames(
         span = min(max(span, inputs), len(usable))
         first = (len(usable) - span) // 2
         frames = _evenly(usable[first : first + span], inputs)
-    _refuse_missing(frames, total, label)
+    _refuse_missing(frames, total)
     if compare is None:
         between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
         compare = _evenly(between, min(NOVEL, len(between)))
-    _refuse_missing(compare, total, label)
+    _refuse_missing(compare, total)
     every = [*frames, *compare]
     twice = sorted({frame for frame in every if every.count(frame) > 1})
     if twice:
         raise ValueError(
-            f"named twice: frame {listed(map(label, twice))}; inputs and compared frames must "
-            "differ"
+            f"frames named twice: {listed(twice)}; inputs and compared frames must differ"
         )
     return tuple(frames), tuple(compare)
 
 
-def _refuse_missing(frames: Sequence[int], total: int, label: Callable[[int], str]) -> None:
+def _refuse_missing(frames: Sequence[int], total: int) -> None:
     missing = [frame for frame in frames if not 0 <= frame < total]
     if missing:
-        there = f"{label(0)} to {label(total - 1)}"
-        raise ValueError(f"frames that do not exist: {listed(missing)}; the photos are {there}")
+        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
 
 
 def choose_sample(
@@ -104,9 +103,7 @@ def choose_sample(
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
     """The views of `scene` that `choose_frames` picks, and their world as of `own_world`."""
     wanted, span = inputs or views.inputs, views.gap[1] + 1
-    picked = choose_frames(
-        len(scene), wanted, span, frames, compare, held_out=scene.held_out, label=scene.label
-    )
+    picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
     (height, width), shown = scene.cameras.size, len(picked[0]) + len(picked[1])
     finer_by = max(1, round(ORBIT_SIDE / max(height, width))) ** 2
     refuse_beyond_memory(
@@ -171,7 +168,7 @@ class Reconstruction:
     """Gaussians (1, G) of a sample, and what its cameras see of them.
 
     world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, refinement: of
-    Gaussians; None without. likeness: how the views lie to those that the model was trained on.
+    Gaussians; None without. remarks: sentences on the photos and what came of them.
     """
 
     sample: Sample
@@ -181,7 +178,14 @@ class Reconstruction:
     world: tuple[Tensor, Tensor]
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
-    likeness: str = ""
+    remarks: Sequence[str] = ()
+
+    @property
+    def worse_than_nearest(self) -> str:
+        """As `qgs.metrics.baselines`, on the compared views."""
+        rows = [(s.psnr, s.baselines["nearest_input"]) for s in self.scores if s.baselines]
+        means = [sum(values) / len(rows) for values in zip(*rows, strict=True)]
+        return worse_than_nearest(Psnr.column, *means) if means else ""
 
 
 @torch.no_grad()
@@ -215,6 +219,21 @@ def reconstruct(
         value = quality[len(sample.input_frames) + index]
         scores.append(ViewScore(frame, kind, value, others))
     return Reconstruction(sample, gaussians, rendering, scores, world, tuning, refinement)
+
+
+def remarks_on(
+    result: Reconstruction, scene: Scene, head: Head, trained_on: str | None
+) -> list[str]:
+    """What is to be said of a prediction for photos of `scene`. trained_on: see `verdict`."""
+    sample, found = result.sample, Domain()
+    found.see(sample.inputs.cameras, sample.targets.cameras)
+    said = (
+        verdict(trained_on, found),
+        framing(scene, sample.input_frames[0]),
+        too_many_capped(head, capped_share(head, result.gaussians)),
+        result.worse_than_nearest,
+    )
+    return [*filter(None, said)]
 
 
 def refinement_photos(
@@ -293,7 +312,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
         "tuning": reconstruction.tuning,
-        "likeness": reconstruction.likeness,
+        "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",

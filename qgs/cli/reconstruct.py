@@ -93,11 +93,11 @@ def reconstruct(
 
     from rich.console import Console
 
-    from qgs.analysis.reconstruction import choose_sample, write_reconstruction
+    from qgs.analysis.reconstruction import choose_sample, remarks_on, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
-    from qgs.data.domain import KEY, Domain, verdict
+    from qgs.data.domain import KEY
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.engine.guard import refuse_broken
@@ -128,17 +128,18 @@ def reconstruct(
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, tuned, record)
-    found = Domain()
-    found.see(sample.inputs.cameras, sample.targets.cameras)
-    result = replace(result, likeness=verdict(load_extra(file).get(KEY), found))
+    remarks = remarks_on(result, scene, model.head, load_extra(file).get(KEY))
+    result = replace(result, remarks=remarks)
     console.print(score_table(result, "feed-forward" if refine else ""))
-    console.print(result.likeness, soft_wrap=True, highlight=False)
+    console.print("\n".join(remarks), soft_wrap=True, highlight=False, markup=False)
     paths = write_reconstruction(model, result, out)
     if refine:
         if fine is not None:
             scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
         better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
         console.print(score_table(better, "refined"))
+        if better.worse_than_nearest:
+            console.print(better.worse_than_nearest, soft_wrap=True, highlight=False)
         paths += write_reconstruction(model, better, out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -232,17 +233,14 @@ def frame_list(text: str | None, option: str, scene: Scene) -> list[int] | None:
     frames: list[int] = []
     for part in map(str.strip, text.split(",")):
         found = [f for f, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
-        try:
-            frames.append(int(part))
-        except ValueError:
-            if len(found) != 1:
-                several = f"and {part!r} may be {listed(map(scene.label, found))}"
-                raise ValueError(
-                    f"{option} takes numbers or file names of photos with commas between, such as "
-                    f"0,8,16; got {text!r}, {several if found else f'and no photo is {part!r}'}. "
-                    f"The photos are {scene.label(0)} to {scene.label(len(names) - 1)}"
-                ) from None
-            frames += found
+        found = [int(part)] if part.removeprefix("-").isdecimal() else found
+        if len(found) != 1:
+            raise ValueError(
+                f"{option} takes numbers or file names of photos with commas between, such as "
+                f"0,8,16; {part!r} of {text!r} is {listed(map(scene.label, found)) or 'none'}. "
+                f"The photos are {scene.label(0)} to {scene.label(len(names) - 1)}"
+            )
+        frames += found
     return frames
 
 

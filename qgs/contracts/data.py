@@ -53,6 +53,10 @@ class Scene(ABC):
         """Number and name of a frame, for messages."""
         return numbered(frame, self.frame_name(frame))
 
+    def stored_size(self, frame: int) -> tuple[int, int] | None:
+        """(H, W) of the photo before it is delivered; None where images are made to measure."""
+        return None
+
     def depths(self, frames: Sequence[int]) -> Tensor | None:
         """Camera-frame z (len(frames), 1, H, W), world units; None where it is not known."""
         return None

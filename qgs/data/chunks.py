@@ -23,6 +23,7 @@ from qgs.data.chunk_files import (
     require_usable,
 )
 from qgs.data.images import CropResize, decode_rgb, to_tensor
+from qgs.data.lenses import Size
 from qgs.data.paths import opened_path
 from qgs.data.scenes import (
     BoundedCache,
@@ -97,6 +98,10 @@ class ChunkScene(EncodedScene):
     def frame_name(self, frame: int) -> str:
         """See `Scene`: the writer's name of a frame, else its time stamp."""
         return self._record.names[frame]
+
+    def stored_size(self, frame: int) -> Size:
+        """See `Scene`."""
+        return self._record.stored_size(frame)
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`. Raises ValueError for an image that cannot be decoded."""

@@ -66,6 +66,7 @@ class Evaluation:
     unlisted: scenes of the data that the index lacks. gaussians: of a scene. incomplete: values
     that scenes lack, and why. held_out: how many held-out frames were judged, and how many there
     are; None where the test scenes hold none out. step: optimiser steps behind the weights.
+    remarks: sentences on what was judged and what came of it.
     """
 
     protocol: Protocol
@@ -79,6 +80,7 @@ class Evaluation:
     incomplete: Mapping[str, str] = field(default_factory=dict)
     held_out: tuple[int, int] | None = None
     step: int | None = None
+    remarks: Sequence[str] = ()
 
     def mean(self, metric: str, method: str = "model") -> float | None:
         """Mean over scenes of one of `columns`, each scene once; None if none has this value."""
@@ -125,6 +127,7 @@ class Evaluation:
             "gaussians_used": {"opacity_above": OPACITY_USED, **used},
             "tuning": self._tuning(),
             "held_out_frames": self.held_out,
+            "remarks": list(self.remarks),
         }
 
     def write(self, folder: str | Path) -> None:
@@ -240,6 +243,7 @@ class Evaluation:
                 f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
                 f"{tuning['loss_after']:.4f}"
             )
+        yield from self.remarks
 
 
 def as_json(value: Mapping[str, Any]) -> str:

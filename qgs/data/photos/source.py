@@ -123,10 +123,14 @@ class PhotoScene(EncodedScene):
         """See `Scene`: the image file, relative to the scene's folder."""
         return self._frames[frame].name
 
+    def stored_size(self, frame: int) -> Size:
+        """See `Scene`."""
+        listed = self._frames[frame]
+        return _checked(image_size(listed.path), listed, listed.path)
+
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
-        listed = self._frames[frame]
-        size = _checked(image_size(listed.path), listed, listed.path)
+        listed, size = self._frames[frame], self.stored_size(frame)
         buffer = io.BytesIO()
         if listed.mask is not None:
             Image.fromarray(_whole_mask(listed)).save(buffer, "png")
