@@ -68,10 +68,11 @@ def framing(scene: Scene, frame: int) -> str:
     left, top, right, bottom = crop.box
     cut = 1 - (right - left) * (bottom - top) / (stored[0] * stored[1])
     part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
-    scaled = f"{'reduced' if crop.scale < 1 else 'enlarged'} to {size[1]} x {size[0]}"
+    done = "reduced" if crop.scale < 1 else "enlarged"
+    scaled = "" if crop.scale == 1 else f", {done} to {size[1]} x {size[0]}"
     return (
         f"the model sees {part if cut >= 0.01 else 'all'} of photos such as frame "
-        f"{scene.label(frame)}, {stored[1]} x {stored[0]} pixels, {scaled}"
+        f"{scene.label(frame)}, {stored[1]} x {stored[0]} pixels{scaled}"
     )
 
 
