@@ -122,7 +122,8 @@ def test_photos_as_the_model_wants_them_are_not_remarked_on(
 
 def test_what_a_frame_of_another_shape_or_size_loses() -> None:
     class Stored(Scene):
-        size = stored = (1, 1)
+        size: tuple[int, int] = (1, 1)
+        stored: tuple[int, int] = (1, 1)
 
         @property
         def cameras(self) -> Cameras:
