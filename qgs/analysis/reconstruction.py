@@ -11,7 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.contracts import Scene, ViewsConfig
+from qgs.contracts import Head, Scene, ViewsConfig
+from qgs.data.domain import Domain, verdict
+from qgs.data.images import framing
 from qgs.data.sampling import Sample, make_sample, own_world, training_frames, views_in
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
@@ -27,11 +29,12 @@ from qgs.geometry.poses import look_at
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.ply import write_ply
 from qgs.memory import refuse_beyond_memory
-from qgs.metrics.baselines import BASELINES
+from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
+from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Rendering, Views
-from qgs.wording import listed
+from qgs.wording import listed, numbered
 
 ORBIT_FRAMES = 48
 ORBIT_SIDE = 320
@@ -79,7 +82,9 @@ def choose_frames(
     every = [*frames, *compare]
     twice = sorted({frame for frame in every if every.count(frame) > 1})
     if twice:
-        raise ValueError(f"frames {twice} are named twice; inputs and compared frames must differ")
+        raise ValueError(
+            f"frames named twice: {listed(twice)}; inputs and compared frames must differ"
+        )
     return tuple(frames), tuple(compare)
 
 
@@ -163,7 +168,7 @@ class Reconstruction:
     """Gaussians (1, G) of a sample, and what its cameras see of them.
 
     world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, refinement: of
-    Gaussians; None without. likeness: how the views lie to those that the model was trained on.
+    Gaussians; None without. remarks: sentences on the photos and what came of them.
     """
 
     sample: Sample
@@ -173,7 +178,14 @@ class Reconstruction:
     world: tuple[Tensor, Tensor]
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
-    likeness: str = ""
+    remarks: Sequence[str] = ()
+
+    @property
+    def worse_than_nearest(self) -> str:
+        """As `qgs.metrics.baselines`, on the compared views."""
+        rows = [(s.psnr, s.baselines["nearest_input"]) for s in self.scores if s.baselines]
+        means = [sum(values) / len(rows) for values in zip(*rows, strict=True)]
+        return worse_than_nearest(Psnr.column, *means) if means else ""
 
 
 @torch.no_grad()
@@ -207,6 +219,21 @@ def reconstruct(
         value = quality[len(sample.input_frames) + index]
         scores.append(ViewScore(frame, kind, value, others))
     return Reconstruction(sample, gaussians, rendering, scores, world, tuning, refinement)
+
+
+def remarks_on(
+    result: Reconstruction, scene: Scene, head: Head, trained_on: str | None
+) -> list[str]:
+    """What is to be said of a prediction for photos of `scene`. trained_on: see `verdict`."""
+    sample, found = result.sample, Domain()
+    found.see(sample.inputs.cameras, sample.targets.cameras)
+    said = (
+        verdict(trained_on, found),
+        framing(scene, sample.input_frames[0]),
+        too_many_capped(head, capped_share(head, result.gaussians)),
+        result.worse_than_nearest,
+    )
+    return [*filter(None, said)]
 
 
 def refinement_photos(
@@ -268,7 +295,10 @@ def _write_views(reconstruction: Reconstruction, out: Path) -> None:
         write_png(rows["depth"][i], out / "depth" / name)
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
     quality = [f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}" for score in scores]
-    titles = [f"frame {scores[i].frame}, {kinds[i]}\n{quality[i]}" for i in shown]
+    files = [Path(sample.names.get(s.frame, "")).name for s in scores]
+    titles = [
+        f"frame {numbered(scores[i].frame, files[i])}\n{kinds[i]}, {quality[i]}" for i in shown
+    ]
     chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
     overview = figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
     write_png(overview, out / "overview.png")
@@ -276,12 +306,13 @@ def _write_views(reconstruction: Reconstruction, out: Path) -> None:
 
 def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, Any]:
     reference, scale = reconstruction.world
+    names = reconstruction.sample.names
     cameras = _plain(_cameras(reconstruction.sample))
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
         "tuning": reconstruction.tuning,
-        "likeness": reconstruction.likeness,
+        "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
@@ -289,7 +320,8 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
             "scale": float(scale),
         },
         "views": [
-            {"frame": s.frame, "kind": s.kind, "psnr": round(s.psnr, 3), **camera}
+            {"frame": s.frame, "photo": names.get(s.frame), "kind": s.kind}
+            | {"psnr": round(s.psnr, 3), **camera}
             for s, camera in zip(reconstruction.scores, cameras, strict=True)
         ],
         "orbit": _plain(path),

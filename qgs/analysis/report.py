@@ -138,7 +138,7 @@ def scene_columns(
 ) -> dict[str, Any]:
     """Name, inputs and columns of pictures of a scene. depth: the true one (T, 1, H, W)."""
     shown = sample.targets.select(slice(TARGETS))
-    frames = [f"frame {frame}" for frame in (*sample.input_frames, *sample.target_frames)]
+    frames = [f"frame {sample.label(f)}" for f in (*sample.input_frames, *sample.target_frames)]
     inputs = len(sample.input_frames)
     truth = shown.images[0]
     columns = {"Truth": _photos(truth, frames[inputs:])}
@@ -242,14 +242,14 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
         }
         for caption, part in parts.items():
             if part is not None:
-                maps = patch_maps(part[0, :, 0].mean(0), record.grid)
+                maps = patch_maps(part[0, :, 0], record.grid)
                 picture = side_by_side(attention_pictures(photos, maps))
                 figures.setdefault(contender.name, []).append(Tile(picture, caption))
     return ReportSection(
         "What one query reads",
         "Cross-attention of the heaviest token over the patches of both input views in the last "
         "layer, averaged over heads, dark to bright within each picture. A geometry bias, where "
-        "there is one, is added to the content logits before the softmax.",
+        "there is one, is added to the content logits before the softmax; what it hides is pale.",
         figures,
         width=240,
     )

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from qgs.wording import listed
+
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from qgs.testing import CheckResult
+    from qgs.contracts import Component
+    from qgs.testing import Case, CheckResult
 
 
 def check_plugin(
@@ -28,6 +31,7 @@ def check_plugin(
 
     from qgs.composer.registry import load_plugin
     from qgs.testing import check_plugin as results_of
+    from qgs.testing.exercise import idle_options
     from qgs.testing.plugins import without_case
     from qgs.testing.registry import TIERS
 
@@ -39,11 +43,21 @@ def check_plugin(
         f"{installed.plugin.contract_version}"
     )
     results: list[CheckResult] = []
+    sound: dict[type[Component], list[Case]] = {}
     made = results_of(name, ("core",) if core else TIERS)
     for _, group in groupby(made, key=lambda result: id(result.case)):
         of_case = list(group)
         _summarise(console, of_case)
+        if all(result.ok and not result.leaves_unchecked for result in of_case):
+            sound.setdefault(of_case[0].case.component, []).append(of_case[0].case)
         results += of_case
+    for component, cases in sound.items():
+        for option, tried in idle_options(cases).items():
+            console.print(
+                f"note: {component.slot}/{component.name}: no value of `{option}` that was tried "
+                f"({listed(tried)}) changed anything, so no check exercised it; give an example "
+                "in which it matters for a few queries and tokens"
+            )
     unchecked = without_case(installed)
     for component, why in unchecked.items():
         label = f"{component.slot}/{component.name}"

@@ -83,8 +83,8 @@ def _show_trained(
     report = contest.report_of(entries, " on your photos" if photos else "", lede, {})
     console.print(contest.table_of(entries))
     if photos is not None:
-        told = trained.likeness(files, report.samples)
-        report = replace(report, facts={**report.facts, "Likeness": "; ".join(told)})
+        told = trained.remarks(entries)
+        report = replace(report, facts={**report.facts, "Remarks": "; ".join(told)})
         console.print("\n".join(told), soft_wrap=True, highlight=False, markup=False)
     _write(report, entries, target, console)
 

@@ -73,11 +73,12 @@ def evaluate(
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
     from qgs.composer import resolve
+    from qgs.data.domain import KEY
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
     from qgs.engine.guard import refuse_broken
-    from qgs.io.checkpoint import load, load_recipe, load_step
+    from qgs.io.checkpoint import load, load_extra, load_recipe, load_step
     from qgs.io.models import is_own_path
 
     use_threads(threads)
@@ -95,7 +96,8 @@ def evaluate(
     refuse_broken(model, checkpoint)
     folder = out or evaluation_folder(checkpoint, bool(settings), is_own_path(runs[0]))
     step = load_step(checkpoint)
-    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
+    trained_on = load_extra(checkpoint).get(KEY, "")
+    evaluation = evaluate_into(model, recipe, step, folder, console, batch, trained_on)
     run = RunFolder(checkpoint.parent)
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
@@ -147,6 +149,7 @@ def evaluate_into(
     folder: Path,
     console: Console,
     batch: int = 1,
+    trained_on: str | None = None,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
     from qgs.engine.evaluation import evaluate as judge
@@ -157,7 +160,7 @@ def evaluate_into(
         def observe(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        evaluation = judge(model, recipe, step, batch, observe)
+        evaluation = judge(model, recipe, step, batch, observe, trained_on)
     evaluation.write(folder)
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qgs.cli.options import Checkpoint, Device, Size, parse_size
-from qgs.wording import listed
+from qgs.wording import listed, numbered
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,10 +32,13 @@ def reconstruct(
         int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(help="Input frames, such as 0,8,16; default: spread mid-folder.")
+        str | None,
+        typer.Option(
+            help="Input photos, by number or file name, such as 0,8,x.jpg; default: spread."
+        ),
     ] = None,
     holdout: Annotated[
-        str | None, typer.Option(help="Frames to compare with; default: six between the inputs.")
+        str | None, typer.Option(help="Photos to compare with; default: six between the inputs.")
     ] = None,
     tune: Annotated[
         int, typer.Option(min=0, help="Steps of token tuning on the input photos; 0 for none.")
@@ -82,7 +85,6 @@ def reconstruct(
         )
     if foreign := [text for text in overrides or () if not text.startswith("views.")]:
         raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
-    chosen, compared = frame_list(frames, "--frames"), frame_list(holdout, "--holdout")
     pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
     refuse_unused(
         refine,
@@ -91,11 +93,11 @@ def reconstruct(
 
     from rich.console import Console
 
-    from qgs.analysis.reconstruction import choose_sample, write_reconstruction
+    from qgs.analysis.reconstruction import choose_sample, remarks_on, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
-    from qgs.data.domain import KEY, Domain, verdict
+    from qgs.data.domain import KEY
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.engine.guard import refuse_broken
@@ -114,7 +116,8 @@ def reconstruct(
         console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
     sources = registry.components("data")
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
-    sample, world = choose_sample(scene, recipe.views, inputs, chosen, compared)
+    wanted = (frame_list(frames, "--frames", scene), frame_list(holdout, "--holdout", scene))
+    sample, world = choose_sample(scene, recipe.views, inputs, *wanted)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     tuned = record = None
     if tune:
@@ -125,17 +128,18 @@ def reconstruct(
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, tuned, record)
-    found = Domain()
-    found.see(sample.inputs.cameras, sample.targets.cameras)
-    result = replace(result, likeness=verdict(load_extra(file).get(KEY), found))
+    remarks = remarks_on(result, scene, model.head, load_extra(file).get(KEY))
+    result = replace(result, remarks=remarks)
     console.print(score_table(result, "feed-forward" if refine else ""))
-    console.print(result.likeness, soft_wrap=True, highlight=False)
+    console.print("\n".join(remarks), soft_wrap=True, highlight=False, markup=False)
     paths = write_reconstruction(model, result, out)
     if refine:
         if fine is not None:
             scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
         better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
         console.print(score_table(better, "refined"))
+        if better.worse_than_nearest:
+            console.print(better.worse_than_nearest, soft_wrap=True, highlight=False)
         paths += write_reconstruction(model, better, out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -164,6 +168,7 @@ def refined(
         highlight=False,
     )
     record = {"seconds": result.seconds, "steps": result.steps, "frames": frames}
+    record |= {"photos": [scene.frame_name(frame) for frame in frames]}
     record |= {"stopped_by": result.stopped_by, "curve": [asdict(p) for p in result.curve]}
     return reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
 
@@ -217,16 +222,26 @@ def chosen_scene(
     return scene, training_frames(scene) if seen else ()
 
 
-def frame_list(text: str | None, option: str) -> list[int] | None:
-    """Frame numbers of "0,8,16"; None stays None. Raises ValueError for anything else."""
+def frame_list(text: str | None, option: str, scene: Scene) -> list[int] | None:
+    """Frame numbers of "0,8,x.jpg"; None stays None. A photo's folders may be left out.
+
+    Raises ValueError for what is neither a number nor the name of one photo of `scene`.
+    """
     if text is None:
         return None
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(
-            f"{option} takes frame numbers with commas between, such as 0,8,16; got {text!r}"
-        ) from None
+    names = [scene.frame_name(frame) for frame in range(len(scene))]
+    frames: list[int] = []
+    for part in map(str.strip, text.split(",")):
+        found = [f for f, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
+        found = [int(part)] if part.removeprefix("-").isdecimal() else found
+        if len(found) != 1:
+            raise ValueError(
+                f"{option} takes numbers or file names of photos with commas between, such as "
+                f"0,8,16; {part!r} of {text!r} is {listed(map(scene.label, found)) or 'none'}. "
+                f"The photos are {scene.label(0)} to {scene.label(len(names) - 1)}"
+            )
+        frames += found
+    return frames
 
 
 def score_table(result: Reconstruction, what: str = "") -> Table:
@@ -242,15 +257,16 @@ def score_table(result: Reconstruction, what: str = "") -> Table:
 
     count = f"{result.gaussians.count:,} Gaussians"
     table = Table(title=f"{result.sample.scene}: {f'{what}, {count}' if what else count}")
-    table.add_column("view")
+    table.add_column("view", no_wrap=True)
     shown = Psnr.column.shown
-    for name in ("frames", Psnr.column.heading, *BASELINES):
+    for name in ("photo", Psnr.column.heading, *BASELINES):
         table.add_column(name.replace("_", " "), justify="right")
     for kind in KINDS:
         scores = [score for score in result.scores if score.kind == kind]
         rows = [[score.psnr, *score.baselines.values()] for score in scores]
         for score, row in zip(scores, rows, strict=True):
-            table.add_row(kind, str(score.frame), *map(shown, row))
+            file = Path(result.sample.names.get(score.frame, "")).name
+            table.add_row(kind, numbered(score.frame, file), *map(shown, row))
         if rows:
             means = [shown(sum(values) / len(rows)) for values in zip(*rows, strict=True)]
             table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")

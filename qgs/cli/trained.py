@@ -7,9 +7,8 @@ from qgs.cli import contest
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import SceneSource, SceneSourceConfig
-from qgs.data.domain import KEY, Domain, verdict
+from qgs.data.domain import KEY
 from qgs.data.recognition import open_for
-from qgs.data.sampling import Sample
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import checkpoint_of
@@ -39,18 +38,17 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
         contest.refuse_unequal(name, recipe, first, other, contest.JUDGED)
     for name, recipe in recipes.items():
         model = load(files[name], choose_device(device))
-        entries.append(contest.entry_of(name, recipe, evaluate(model, recipe), model))
+        evaluation = evaluate(model, recipe, trained_on=load_extra(files[name]).get(KEY, ""))
+        entries.append(contest.entry_of(name, recipe, evaluation, model))
     return entries
 
 
-def likeness(files: Mapping[str, Path], samples: Sequence[Sample]) -> list[str]:
-    """How `samples` lie to what each model in `files` was trained on, a sentence once."""
-    found = Domain()
-    for sample in samples:
-        found.see(sample.inputs.cameras, sample.targets.cameras)
+def remarks(entries: Sequence[contest.Entry]) -> list[str]:
+    """What is to be said of the models' results, each sentence once."""
     told: dict[str, list[str]] = {}
-    for name, file in files.items():
-        told.setdefault(verdict(load_extra(file).get(KEY), found), []).append(name)
+    for entry in entries:
+        for sentence in entry.evaluation.remarks:
+            told.setdefault(sentence, []).append(entry.contender.name)
     return [f"{', '.join(models)}: {sentence}" for sentence, models in told.items()]
 
 

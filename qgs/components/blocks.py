@@ -47,12 +47,12 @@ def merge_heads(x_BhTd: Tensor) -> Tensor:
     return rearrange(x_BhTd, "b h t d -> b t (h d)")
 
 
-def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_B1QT: Tensor | None) -> AttentionWeights:
-    """The parts of scaled dot-product attention, computed in float32."""
+def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) -> AttentionWeights:
+    """The parts of scaled dot-product attention, computed in float32. bias: for one head or all."""
     scale = q_BhQd.shape[-1] ** -0.5
     content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
-    logits_BhQT = content_BhQT if bias_B1QT is None else content_BhQT + bias_B1QT
-    return AttentionWeights(content_BhQT, bias_B1QT, logits_BhQT.softmax(-1))
+    logits_BhQT = content_BhQT if bias_BhQT is None else content_BhQT + bias_BhQT
+    return AttentionWeights(content_BhQT, bias_BhQT, logits_BhQT.softmax(-1))
 
 
 class SelfAttentionCore(nn.Module):
@@ -99,19 +99,25 @@ class CrossAttentionCore(nn.Module):
         return self.q_norm(split_heads(self.q_proj(self.norm(x_BND)), self.heads))
 
     def forward(
-        self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias_BNM: Tensor | None = None
+        self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None = None
     ) -> Tensor:
-        """(B, N, D); `bias_BNM` is shared by all heads."""
+        """(B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M); -inf hides a token."""
         q_BhNd = self.project(x_BND).to(v_BhMd.dtype)
-        bias_B1NM = None if bias_BNM is None else bias_BNM[:, None].to(v_BhMd.dtype)
+        bias_BhNM = None if bias is None else _by_head(bias).to(v_BhMd.dtype)
         k_BhMd = k_BhMd.to(v_BhMd.dtype)
-        read_BhNd = F.scaled_dot_product_attention(q_BhNd, k_BhMd, v_BhMd, attn_mask=bias_B1NM)
+        read_BhNd = F.scaled_dot_product_attention(q_BhNd, k_BhMd, v_BhMd, attn_mask=bias_BhNM)
         return self.out_proj(merge_heads(read_BhNd))
 
     def explain(
-        self, x_BND: Tensor, k_BhMd: Tensor, queries: Tensor, bias_BNM: Tensor | None = None
+        self, x_BND: Tensor, k_BhMd: Tensor, queries: Tensor, bias: Tensor | None = None
     ) -> AttentionWeights:
-        """Attention of the queries with indices `queries` (Q,)."""
+        """Attention of the queries with indices `queries` (Q,), with the bias as in `forward`."""
         q_BhQd = self.project(x_BND)[:, :, queries]
-        bias_B1QM = None if bias_BNM is None else bias_BNM[:, None, queries]
-        return attention_weights(q_BhQd, k_BhMd, bias_B1QM)
+        full = (len(x_BND), -1, x_BND.shape[1], k_BhMd.shape[2])
+        bias_BhQM = None if bias is None else _by_head(bias).expand(full)[:, :, queries]
+        return attention_weights(q_BhQd, k_BhMd, bias_BhQM)
+
+
+def _by_head(bias: Tensor) -> Tensor:
+    """(B, N, M) -> (B, 1, N, M); one that has heads stays."""
+    return bias if bias.ndim == 4 else bias[:, None]

@@ -10,13 +10,18 @@ from upath import UPath
 
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.types import Cameras
+from qgs.wording import numbered
 
 Split = Literal["train", "test"]
 Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 
 class Scene(ABC):
-    """Frames of one scene, decoded only when asked for."""
+    """Frames of one scene, decoded only when asked for.
+
+    A frame's number is its place, from 0, among those that are there: indices, held-out lists,
+    options, tables and messages all mean this number.
+    """
 
     name: str
     held_out: Sequence[int] = ()
@@ -43,6 +48,14 @@ class Scene(ABC):
     def frame_name(self, frame: int) -> str:
         """What a person knows a frame by: a file name or a time stamp."""
         return str(frame)
+
+    def label(self, frame: int) -> str:
+        """Number and name of a frame, for messages."""
+        return numbered(frame, self.frame_name(frame))
+
+    def stored_size(self, frame: int) -> tuple[int, int] | None:
+        """(H, W) of the photo before it is delivered; None where images are made to measure."""
+        return None
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
         """Camera-frame z (len(frames), 1, H, W), world units; None where it is not known."""

@@ -357,7 +357,7 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
     if missing:
         warn_once(
             f"{len(missing)} of {len(index)} scenes of {folder / INDEX} are left out, because "
-            f"their chunks do not exist: {', '.join(missing)}"
+            f"their chunks do not exist: {listed(missing)}"
         )
     return here
 

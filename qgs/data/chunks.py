@@ -23,6 +23,7 @@ from qgs.data.chunk_files import (
     require_usable,
 )
 from qgs.data.images import CropResize, decode_rgb, to_tensor
+from qgs.data.lenses import Size
 from qgs.data.paths import opened_path
 from qgs.data.scenes import (
     BoundedCache,
@@ -97,6 +98,10 @@ class ChunkScene(EncodedScene):
     def frame_name(self, frame: int) -> str:
         """See `Scene`: the writer's name of a frame, else its time stamp."""
         return self._record.names[frame]
+
+    def stored_size(self, frame: int) -> Size:
+        """See `Scene`."""
+        return self._record.stored_size(frame)
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`. Raises ValueError for an image that cannot be decoded."""
@@ -227,7 +232,7 @@ def _long_enough(
     frames = {key: len(opener(key, file)) for key, file in by_file}
     short = {key: count for key, count in frames.items() if count < config.min_frames}
     if short:
-        names = ", ".join(f"{key} ({count})" for key, count in short.items())
+        names = listed(f"{key} ({count})" for key, count in short.items())
         warn_once(
             f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
             f"{config.min_frames} frames (min_frames) and are left out: {names}"

@@ -67,8 +67,8 @@ class Dl3dvSource(LazySource):
             test = {name: places[name] for name in named if name in places}
             train = {name: place for name, place in places.items() if name not in test}
             if absent:
-                names = ", ".join(absent)
-                warn_once(f"{len(absent)} of {len(named)} test scenes are not there: {names}")
+                told = f"{len(absent)} of {len(named)} test scenes are not there"
+                warn_once(f"{told}: {listed(absent, 3)}")
         same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
         photos = PhotosConfig(format="nerfstudio", **same)
         opener = partial(_opened, config=photos, cache=image_cache(0))
@@ -116,7 +116,7 @@ def find_scenes(path: UPath) -> dict[str, Place]:
     if again:
         warn_once(
             f"{len(again)} scenes of {path} are there more than once, as folders or archives; one "
-            f"of each is read: {', '.join(f'{name} ({scenes[name]})' for name in again)}"
+            f"of each is read: {listed((f'{name} ({scenes[name]})' for name in again), 3)}"
         )
     return scenes
 

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
+from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
 from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, training_frames
 from qgs.geometry.poses import largest_distance
@@ -90,7 +91,8 @@ class EvaluationPlan:
     the others `evaluation.samples` samples, inputs drawn as in training with `evaluation.seed`,
     targets the other frames of the span.
 
-    wanted, null, unlisted: see `qgs.engine.results.Evaluation`. Raises ValueError without scenes.
+    wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
+    drawn: whether samples were, once `samples` has run. Raises ValueError without scenes.
     """
 
     def __init__(
@@ -100,6 +102,7 @@ class EvaluationPlan:
         evaluation: EvaluationConfig,
         index: EvaluationIndex | None = None,
     ) -> None:
+        self.framing, self.drawn = "", False
         self._scenes = source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
@@ -123,6 +126,7 @@ class EvaluationPlan:
                 place = self._places[name]
                 scene = self._scenes[place]
                 for frames in self._choices(scene, place):
+                    self.framing = self.framing or framing(scene, frames[0][0])
                     yield make_sample(scene, *frames, self._views, mirror=False)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
@@ -137,6 +141,7 @@ class EvaluationPlan:
             kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
             yield from (windows[i] for i in kept)
         else:
+            self.drawn = True
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])
                 inputs, drawn = draw_frames(scene, self._views, rng)
@@ -207,11 +212,13 @@ def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
     if scene.missing:
         raise ValueError(
             f"{len(scene.missing)} of its listed images do not exist, so that positions "
-            f"of the index would mean other frames: {listed(scene.missing)}"
+            f"of the index would mean other frames: {listed(scene.missing, 3)}"
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
-        numbers = ", ".join(map(str, outside))
-        which = f"frames {numbers} are" if len(outside) > 1 else f"frame {numbers} is"
-        raise ValueError(f"{which} out of range, it has frames 0 to {len(scene) - 1}")
+        which = f"frame{'s' if len(outside) > 1 else ''} {listed(outside)}"
+        ends = f"frames {scene.label(0)} to {scene.label(len(scene) - 1)}"
+        raise ValueError(
+            f"{which} {'are' if len(outside) > 1 else 'is'} out of range, it has {ends}"
+        )
     return tuple(entry.context), tuple(entry.target)

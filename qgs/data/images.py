@@ -13,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 from upath import UPath
 
+from qgs.contracts import Scene
 from qgs.data.paths import open_file
 from qgs.data.scenes import warn_once
 
@@ -56,6 +57,23 @@ class CropResize:
     ) -> np.ndarray:
         """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel."""
         return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
+
+
+def framing(scene: Scene, frame: int) -> str:
+    """A sentence on what a model sees of a photo; "" where that is all, as it is stored."""
+    stored, size = scene.stored_size(frame), scene.cameras.size
+    if stored is None or stored == size:
+        return ""
+    crop = CropResize(stored, size)
+    left, top, right, bottom = crop.box
+    cut = 1 - (right - left) * (bottom - top) / (stored[0] * stored[1])
+    part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
+    done = "reduced" if crop.scale < 1 else "enlarged"
+    scaled = "" if crop.scale == 1 else f", {done} to {size[1]} x {size[0]}"
+    return (
+        f"the model sees {part if cut >= 0.01 else 'all'} of photos such as frame "
+        f"{scene.label(frame)}, {stored[1]} x {stored[0]} pixels{scaled}"
+    )
 
 
 @contextmanager

@@ -5,8 +5,8 @@ Everything here is a pure function of its arguments and of the random generator 
 Images are moved by NumPy, on one thread: torch's would wait for cores that training holds.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -26,19 +26,28 @@ from qgs.geometry.poses import (
 )
 from qgs.memory import refuse_beyond_memory
 from qgs.types import Cameras, Views, map_tensors
+from qgs.wording import numbered
 
 Frames: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Input and target Views (1, V) of one scene, in the frame of the inputs."""
+    """Input and target Views (1, V) of one scene, in the frame of the inputs.
+
+    names: of frames that are known by more than their number, such as by a file.
+    """
 
     scene: str
     inputs: Views
     targets: Views
     input_frames: Frames
     target_frames: Frames
+    names: Mapping[int, str] = field(default_factory=dict)
+
+    def label(self, frame: int) -> str:
+        """See `Scene`."""
+        return numbered(frame, self.names.get(frame, ""))
 
 
 @dataclass(frozen=True)
@@ -132,7 +141,9 @@ def make_sample(
     both = mirrored_views(both) if mirror else both
     count = len(input_frames)
     inputs, targets = both.select(slice(0, count)), both.select(slice(count, None))
-    return Sample(scene.name, inputs, targets, input_frames, target_frames)
+    names = {frame: scene.frame_name(frame) for frame in (*input_frames, *target_frames)}
+    names = {frame: name for frame, name in names.items() if name != str(frame)}
+    return Sample(scene.name, inputs, targets, input_frames, target_frames, names)
 
 
 def views_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Views:

@@ -24,6 +24,7 @@ from qgs.data.evaluation import one_line
 from qgs.data.paths import is_local, opened_path
 from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
 from qgs.memory import is_out_of_memory
+from qgs.wording import listed
 
 
 @dataclass(frozen=True)
@@ -173,8 +174,8 @@ def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
             scene.images([frame])
             scene.masks([frame])
         except Exception as own:
-            return f"scene {scene.name!r}, frame {frame} ({scene.frame_name(frame)}): {own}"
-    return f"scene {scene.name!r}, frames {sorted(set(frames))}: {error}"
+            return f"scene {scene.name!r}, frame {scene.label(frame)}: {own}"
+    return f"scene {scene.name!r}, frames {listed(map(scene.label, sorted({*frames})))}: {error}"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from qgs.drawing.figures import INK, Color, categorical
-from qgs.drawing.images import Picture, enlarged, rgb_picture, washed
+from qgs.drawing.images import NOTHING, Picture, enlarged, rgb_picture, washed
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.model import QueryGaussianModel
@@ -98,21 +98,31 @@ def support_picture(
     return _reduced(image)
 
 
-def patch_maps(row_M: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
-    """Scores (M,) of image tokens as one map per view (V, H/P, W/P)."""
-    return row_M.detach().float().cpu().reshape(grid).numpy()
+def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
+    """Scores (h, M) of image tokens as one map per view (V, H/P, W/P), the mean over heads.
+
+    Heads that a mask keeps from a token (-inf) do not count; NaN where none sees it.
+    """
+    scores = rows_hM.detach().float().cpu()
+    return scores.masked_fill(scores.isinf(), torch.nan).nanmean(0).reshape(grid).numpy()
 
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
-    """Each photo in pale grey with its map on top; the views share one colour scale."""
-    low, high = float(maps.min()), float(maps.max())
-    shades = (maps - low) / max(high - low, 1e-12)
+    """Each photo in pale grey with its map on top; the views share one colour scale.
+
+    Tokens without a score (NaN) have the colour of nothing.
+    """
+    seen = maps[np.isfinite(maps)]
+    low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
+    hidden = [~np.isfinite(view) for view in maps]
+    shades = np.nan_to_num((maps - low) / max(high - low, 1e-12))
     pictures = []
-    for photo, shade in zip(photos, shades, strict=True):
-        height, width = photo.shape[:2]
+    for photo, shade, unseen in zip(photos, shades, hidden, strict=True):
+        size = photo.shape[1::-1]
         patches = Image.fromarray((shade * 255).round().astype(np.uint8))
-        cells = np.asarray(patches.resize((width, height), Image.Resampling.NEAREST)) / 255
+        cells = np.asarray(patches.resize(size, Image.Resampling.NEAREST)) / 255
         color = colormaps[ATTENTION_MAP](cells)[..., :3] * 255
+        color[np.asarray(Image.fromarray(unseen).resize(size, Image.Resampling.NEAREST))] = NOTHING
         mixed = 0.72 * color + 0.28 * washed(photo, 0.2)
         pictures.append(mixed.round().astype(np.uint8))
     return pictures

@@ -189,7 +189,7 @@ class Saver:
         missing = [name for name in self.parts if name not in saved.parts]
         if missing:
             raise CheckpointError(
-                f"{self.folder.state} lacks {', '.join(missing)}: another version of qgs wrote "
+                f"{self.folder.state} lacks {listed(missing)}: another version of qgs wrote "
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():

@@ -3,21 +3,25 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean as mean
 
 import torch
 
 from qgs.composer import Recipe
 from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
+from qgs.data.domain import Domain, verdict
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
 from qgs.data.sampling import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
-from qgs.metrics.baselines import BASELINES
+from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
+from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
@@ -31,13 +35,15 @@ def evaluate(
     step: int | None = None,
     batch: int = 1,
     observe: Callable[[int, int], None] | None = None,
+    trained_on: str | None = None,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
     A scene that fails is named in the result with the reason, and the others go on. Leaves the
     model in the mode it was in. step: optimiser steps behind the weights. batch: scenes that pass
     through the model together; with tuned tokens each passes alone. observe: called with how many
-    scenes are done, and how many there are.
+    scenes are done, and how many there are. trained_on: `Domain.text` of the model, "" where it
+    is not known; None says nothing of it.
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene at all could be judged or `batch` is less than 1.
     """
@@ -57,7 +63,7 @@ def evaluate(
     if not scores:
         first = f"{missing[0].scene}: {missing[0].reason}"
         raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
-    return Evaluation(
+    evaluation = Evaluation(
         protocol=protocol_of(recipe, index, plan.wanted),
         columns=measures.columns,
         scores=scores,
@@ -70,6 +76,26 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
+    likeness = "" if trained_on is None else verdict(trained_on, judge.seen)
+    said = (likeness, plan.framing, *_remarks(evaluation, plan, recipe, model))
+    return replace(evaluation, remarks=[*filter(None, said)])
+
+
+def _remarks(
+    evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe, model: QueryGaussianModel
+) -> Iterator[str]:
+    """Sentences on what came of an evaluation, "" for those that do not apply."""
+    scores, samples = evaluation.scores, recipe.evaluation.samples
+    if samples > 1 and not plan.drawn:
+        why = "the index names the views"
+        if evaluation.held_out:
+            why = "{} of {} held-out frames are judged, each once".format(*evaluation.held_out)
+        yield f"evaluation.samples={samples} changed nothing, since no views were drawn: {why}"
+    yield too_many_capped(model.head, mean(s.values["scales_at_cap"] for s in scores))
+    if evaluation.columns and not any(score.given for score in scores):
+        name, column = next(iter(evaluation.columns.items()))
+        nearest = evaluation.mean(name, "nearest_input")
+        yield worse_than_nearest(column, evaluation.mean(name), nearest)
 
 
 class Measures:
@@ -144,6 +170,7 @@ class _Judge:
         self._source = source
         self._device = next(model.parameters()).device
         self._measures = measures
+        self.seen = Domain()
         for metric in measures.metrics.values():
             metric.to(self._device)
         self._tune = None
@@ -181,6 +208,7 @@ class _Judge:
     ) -> SceneScore | SceneFailure:
         values: dict[str, float] = {}
         try:
+            self.seen.see(sample.inputs.cameras, sample.targets.cameras)
             inputs = sample.inputs.to(self._device)
             if self._tune:
                 tuning = self._tune(inputs)
@@ -193,7 +221,8 @@ class _Judge:
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         if broken:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
-        return SceneScore(sample.scene, [(sample.input_frames, sample.target_frames)], values)
+        frames = (sample.input_frames, sample.target_frames)
+        return SceneScore(sample.scene, [frames], values, sample.names)
 
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
         targets = sample.targets.to(self._device)
@@ -211,7 +240,8 @@ class _Judge:
         values: dict[str, float] = {}
         for method, shown in given.items():
             values |= self._measures(method, shown)
-        return {**values, "gaussians_used": float((gaussians.opacities > OPACITY_USED).sum())}
+        values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
+        return {**values, "scales_at_cap": capped_share(self._model.head, gaussians)}
 
 
 def _name(metric: str, key: str) -> str:
@@ -239,7 +269,8 @@ def _by_scene(
         common = [key for key in found[0] if all(key in values for values in found)]
         means = {key: sum(values[key] for values in found) / len(found) for key in common}
         views = [frames for sample in samples[name] for frames in sample.views]
-        scores.append(SceneScore(name, views, means))
+        names = {frame: n for sample in samples[name] for frame, n in sample.names.items()}
+        scores.append(SceneScore(name, views, means, names))
     return scores, [failures[name] for name in wanted if name in failures]
 
 

@@ -20,12 +20,13 @@ from qgs.engine.protocol import Protocol
 from qgs.io.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
-from qgs.wording import listed
+from qgs.wording import listed, numbered
 
 METHODS = ("model", *BASELINES)
 TUNING = ("tuning_loss_before", "tuning_loss_after")
 _FRAMES = ("scene", "input_frames", "target_frames")
-"""Columns of scenes.csv before the values; `problem` stands behind them."""
+_NAMES = ("input_names", "target_names")
+"""Columns of scenes.csv before the values, _NAMES where frames have names; `problem` is last."""
 _MOST_MISSING = 10
 """How many missing scenes the notes give the reason of."""
 
@@ -38,7 +39,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class SceneScore:
-    """One scene. views: input and target frames of each of its samples.
+    """One scene. views: input and target frames of each of its samples; names: as in `Sample`.
 
     values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNING; less
     those whose metric needs what the method or the scene lacks.
@@ -47,6 +48,7 @@ class SceneScore:
     scene: str
     views: Sequence[tuple[Frames, Frames]]
     values: Mapping[str, float]
+    names: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def given(self) -> tuple[int, ...]:
@@ -64,6 +66,7 @@ class Evaluation:
     unlisted: scenes of the data that the index lacks. gaussians: of a scene. incomplete: values
     that scenes lack, and why. held_out: how many held-out frames were judged, and how many there
     are; None where the test scenes hold none out. step: optimiser steps behind the weights.
+    remarks: sentences on what was judged and what came of it.
     """
 
     protocol: Protocol
@@ -77,6 +80,7 @@ class Evaluation:
     incomplete: Mapping[str, str] = field(default_factory=dict)
     held_out: tuple[int, int] | None = None
     step: int | None = None
+    remarks: Sequence[str] = ()
 
     def mean(self, metric: str, method: str = "model") -> float | None:
         """Mean over scenes of one of `columns`, each scene once; None if none has this value."""
@@ -123,6 +127,7 @@ class Evaluation:
             "gaussians_used": {"opacity_above": OPACITY_USED, **used},
             "tuning": self._tuning(),
             "held_out_frames": self.held_out,
+            "remarks": list(self.remarks),
         }
 
     def write(self, folder: str | Path) -> None:
@@ -178,13 +183,19 @@ class Evaluation:
         reasons = {failure.scene: failure.reason for failure in self.missing}
         columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
         text = io.StringIO()
-        writer = csv.DictWriter(text, [*_FRAMES, *columns, "problem"], lineterminator="\n")
+        named = _NAMES if any(score.names for score in self.scores) else ()
+        fields = [*_FRAMES, *named, *columns, "problem"]
+        writer = csv.DictWriter(text, fields, lineterminator="\n")
         writer.writeheader()
         for name in self.wanted:
             row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
             if score := judged.get(name):
-                for key, side in zip(_FRAMES[1:], zip(*score.views, strict=True), strict=True):
+                sides = [*zip(*score.views, strict=True)]
+                for key, side in zip(_FRAMES[1:], sides, strict=True):
                     row[key] = "; ".join(" ".join(map(str, frames)) for frames in side)
+                for key, side in zip(named, sides, strict=bool(named)):
+                    names = ([score.names.get(f, str(f)) for f in frames] for frames in side)
+                    row[key] = "; ".join(", ".join(frames) for frames in names)
                 row |= score.values
             writer.writerow(row)
         return text.getvalue()
@@ -207,7 +218,10 @@ class Evaluation:
         if names := self.unlisted:
             yield f"scenes that the index lacks, not judged ({len(names)}): {listed(names)}"
         if given := [score for score in self.scores if score.given]:
-            named = [f"{score.scene} ({' '.join(map(str, score.given))})" for score in given]
+            named = [
+                f"{s.scene} ({listed(numbered(f, s.names.get(f, '')) for f in s.given)})"
+                for s in given
+            ]
             yield (
                 f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the "
                 f"nearest input view is perfect: {listed(named)}"
@@ -229,6 +243,7 @@ class Evaluation:
                 f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
                 f"{tuning['loss_after']:.4f}"
             )
+        yield from self.remarks
 
 
 def as_json(value: Mapping[str, Any]) -> str:
@@ -314,7 +329,7 @@ def read_results(path: str | Path) -> StoredResults:
             protocol=Protocol(summary["protocol"]["name"], content),
             columns={name: Column(**column) for name, column in summary["columns"].items()},
             scenes={
-                scene: {k: float(v) for k, v in row.items() if k not in _FRAMES and v}
+                scene: {k: float(v) for k, v in row.items() if k not in (*_FRAMES, *_NAMES) and v}
                 for scene, row in judged.items()
             },
             frames={s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()},

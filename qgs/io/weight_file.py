@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from qgs.io.checkpoint import CheckpointError, opened_tensors, pickle_kind, read_tensors
+from qgs.wording import listed
 
 SAFETENSORS = (".safetensors",)
 TORCH = (".pt", ".pth", ".bin", ".ckpt")
@@ -105,10 +106,10 @@ def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]
     if len(inner) != 1:
         among = f"more than one of them ({', '.join(inner)})" if inner else "none of them"
         raise CheckpointError(
-            f"{path} holds entries that are no tensors ({', '.join(others)}); a state dict may lie "
+            f"{path} holds entries that are no tensors ({listed(others)}); a state dict may lie "
             f"below {', '.join(NESTING)}, and {among} is a mapping here: save it alone"
         )
     left = [str(key) for key in content if key != inner[0]]
-    beside = f", beside {', '.join(left)}, which are left out" if left else ""
+    beside = f", beside {listed(left)}, which are left out" if left else ""
     notes.append(f"the weights lie below {inner[0]!r}{beside}")
     return _state_dict(content[inner[0]], path, notes)

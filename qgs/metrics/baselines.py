@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from qgs.contracts import Column
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, Views
 
@@ -26,6 +27,17 @@ def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
 
 BASELINES = {"nearest_input": nearest_input, "mean_colour": mean_colour}
 """By their names in results; tables write blanks for underscores."""
+
+
+def worse_than_nearest(column: Column, model: float | None, nearest: float | None) -> str:
+    """A sentence where `nearest_input` scores better than the model, else ""."""
+    if model is None or nearest is None or column.best((model, nearest)) == model:
+        return ""
+    return (
+        f"the result is worse than the nearest photo, copied: {column.heading} "
+        f"{column.shown(model)} against {column.shown(nearest)}. Do not rely on it: choose inputs "
+        "nearer to the views that are wanted, or train longer, or on photos like these"
+    )
 
 
 @full_precision

@@ -141,12 +141,27 @@ def test_pictures_keep_their_pixels():
 def test_attention_maps_share_one_scale_over_the_views():
     scores = torch.zeros(8)
     scores[5] = 1.0
-    maps = patch_maps(scores, (2, 2, 2))
+    maps = patch_maps(scores[None], (2, 2, 2))
     assert maps[1, 0, 1] == 1
     white = [np.full((16, 16, 3), 255, np.uint8)] * 2
     first, second = attention_pictures(white, maps)
     assert np.ptp(first.reshape(-1, 3), axis=0).max() == 0
     assert (second[:8, 8:].astype(int) > second[8:, :8]).all()
+
+
+def test_what_a_mask_hides_has_the_colour_of_nothing_and_no_part_in_the_scale():
+    scores = torch.tensor([[0.0, 1.0, -torch.inf, -torch.inf], [0.0, 3.0, 2.0, -torch.inf]])
+    maps = patch_maps(scores, (1, 2, 2))
+    np.testing.assert_array_equal(maps[0], [[0, 2], [2, np.nan]])
+    black = [np.zeros((4, 4, 3), np.uint8)]
+    with np.errstate(all="raise"):
+        (picture,) = attention_pictures(black, maps)
+        (plain,) = attention_pictures(black, np.nan_to_num(maps))
+        (none,) = attention_pictures(black, np.full_like(maps, np.nan))
+    assert (picture[:, :2] == plain[:, :2]).all()
+    ground = washed(black[0], 0.2)[0, 0, 0]
+    assert (picture[2:, 2:] == np.round(0.72 * np.array(NOTHING) + 0.28 * ground)).all()
+    assert (none == picture[3, 3]).all()
 
 
 def test_curves_are_drawn_for_each_model():

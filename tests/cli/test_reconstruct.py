@@ -1,11 +1,12 @@
 import json
 import re
+import shutil
 from functools import partial
 
 import numpy as np
 import pytest
 from commands import MODEL, run_qgs
-from photo_formats import row_of_frames
+from photo_formats import opened, row_of_frames
 from PIL import Image
 from plyfile import PlyData
 
@@ -123,11 +124,34 @@ def test_a_missing_checkpoint_and_missing_photos_are_told(checkpoint, photos, tm
     assert not (tmp_path / "b").exists()
 
 
-def test_frames_that_are_no_numbers_are_refused():
-    assert frame_list("0,8", "--frames") == [0, 8]
-    assert frame_list(None, "--frames") is None
-    with pytest.raises(ValueError, match=r"--frames takes frame numbers.*'0-8'"):
-        frame_list("0-8", "--frames")
+def test_photos_are_named_by_number_or_file(checkpoint, photos, tmp_path):
+    named = ("--frames", "0.png,images/3.png", "--holdout", "1, 2.png")
+    result = run(checkpoint, photos, "--out", tmp_path, *named)
+    assert result.exception is None, result.exception
+    views = json.loads((tmp_path / "cameras.json").read_text())["views"]
+    assert [view["frame"] for view in views] == [0, 3, 1, 2]
+    assert [view["photo"] for view in views] == [f"images/{i}.png" for i in (0, 3, 1, 2)]
+    for label in ("0 (0.png)", "3 (3.png)", "1 (1.png)"):
+        assert label in result.output
+
+
+def test_photos_that_are_not_there_are_refused(photos, tmp_path):
+    scene = opened(photos).scenes("train")[0]
+    assert frame_list("0,8", "--frames", scene) == [0, 8]
+    assert frame_list(None, "--frames", scene) is None
+    ends = r"The photos are 0 \(images/0\.png\) to 6 \(images/6\.png\)"
+    with pytest.raises(ValueError, match=rf"'0-8' of '0-8' is none\. {ends}"):
+        frame_list("0-8", "--frames", scene)
+    for folder in "ab":
+        shutil.copytree(photos / "images", tmp_path / folder)
+    frames = row_of_frames(2, fl_x=20, fl_y=20, cx=12, cy=10, w=24, h=20)
+    for folder, frame in zip("ab", frames["frames"], strict=True):
+        frame["file_path"] = f"{folder}/1.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(frames))
+    twins = opened(tmp_path).scenes("train")[0]
+    assert frame_list("b/1.png", "--frames", twins) == [1]
+    with pytest.raises(ValueError, match=r"'1\.png' is 0 \(a/1\.png\), 1 \(b/1\.png\)"):
+        frame_list("1.png", "--frames", twins)
 
 
 def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tmp_path):

@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from qgs import Cameras, QueryState, Views
-from qgs.components import FreeCenters, GaussianHead, LayerSupervision, MultiViewViT, posact
-from qgs.contracts import ModelDims, RecipeContext
+from qgs.components import (
+    CrossAttentionCore,
+    FreeCenters,
+    GaussianHead,
+    LayerSupervision,
+    MultiViewViT,
+    posact,
+)
+from qgs.contracts import AttentionWeights, ModelDims, RecipeContext
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
 
@@ -95,3 +102,40 @@ def test_free_centers_ignore_the_state() -> None:
 def test_supervision_weights(layers: tuple[int, ...], expected: dict[int, float]) -> None:
     weights = LayerSupervision(LayerSupervision.Config(layers=layers)).weights()
     assert weights == pytest.approx(expected)
+
+
+def test_a_bias_is_for_all_heads_or_for_each() -> None:
+    core = CrossAttentionCore(16, 2)
+    features, bias = torch.randn(2, 3, 16), torch.randn(2, 2, 3, 5)
+    keys, values = torch.randn(2, 2, 2, 5, 8).unbind()
+    alike = bias[:, :1].expand_as(bias)
+    shared = core(features, keys, values, bias[:, 0])
+    for same in (bias[:, :1], alike):
+        torch.testing.assert_close(core(features, keys, values, same), shared)
+    logits = core.project(features) @ keys.mT / 8**0.5 + bias
+    read = (logits.softmax(-1) @ values).transpose(1, 2).flatten(2)
+    torch.testing.assert_close(core(features, keys, values, bias), core.out_proj(read))
+    queries = torch.tensor([2, 0])
+    explained = core.explain(features, keys, queries, bias)
+    torch.testing.assert_close(explained.geometry, bias[:, :, queries])
+    torch.testing.assert_close(explained.weights, logits.softmax(-1)[:, :, queries])
+    assert core.explain(features, keys, queries, bias[:, 0]).geometry.shape == (2, 1, 2, 5)
+    assert core.explain(features, keys, queries, bias[:1, :1, :1]).geometry.shape == (2, 1, 2, 5)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (((2, 3, 5), None, (2, 3, 5)), r"content must have shape \(B, h, Q, T\), got \(2, 3, 5\)"),
+        (
+            ((2, 4, 3, 5), (2, 3, 5), (2, 4, 3, 5)),
+            r"\(2, 1, 3, 5\) or \(2, 4, 3, 5\), got \(2, 3, 5\)",
+        ),
+        (((2, 4, 3, 5), (1, 1, 3, 5), (2, 4, 3, 5)), r"geometry must .*got \(1, 1, 3, 5\)"),
+        (((2, 4, 3, 5), None, (2, 4, 3, 6)), r"weights must .*\(2, 4, 3, 5\), got \(2, 4, 3, 6\)"),
+    ],
+)
+def test_attention_of_other_shapes_is_refused(shapes, message) -> None:
+    parts = [None if shape is None else torch.zeros(shape) for shape in shapes]
+    with pytest.raises(ValueError, match=message):
+        AttentionWeights(*parts)

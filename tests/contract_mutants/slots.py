@@ -262,3 +262,39 @@ class ExplainsBySigmoid(ContentSelfAttention):
     def explain(self, state, queries):
         content = super().explain(state, queries).content
         return AttentionWeights(content, None, torch.sigmoid(content))
+
+
+@mutant(
+    "explanation_is_a_softmax",
+    "geometry must have shape (2, 1, 6, 12) or (2, 2, 6, 12), got (2, 6, 12)",
+    also="explanation_is_of_the_forward_pass geometry_is_float32_under_autocast",
+)
+class ExplainsGeometryWithoutHeads(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        given = super().explain(state, memory, queries)
+        return AttentionWeights(given.content, 0 * given.content[:, 0], given.weights)
+
+
+@mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")
+class MasksItsContent(ContentSelfAttention):
+    def explain(self, state, queries):
+        content = super().explain(state, queries).content
+        content = content.masked_fill(content < content.mean(), -torch.inf)
+        return AttentionWeights(content, None, content.softmax(-1))
+
+
+@mutant("explanation_is_a_softmax", "asked for queries 2 and 0 alone, it gives other weights")
+class ExplainsAllQueries(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        return super().explain(state, memory, torch.arange(state.features.shape[1]))
+
+
+@mutant(
+    "explanation_is_a_softmax",
+    "content is (2, 2, 6, 11), not (B, h, Q, T) = (2, h, 6, 12)",
+    also="explanation_is_of_the_forward_pass",
+)
+class ExplainsToFewTokens(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        content = super().explain(state, memory, queries).content[..., 1:]
+        return AttentionWeights(content, None, content.softmax(-1))

@@ -17,7 +17,14 @@ from qgs.components import (
     MultiViewViT,
 )
 from qgs.components.blocks import merge_heads
-from qgs.contracts import ComponentConfig, FeedForward, FieldSpec, Queries, SelfAttention
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    ComponentConfig,
+    FeedForward,
+    FieldSpec,
+    Queries,
+    SelfAttention,
+)
 from qgs.losses import Opacity
 from qgs.renderers import TorchRenderer
 from qgs.types import QueryState
@@ -193,3 +200,26 @@ class Fades(TorchRenderer):
     def forward(self, gaussians, cameras, background=None):
         faded = replace(gaussians, opacities=0.7 * gaussians.opacities)
         return super().forward(faded, cameras, background)
+
+
+@named
+class EachHeadSeesASide(ContentCrossAttention):
+    """A bias for each head that hides what lies left, or right, of the camera's axis."""
+
+    @classmethod
+    def requires(cls, config):
+        return {**super().requires(config), "memory.patch_rays": MEMORY_FIELDS["memory.patch_rays"]}
+
+    def bias(self, state, memory):
+        side_B1M = memory.patch_rays[:, None, :, 3]
+        heads = torch.arange(self.dims.heads).to(side_B1M.device) % 2 == 1
+        bias_BhM = side_B1M.square().masked_fill((side_B1M < 0.05) == heads[:, None], -torch.inf)
+        return bias_BhM[:, :, None].expand(-1, -1, state.features.shape[1], -1)
+
+    def forward(self, state, memory):
+        bias = self.bias(state, memory)
+        return self.core(state.features, memory.keys, memory.values, bias)
+
+    def explain(self, state, memory, queries):
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias)

@@ -167,7 +167,7 @@ def test_an_angle_of_view_without_a_size_goes_with_the_first_image(folder):
 def test_doubtful_intrinsics_are_read_and_told(folder, caplog):
     change(folder, 2, cx=55.0)
     assert read(folder).cameras.intrinsics[2, 2] == 55
-    assert "1 of 6 frames are doubtful, first frame 2 (images/view_002.png)" in caplog.text
+    assert "1 of 6 frames are doubtful: frame 2 (images/view_002.png)" in caplog.text
 
 
 def test_the_world_is_that_of_the_poses(folder):

@@ -143,7 +143,7 @@ def test_frames_that_a_model_is_given_and_judged_on_are_told(tiny: Tiny, tmp_pat
     assert evaluation.summary()["context_and_target"] == {"test/000000": [0, 4]}
     expected = "1 scene with frames as context and as target"
     (line,) = (line for line in shown(evaluation).splitlines() if expected in line)
-    assert line.endswith("test/000000 (0 4)")
+    assert line.endswith("test/000000 (0, 4)")
 
 
 def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_path: Path) -> None:

@@ -13,13 +13,15 @@ from types import ModuleType
 import pytest
 import torch
 from guide_pages import blocks
+from qgs_locus.cross_attention import RayBiasedCrossAttention
 
 from qgs.cli.new_plugin import rendered
 from qgs.composer import RecipeError
 from qgs.composer.recipe import resolve
 from qgs.composer.registry import InstalledPlugin
 from qgs.contracts import ModelDims
-from qgs.testing import cases_of, checks_for, run_check
+from qgs.testing import Case, cases_of, checks_for, run_check
+from qgs.testing.inputs import inputs_of
 from qgs.types import QueryState
 
 PACKAGE = "qgs_sightline"
@@ -79,10 +81,10 @@ def test_the_pages_test_makes_the_checks_of_the_command(folder: Path, package: M
     assert checked == expected
 
 
-@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("number", range(7))
 def test_components_keep_their_contracts(package: ModuleType, number: int) -> None:
     cases = cases_of(InstalledPlugin(package.plugin))
-    assert len(cases) == 6, "one of each component, and one more of its examples"
+    assert len(cases) == 7, "one of each component, and one more of its examples"
     case = cases[number]
     outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
     assert [outcome.message for outcome in outcomes if outcome.verdict == "failed"] == []
@@ -131,3 +133,23 @@ def test_the_recipes_work(
     assert recipe.tree["model"]["decoder"]["cross_attention"]["type"] == "sightline/abstaining"
     model = recipe.build_model("meta")
     assert isinstance(model.centers, package.FrustumCenters)
+
+
+def test_every_second_head_reads_close_rays_alone_and_says_so(
+    folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    recipe = resolve("nearby.yaml", plugins=[package.plugin])
+    assert set(recipe.tree["plugins"]) == {"locus", "sightline", "rooms"}
+    case = Case(package.NearbyAttention.Config(reach=0.5))
+    inputs, attention = inputs_of(case), case.build()
+    with torch.no_grad():
+        explained = attention.explain(*inputs.values(), torch.arange(6))
+        shared = RayBiasedCrossAttention.bias(attention, *inputs.values())
+    assert torch.equal(explained.geometry[:, 0], shared)
+    hidden = explained.geometry[:, 1].isinf()
+    kept = shared >= -0.5 * attention.gamma * 0.25
+    assert hidden.any()
+    assert (~hidden).any(-1).all()
+    assert not (hidden & kept).any()
+    assert (explained.weights[:, 1][hidden] == 0).all()

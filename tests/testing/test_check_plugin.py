@@ -1,16 +1,28 @@
 """The contract suite on a whole plugin: its report, its examples, its exemptions."""
 
 import pytest
+import torch
 from commands import run_qgs
 from contract_mutants.basics import RaisesWhenCalled
 from contract_mutants.state import CountsItsCalls
+from pydantic import Field
 
-from qgs.components import FreeCenters, GaussianHead, MlpFeedForward
+from qgs.components import (
+    ContentCrossAttention,
+    FreeCenters,
+    GaussianHead,
+    LatentQueries,
+    MlpFeedForward,
+    OneCycleAdamW,
+)
 from qgs.composer.registry import InstalledPlugin, PluginError
 from qgs.contracts import CONTRACT_VERSION, MissingExtraError, Plugin, ViewsConfig
 from qgs.data import ChunksSource
+from qgs.geometry.precision import at_least_float32
+from qgs.losses import Opacity
 from qgs.renderers import TorchRenderer
-from qgs.testing import cases_of, check_plugin
+from qgs.testing import Case, cases_of, check_plugin
+from qgs.testing.exercise import idle_options
 from qgs.testing.plugins import exemptions_of
 
 UNBOUNDED = FreeCenters.Config(output_limit=None)
@@ -60,6 +72,28 @@ class OnOtherDevices(TorchRenderer):
     devices = ("cuda",)
 
 
+class ReadsTheTop(ContentCrossAttention):
+    """Each head of each query reads `top` tokens; the suite's memory has 12."""
+
+    name = "reads_the_top"
+
+    class Config(ContentCrossAttention.Config):
+        top: int = Field(default=32, ge=1)
+        careful: bool = False
+
+    def bias(self, state, memory):
+        logits = self.core.project(state.features) @ memory.keys.mT
+        least = logits.topk(min(self.config.top, logits.shape[-1])).values[..., -1:]
+        return at_least_float32(torch.zeros_like(logits)).masked_fill(logits < least, -torch.inf)
+
+    def forward(self, state, memory):
+        return self.core(state.features, memory.keys, memory.values, self.bias(state, memory))
+
+    def explain(self, state, memory, queries):
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias)
+
+
 def _installed(*components, **parts) -> InstalledPlugin:
     return InstalledPlugin(Plugin("mine", CONTRACT_VERSION, components, **parts), "qgs-mine", "1.2")
 
@@ -88,6 +122,34 @@ def test_the_report_tells_a_cause_once(monkeypatch) -> None:
     assert "checks: ends with an error as `runs` does: see that check" in skips[0]
     assert lines[-1].startswith("2 components, ")
     assert ", 1 failed, 0 expected to fail, " in lines[-1]
+
+
+def test_options_that_no_check_exercised_are_noted(monkeypatch) -> None:
+    idle = {"careful": ["true"], "top": ["31", "33", "64"]}
+    large, small = (Case(ReadsTheTop.Config(top=top)) for top in (32, 8))
+    assert idle_options([large]) == idle
+    assert idle_options([small]) == idle_options([large, small]) == {"careful": ["true"]}
+    assert idle_options([small, Case(ReadsTheTop.Config(top=8, norm_eps=0.1))]).keys() == {
+        "careful"
+    }
+    result = _report(monkeypatch, _installed(ReadsTheTop), "--core")
+    assert result.exit_code == 0, result.output
+    note = "note: cross_attention/reads_the_top: no value of `top` that was tried (31, 33, 64) "
+    assert f"{note}changed anything, so no check exercised it; " in result.output
+    assert "`norm_eps`" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("component", "idle"),
+    [
+        (OneCycleAdamW, set()),
+        (LatentQueries, set()),
+        (Opacity, set()),
+        (TorchRenderer, {"near", "far", "transmittance_min"}),
+    ],
+)
+def test_components_of_every_kind_of_slot_are_exercised(component, idle) -> None:
+    assert idle_options([Case(component.Config())]).keys() == idle
 
 
 def test_the_report_names_what_is_exempt(monkeypatch) -> None:

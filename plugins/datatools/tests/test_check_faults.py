@@ -14,6 +14,8 @@ from qgs_datatools.chunks import chunk_folders
 from textured_room import SIZE
 from upath import UPath
 
+from qgs.data.photos.source import present_frames
+
 
 @pytest.mark.parametrize("name", ["room", "chunks", "archives"])
 def test_untouched_sets_pass(good, name):
@@ -63,7 +65,7 @@ def listed(**values):
 IN_A_FOLDER = {
     "missing image": (
         lambda room, shots: (room.path / "images" / "2.jpg").unlink(),
-        "frame 2 (images/2.jpg): the image does not exist: add the file, or remove the frame from "
+        "images/2.jpg: the image does not exist: add the file, or remove the frame from "
         "transforms.json",
     ),
     "truncated JPEG": (
@@ -302,3 +304,14 @@ def test_archive_that_leads_outside(archives):
         f"error: {HASH}: {file} holds the name '../evil.txt', which leads outside the archive: it "
         "is not read. Get the archive from its publisher again"
     ]
+
+
+def test_photos_have_one_number_in_reading_and_in_checking(room, shots):
+    """Behind a photo that is missing, the number in a message is the one that `--frames` takes."""
+    (room.path / "images/1.jpg").unlink()
+    pose(3, lambda c2w, shots: c2w * np.nan)(room, shots)
+    lines = told(room.path)
+    assert any("room, images/1.jpg: the image does not exist" in line for line in lines)
+    assert any("room, frame 2 (images/3.jpg): the pose has NaN" in line for line in lines)
+    with pytest.raises(ValueError, match=r"frame 2 \(images/3\.jpg\): the pose has NaN"):
+        present_frames(UPath(room.path))

@@ -69,7 +69,7 @@ def test_errors_have_exit_code_1_and_one_line_each(broken):
     result = run(broken, "--geometry", 0)
     assert result.exit_code == 1
     assert (
-        "error: <b>bad, frame 1 (images/1.jpg): the image does not exist: add the file, or remove "
+        "error: <b>bad, images/1.jpg: the image does not exist: add the file, or remove "
         "the frame from transforms.json\n" in result.output
     )
     assert "note: no pose was judged by photos (--geometry 0)" in result.output

@@ -8,6 +8,7 @@ import numpy as np
 from qgs.data.lenses import Intrinsics, Size
 from qgs.data.photos.reader import FrameProblem, PhotoFrame
 from qgs.data.scenes import warn_once
+from qgs.wording import listed, numbered
 
 LARGEST_SIDE = 10**6  # pixels of a listed photo
 _FARTHEST = 1e12  # a camera's coordinate beyond is none, and its square leaves float32
@@ -118,16 +119,17 @@ def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
 
 
 def require_sound(listing: object, frames: Sequence[PhotoFrame]) -> None:
-    """Raise ValueError for the first fatal problem, with its frame; log the first other one."""
+    """Raise ValueError for the first fatal problem, with its frame; log the others."""
     doubtful: list[str] = []
     for index, frame in enumerate(frames):
         problems = list(frame_problems(frame))
-        where = f"frame {index} ({frame.name})" if frame.name else f"frame {index}"
+        where = f"frame {numbered(index, frame.name)}"
         for problem in problems:
             if problem.fatal:
                 raise ValueError(f"{listing}: {where}: {problem}")
         doubtful += [f"{where}: {problems[0]}"] if problems else []
     if doubtful:
         warn_once(
-            f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful, first {doubtful[0]}"
+            f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful: "
+            + listed(doubtful, 3, "; ")
         )

@@ -38,6 +38,7 @@ from qgs.data.scenes import (
     warn_once,
 )
 from qgs.types import Cameras
+from qgs.wording import listed
 
 
 class PhotosConfig(SceneSource.Config):
@@ -122,10 +123,14 @@ class PhotoScene(EncodedScene):
         """See `Scene`: the image file, relative to the scene's folder."""
         return self._frames[frame].name
 
+    def stored_size(self, frame: int) -> Size:
+        """See `Scene`."""
+        listed = self._frames[frame]
+        return _checked(image_size(listed.path), listed, listed.path)
+
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
-        listed = self._frames[frame]
-        size = _checked(image_size(listed.path), listed, listed.path)
+        listed, size = self._frames[frame], self.stored_size(frame)
         buffer = io.BytesIO()
         if listed.mask is not None:
             Image.fromarray(_whole_mask(listed)).save(buffer, "png")
@@ -242,7 +247,7 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
     if wanted and left:
         warn_once(
             f"{len(left)} of {len(inside)} folders in {root} hold no photos with cameras and are "
-            f"left out: {', '.join(left)}"
+            f"left out: {listed(left)}"
         )
     return {folder.name: folder for folder in wanted}
 
@@ -261,7 +266,6 @@ def present_frames(
     exist, ValueError for poses and intrinsics that cannot be right.
     """
     listing = read_listing(folder, format, images)
-    require_sound(listing.file, listing.frames)
     frames = [frame for frame in listing.frames if frame.split != "unused"]
     if len(frames) < len(listing.frames):
         warn_once(
@@ -271,20 +275,21 @@ def present_frames(
     there = existing(frame.path for frame in frames)
     present = [frame for frame in frames if frame.path in there]
     missing = [str(frame.path) for frame in frames if frame.path not in there]
+    require_sound(listing.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
             f"{listing.file} names {len(frames)} images, of which {len(present)} exist "
-            f"and 2 are needed: add {missing[0] if missing else 'photos'}"
+            f"and 2 are needed: add {listed(missing, 3) or 'photos'}"
         )
     if missing:
         warn_once(
-            f"{len(missing)} of {len(frames)} images of {folder} are missing: {', '.join(missing)}"
+            f"{len(missing)} of {len(frames)} images of {folder} are missing: {listed(missing, 3)}"
         )
     masks = [frame.mask for frame in present if frame.mask is not None]
     absent = sorted(set(map(str, masks)) - set(map(str, existing(masks))))
     if absent:
         raise FileNotFoundError(
-            f"{listing.file} names {len(masks)} masks, of which {len(absent)} do not exist, the "
-            f"first being {absent[0]}: add them, or remove their 'mask_path'"
+            f"{listing.file} names {len(masks)} masks, of which {len(absent)} do not exist: "
+            f"{listed(absent, 3)}. Add them, or remove their 'mask_path'"
         )
     return present, missing

@@ -390,13 +390,26 @@ def check_memo_is_of_the_memory_alone(case: Case) -> None:
 
 @check({"cross_attention", "self_attention"})
 def check_explanation_is_a_softmax(case: Case) -> None:
-    """The weights that `explain` gives are the softmax of content and geometry."""
-    given = _explanation(case.lively(), inputs_of(case))
+    """The weights that `explain` gives are the softmax of content and geometry, of all tokens.
+
+    Content is (B, h, Q, T), for the queries that are asked for in their order; what hides a token
+    is -inf in geometry, (B, 1, Q, T) or (B, h, Q, T).
+    """
+    module, inputs = case.lively(), inputs_of(case)
+    given = _explanation(module, inputs)
     if given is None:
         return
+    tokens = inputs["memory"].keys.shape[2] if "memory" in inputs else given.content.shape[2]
+    wanted, shape = inputs["state"].features.shape[:2], tuple(given.content.shape)
+    right = shape == (wanted[0], shape[1], wanted[1], tokens)
+    expect(right, f"content is {shape}, not (B, h, Q, T) = ({wanted[0]}, h, {wanted[1]}, {tokens})")
+    expect(bool(given.content.isfinite().all()), "content is not finite: a mask is geometry")
+    with torch.no_grad():
+        some = module.explain(*inputs.values(), torch.tensor([2, 0]))
+    found = some and difference(some.weights, given.weights[:, :, [2, 0]], 1e-4, 1e-5)
+    expect(found == "", f"asked for queries 2 and 0 alone, it gives other weights: {found}")
     logits = given.content if given.geometry is None else given.content + given.geometry
-    weights, shape = logits.softmax(-1), described(given.weights)
-    expect(given.weights.shape == weights.shape, f"weights are {shape}, logits {described(logits)}")
+    weights = logits.softmax(-1)
     off = (given.weights - weights).abs().max().item()
     expect(off < 1e-3, f"weights are off the softmax of content and geometry by up to {off:.3g}")
 

@@ -70,7 +70,7 @@ def sharing_findings(
             first, *rest = firsts
             yield scene.finding(
                 rest,
-                f"the camera stands on the same point as that of {_named(scene, first)}, a zero "
+                f"the camera stands on the same point as that of {scene.label(first)}, a zero "
                 "baseline, so that the two tell no depth",
                 "correct the position, or remove one of the frames",
             )
@@ -105,13 +105,9 @@ def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
 
 
 def _duplicate(scene: DecodedScene, first: int, second: int) -> Finding:
-    which = _named(scene, first)
+    which = scene.label(first)
     if scene.decoded[first].digest and scene.decoded[first].digest == scene.decoded[second].digest:
         reason, fix = f"the photo and its pose repeat {which}", "remove one of the two"
         return scene.finding([second], reason, fix, "warning")
     reason = f"the pose repeats that of {which}, whose photo is another one"
     return scene.finding([second], reason, "correct the pose, or remove one of the frames")
-
-
-def _named(scene: DecodedScene, frame: int) -> str:
-    return f"frame {frame} ({scene.photos[frame].listed.name})"

@@ -43,9 +43,10 @@ class Options:
 class SceneReport:
     """What was found in a scene.
 
-    split: empty where the format has none. pose_problems: frames whose pose is wrong. c2w: (F, 3,
-    4) float32 OpenCV poses of `frames`, those that can be drawn; fov: (F, 2) tangents of half the
-    angles of view, x and y. geometry: None where it was not asked for.
+    split: empty where the format has none. numbered: photos that a reader has as frames.
+    pose_problems: frames whose pose is wrong. c2w: (F, 3, 4) float32 OpenCV poses of `frames`, the
+    numbers of those that can be drawn; fov: (F, 2) tangents of half the angles of view, x and y.
+    geometry: None where it was not asked for.
     """
 
     name: str
@@ -55,6 +56,7 @@ class SceneReport:
     listed: int = 0
     decodable: int = 0
     missing: int = 0
+    numbered: int = 0
     pose_problems: int = 0
     frames: tuple[int, ...] = ()
     c2w: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4), np.float32))
@@ -147,7 +149,7 @@ def check(
         progress(number, len(candidates), candidate.name)
         report = check_scene(candidate, options, with_geometry=number in judged)
         scenes.append(report)
-        held[report.scene].append(Held(report.split, report.listed - report.missing or None))
+        held[report.scene].append(Held(report.split, report.numbered or None))
     summaries: list[str] = []
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         findings, summary = index_findings(file, held, told)
@@ -210,7 +212,7 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
         if not colon or not isinstance(error, OSError | ValueError):
             reason, fix = said(error), "get the files again, or mend what reads them"
         return replace(report, findings=[Finding(name, reason, fix)])
-    reason = f"listed images that do not exist: {listed(missing)}; later frames move up"
+    reason = f"listed images that do not exist: {listed(missing, 3)}; later frames move up"
     fix = "add the files, or take them out of what lists them"
     absent = [Finding(name, f"{reason} in an index", fix)] if missing else []
     if not photos:
@@ -245,6 +247,7 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
         listed=len(photos) + len(missing),
         decodable=sum(result.size is not None for result in scene.decoded),
         missing=len(missing) + sum(not photo.exists for photo in photos),
+        numbered=sum(number is not None for number in scene.numbers),
         pose_problems=len(_frames([*poses, *sharing])),
         geometry=geometry,
         findings=findings,
@@ -258,6 +261,7 @@ def _frames(findings: Sequence[Finding]) -> set[int]:
 
 def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
     """What a picture of the cameras needs."""
+    frames = [frame for frame in frames if scene.numbers[frame] is not None]
     if not frames:
         return {}
     fov, c2w = [], []
@@ -268,4 +272,4 @@ def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
         fov.append([side / 2 / focal if focal > 0 else 0.0 for side, focal in sides])
         c2w.append(photo.c2w[:3])
     drawn = {"c2w": np.array(c2w, np.float32), "fov": np.array(fov, np.float32)}
-    return {"frames": tuple(frames), **drawn}
+    return {"frames": tuple(scene.numbers[frame] for frame in frames), **drawn}

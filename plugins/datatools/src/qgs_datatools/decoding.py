@@ -2,10 +2,11 @@
 
 import hashlib
 import io
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from statistics import median, median_low
 
 from PIL import Image
@@ -23,6 +24,7 @@ from qgs.data.images import (
 from qgs.data.lenses import Size
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
+from qgs.wording import numbered
 from qgs_datatools.candidates import Photo
 from qgs_datatools.findings import Finding, Severity
 
@@ -60,7 +62,25 @@ class DecodedScene:
     ) -> Finding:
         """A finding about some of the frames."""
         names = tuple(self.photos[frame].listed.name for frame in frames)
-        return Finding(self.name, reason, fix, tuple(frames), names, severity)
+        numbers = tuple(self.numbers[frame] for frame in frames)
+        return Finding(self.name, reason, fix, tuple(frames), names, severity, numbers)
+
+    @cached_property
+    def numbers(self) -> Sequence[int | None]:
+        """The number that readers give each photo; None for those that they leave out.
+
+        One without a name is refused, not left out.
+        """
+        count = itertools.count()
+        return [
+            next(count) if (p.exists or not p.listed.name) and p.listed.split != "unused" else None
+            for p in self.photos
+        ]
+
+    def label(self, frame: int) -> str:
+        """What messages call a photo: its number and name, or its name alone."""
+        name, number = self.photos[frame].listed.name, self.numbers[frame]
+        return name if number is None else f"frame {numbered(number, name)}"
 
 
 def decode(photo: Photo, headers_only: bool) -> Decoded:

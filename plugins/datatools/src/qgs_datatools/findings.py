@@ -7,6 +7,8 @@ from itertools import groupby
 from operator import attrgetter
 from typing import Any, Literal, TypeAlias
 
+from qgs.wording import listed
+
 Severity: TypeAlias = Literal["error", "warning"]
 
 _FEW = 3
@@ -14,7 +16,10 @@ _FEW = 3
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault and its remedy. frames, names: as listed. An error makes results wrong."""
+    """A fault and its remedy. frames, names: as listed. An error makes results wrong.
+
+    numbers: of the frames, as `DecodedScene.numbers`; those of `frames` where none are given.
+    """
 
     scene: str
     reason: str
@@ -22,6 +27,7 @@ class Finding:
     frames: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
     severity: Severity = "error"
+    numbers: tuple[int | None, ...] = ()
 
     @property
     def place(self) -> str:
@@ -29,8 +35,11 @@ class Finding:
         if not self.frames:
             return ""
         names = [name for name in self.names if name]
+        numbers = [number for number in self.numbers or self.frames if number is not None]
+        if not numbers:
+            return listed(names, 3)
         named = f" ({names[0]}{f' to {names[-1]}' if len(names) > 1 else ''})" if names else ""
-        return f"frame{'s' if len(self.frames) > 1 else ''} {spans(self.frames)}{named}"
+        return f"frame{'s' if len(numbers) > 1 else ''} {spans(numbers)}{named}"
 
     def __str__(self) -> str:
         where = f"{self.scene}, {self.place}" if self.frames else self.scene
@@ -65,7 +74,9 @@ def _together(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> lis
     together: dict[Any, Finding] = {}
     for finding in findings:
         if known := together.get(key(finding)):
-            frames, names = known.frames + finding.frames, known.names + finding.names
-            finding = replace(known, frames=frames, names=names)
+            both = {
+                k: getattr(known, k) + getattr(finding, k) for k in ("frames", "names", "numbers")
+            }
+            finding = replace(known, **both)
         together[key(finding)] = finding
     return list(together.values())

@@ -30,7 +30,8 @@ class Geometry:
 
     distances: median over pairs of the distance of matches to epipolar lines by reading of the
     poses, fractions of the diagonal; empty where `unjudged` says why. pairs: the worst first;
-    photos: both of the worst one, (H, W, 3) uint8. diagonal: of the files, in pixels.
+    photos: both of the worst one, (H, W, 3) uint8. diagonal: of the files, in pixels. labels: what
+    messages call the photos.
     """
 
     distances: Mapping[str, float] = field(default_factory=dict)
@@ -38,6 +39,7 @@ class Geometry:
     pairs: Sequence[Pair] = ()
     photos: tuple[np.ndarray, ...] = ()
     diagonal: float = 0.0
+    labels: tuple[str, ...] = ()
 
     @property
     def fraction(self) -> float:
@@ -82,7 +84,8 @@ def judge_scene(scene: DecodedScene, sound: Sequence[int], convention: Conventio
     photos = tuple(matcher.picture(frame)[0] for frame in pairs[0].frames)
     size = scene.decoded[pairs[0].frames[0]].size
     assert size is not None
-    return Geometry(distances, "", pairs, photos, float(np.hypot(*size)))
+    labels = tuple(map(scene.label, pairs[0].frames))
+    return Geometry(distances, "", pairs, photos, float(np.hypot(*size)), labels)
 
 
 class _Matcher:

@@ -201,7 +201,7 @@ def pack(
             done.update({entry["key"]: file for entry in chunk})
             journal.save()
     if not any(journal.files.values()):
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in packed.left_out.items())
+        reasons = listed((f"{n}: {why}" for n, why in packed.left_out.items()), 3, "; ")
         raise ValueError(f"there is no scene to pack{': ' if reasons else ''}{reasons}")
     for split, files in journal.files.items():
         packed.scenes[split] = len(files)

@@ -17,6 +17,7 @@ from qgs.drawing.figures import INK, figure_picture, figure_style, hex_color
 from qgs.drawing.images import Picture, data_uri
 from qgs_datatools.check import CheckReport, SceneReport
 from qgs_datatools.epipolar import Pair
+from qgs_datatools.geometry import Geometry
 
 PICTURED = 12  # scenes that get pictures, the worst first
 ROWS = 500  # scenes in the table, and findings in the list, the worst first
@@ -49,7 +50,7 @@ def _pictured(scene: SceneReport) -> dict[str, Any]:
     frusta = frusta_figure(scene)
     cameras = None if frusta is None else figure_picture(frusta, dpi=_DPI)
     worst = scene.geometry.pairs[0] if scene.geometry and scene.geometry.pairs else None
-    figure = pair_figure(worst, scene.geometry.photos) if scene.geometry and worst else None
+    figure = pair_figure(worst, scene.geometry) if scene.geometry and worst else None
     matches = None if figure is None else figure_picture(figure, dpi=_DPI)
     return {"scene": scene, "cameras": cameras, "pair": worst, "matches": matches}
 
@@ -128,7 +129,7 @@ def _frame(axes: Any, points: np.ndarray) -> None:
         axis.set_major_locator(MaxNLocator(4))
 
 
-def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
+def pair_figure(pair: Pair, geometry: Geometry) -> Figure:
     """Both photos with matches as dots, and the lines on which the poses want them."""
     chosen = _spread(pair.matches[0], _MATCHES)
     points, lines = pair.matches[:, chosen], pair.lines()[:, chosen]
@@ -137,11 +138,11 @@ def pair_figure(pair: Pair, photos: tuple[Picture, ...]) -> Figure:
         figure = Figure(figsize=(8.0, 4.0 * height / width * (1 - _GAP) + 0.3))
         axes = figure.subplots(1, 2)
         figure.subplots_adjust(0, 0, 1, 0.93, wspace=_GAP)
-        for axis, photo, dots, wanted, frame in zip(
-            axes, photos, points, lines, pair.frames, strict=True
+        for axis, photo, dots, wanted, label in zip(
+            axes, geometry.photos, points, lines, geometry.labels, strict=True
         ):
             _photo(axis, photo, dots, wanted)
-            axis.set_title(f"frame {frame}")
+            axis.set_title(label)
     return figure
 
 

@@ -1,0 +1,166 @@
+"""What `qgs eval` and `qgs reconstruct` say beside their numbers, in plain sentences."""
+
+import csv
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands import MODEL, run_qgs
+from photo_formats import row_of_frames
+from PIL import Image
+
+import qgs
+from qgs.components import GaussianHead
+from qgs.contracts import Column, ModelDims, Scene
+from qgs.data.domain import KEY, trained_domain
+from qgs.data.evaluation import EvaluationPlan
+from qgs.data.images import framing
+from qgs.metrics.baselines import worse_than_nearest
+from qgs.metrics.scales import TOLD, too_many_capped
+from qgs.types import Cameras
+
+FRAMING = "(20% is cut off)"
+NEAREST = "the result is worse than the nearest photo, copied: PSNR "
+CAPPED = "of the scales of visible Gaussians are at the cap, model.head.scale_cap: 0.075"
+OUTSIDE = "the photos lie outside what this model was trained on"
+WITHIN = "the cameras lie within what this model was trained on"
+
+evaluated = partial(run_qgs, "eval")
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> Path:
+    """Nine photos of 20 x 16 pixels, alike but for a little noise, taken along a line."""
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "images").mkdir()
+    rng = np.random.default_rng(0)
+    for index in range(9):
+        pixels = (np.full((16, 20, 3), 90) + rng.integers(0, 9, (16, 20, 3))).astype(np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"IMG_{index + 1}.png")
+    frames = row_of_frames(9, step=0.1, fl_x=20, fl_y=20, cx=10, cy=8, w=20, h=16)
+    for index, frame in enumerate(frames["frames"]):
+        frame["file_path"] = f"images/IMG_{index + 1}.png"
+    (folder / "transforms.json").write_text(json.dumps(frames))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def checkpoint(photos: Path, tmp_path_factory) -> Path:
+    """A model of these photos whose Gaussians are as large as they can be."""
+    recipe = {
+        "recipe": 1,
+        "model": MODEL,
+        "data": {"type": "qgs/photos", "path": str(photos), "image_size": [16, 16], "holdout": 3},
+        "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"},
+    }
+    resolved = qgs.composer.resolve(recipe)
+    model = resolved.build_model()
+    with torch.no_grad():
+        model.head.linear.bias.unflatten(0, (-1, 14))[:, 6:9] = 5.0
+    domain = trained_domain(resolved.build_data(), resolved.views, 0)
+    file = tmp_path_factory.mktemp("run") / "checkpoint.safetensors"
+    qgs.save(model, file, extra={KEY: domain.text})
+    return file
+
+
+def test_an_evaluation_says_what_it_judged_and_what_came_of_it(checkpoint: Path) -> None:
+    result = evaluated(checkpoint)
+    assert result.exit_code == 0, result.output
+    said = ("frame 0 (images/IMG_1.png), 20 x 16 pixels", FRAMING, NEAREST, CAPPED, WITHIN)
+    for words in said:
+        assert result.output.count(words) == 1, words
+    folder = checkpoint.parent / "evaluation"
+    remarks = json.loads((folder / "summary.json").read_text())["remarks"]
+    assert all(any(words in remark for remark in remarks) for words in said)
+    assert "changed nothing" not in result.output
+    (row,) = csv.DictReader((folder / "scenes.csv").open())
+    assert row["input_frames"].split("; ")[0] == "0 6"
+    assert row["input_names"].split("; ")[0] == "images/IMG_1.png, images/IMG_7.png"
+    assert row["target_names"].split("; ")[0] == "images/IMG_2.png, images/IMG_5.png"
+    assert float(row["scales_at_cap"]) == 1
+
+
+def test_samples_where_none_are_drawn_are_said_to_change_nothing(
+    checkpoint: Path, tmp_path: Path
+) -> None:
+    index = tmp_path / "index.json"
+    index.write_text(json.dumps({only_scene(checkpoint): {"context": [0], "target": [1]}}))
+    more = ("--set", "evaluation.samples=8", "--out", tmp_path / "a")
+    told = "evaluation.samples=8 changed nothing, since no views were drawn: "
+    held_out = f"{told}3 of 3 held-out frames are judged, each once"
+    assert held_out in evaluated(checkpoint, *more).output
+    assert (
+        f"{told}the index names the views" in evaluated(checkpoint, *more, "--index", index).output
+    )
+
+
+def only_scene(checkpoint: Path) -> str:
+    """The name of the only scene."""
+    recipe = qgs.io.checkpoint.load_recipe(checkpoint)
+    return EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation).wanted[0]
+
+
+def test_a_reconstruction_says_the_same(checkpoint: Path, photos: Path, tmp_path: Path) -> None:
+    result = run_qgs("reconstruct", checkpoint, photos, "--out", tmp_path, "--frames", "0,8")
+    assert result.exit_code == 0, result.output
+    remarks = json.loads((tmp_path / "cameras.json").read_text())["remarks"]
+    for words in (FRAMING, NEAREST, CAPPED, OUTSIDE):
+        assert words in result.output
+        assert any(words in remark for remark in remarks)
+
+
+def test_photos_as_the_model_wants_them_are_not_remarked_on(
+    checkpoint: Path, photos: Path, tmp_path: Path
+) -> None:
+    size = ("--size", "16x20")
+    result = run_qgs("reconstruct", checkpoint, photos, "--out", tmp_path, *size)
+    assert "the model sees" not in result.output
+
+
+def test_what_a_frame_of_another_shape_or_size_loses() -> None:
+    class Stored(Scene):
+        size: tuple[int, int] = (1, 1)
+        stored: tuple[int, int] = (1, 1)
+
+        @property
+        def cameras(self) -> Cameras:
+            return Cameras(torch.eye(4)[None], torch.ones(1, 4), self.size)
+
+        def images(self, frames):
+            raise NotImplementedError
+
+        def frame_name(self, frame: int) -> str:
+            return "a.jpg"
+
+        def stored_size(self, frame: int) -> tuple[int, int] | None:
+            return self.stored
+
+    scene = Stored()
+    photo, part = "photos such as frame 0 (a.jpg), ", "the middle 720 x 720 (44% is cut off)"
+    for scene.stored, scene.size, told in (
+        ((720, 1280), (64, 64), f"{part} of {photo}1280 x 720 pixels, reduced to 64 x 64"),
+        ((720, 1280), (720, 720), f"{part} of {photo}1280 x 720 pixels"),
+        ((720, 1280), (36, 64), f"all of {photo}1280 x 720 pixels, reduced to 64 x 36"),
+        ((32, 32), (64, 64), f"all of {photo}32 x 32 pixels, enlarged to 64 x 64"),
+    ):
+        assert framing(scene, 0) == f"the model sees {told}"
+    scene.stored = scene.size
+    assert framing(scene, 0) == ""
+
+
+def test_what_is_as_good_as_the_nearest_photo_is_not_worse() -> None:
+    psnr, lpips = Column("PSNR", "higher", 2, "dB"), Column("LPIPS", "lower")
+    assert worse_than_nearest(psnr, 20.0, 20.0) == worse_than_nearest(psnr, 20.1, 20.0) == ""
+    assert worse_than_nearest(lpips, 0.2, 0.3) == worse_than_nearest(lpips, None, 0.3) == ""
+    assert "LPIPS 0.300 against 0.200" in worse_than_nearest(lpips, 0.3, 0.2)
+
+
+def test_few_scales_at_the_cap_are_not_told() -> None:
+    head = GaussianHead(GaussianHead.Config(scale_cap=0.1), ModelDims(16, 2, 1))
+    assert too_many_capped(head, TOLD - 0.01) == ""
+    told = too_many_capped(head, TOLD)
+    assert told.startswith("25% of the scales of visible Gaussians are at the cap, ")
+    assert "model.head.scale_cap: 0.1," in told
