@@ -1,4 +1,4 @@
-"""Small data sets in every format, each with one hostile change that a seed chooses."""
+"""Small data sets in every format, each with one hostile change that dice choose."""
 
 import importlib
 import io
@@ -29,9 +29,8 @@ _HOSTILE: Sequence[Any] = (
 )  # fmt: skip
 
 
-def write_data_set(folder: Path, seed: int) -> str:
-    """Write the data set of a seed to `folder`; its format and change in words."""
-    chance = random.Random(seed)
+def write_data_set(folder: Path, chance: random.Random) -> str:
+    """Write a data set to `folder`; its format and change in words."""
     kind = chance.choice(sorted(_WRITERS))
     write, listings, own = _WRITERS[kind]
     content = write(folder, chance)
