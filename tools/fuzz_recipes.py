@@ -243,7 +243,7 @@ def sections(case: Case) -> None:
 
 def broken_text(case: Case) -> None:
     """The text cut, a piece of it repeated, or characters put into it."""
-    draw = case.random
+    draw = random.Random(case.random.random())  # the same however often it is written
     odd = (
         *(
             "\t",

@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 from upath import UPath
 
-from qgs.data.paths import open_file
+from qgs.data.paths import StoreError, open_file
 from qgs.data.scenes import warn_once
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
@@ -60,10 +60,12 @@ class CropResize:
 
 @contextmanager
 def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
-    """`path`, open. Raises ValueError for what goes wrong inside, whatever a decoder raises."""
+    """`path`, open. Raises StoreError, else ValueError for whatever a decoder raises inside."""
     try:
         with open_file(path) as file:
             yield file
+    except StoreError:
+        raise
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise ValueError(
