@@ -38,8 +38,8 @@ class Count:
         self.values += 1
         if self.values > MAX_VALUES:
             raise RecipeSizeError(
-                f"there are more than {MAX_VALUES:,} values and keys, those of aliases counted each "
-                "time"
+                f"there are more than {MAX_VALUES:,} values and keys, those of aliases counted "
+                "each time"
             )
         if depth > MAX_NESTING:
             raise RecipeSizeError(
