@@ -206,7 +206,7 @@ def kill_command(options: argparse.Namespace) -> int:
                 shutil.rmtree(out)
         equal = killed(out, 10**9, 0) == 0 and files_of(out) == whole
     print(
-        f"{kills} kills of {options.what}, each amid its {changes} changes of files, {amid} leaving "
+        f"{kills} kills of {options.what}, each amid its {changes} changes of files, {amid} left "
         f"some of its files or parts of them, {ended} ends between; "
         f"{damaged} times a file was damaged; in the end "
         + ("equal to" if equal else "UNLIKE")
