@@ -16,8 +16,13 @@ from typing import IO, Any, Literal, TypeVar
 
 from upath import UPath
 
+from qgs.memory import in_words
+
 PAUSES = (1.0, 4.0)
 """Seconds before a remote store that failed is asked again."""
+
+LARGEST = 10**9
+"""Bytes of a file that is read whole; a small archive may promise any number."""
 
 Answer = TypeVar("Answer")
 _log = logging.getLogger(__name__)
@@ -97,9 +102,16 @@ def open_file(path: Path | UPath) -> IO[bytes]:
 
 
 def read_file(path: Path | UPath) -> bytes:
-    """The bytes of `path`. Raises as `open_file`."""
+    """The bytes of `path`. Raises as `open_file`, and OSError for one beyond LARGEST."""
     with open_file(path) as file:
+        if is_local(path):
+            _refuse_huge(path.stat().st_size)
         return file.read()
+
+
+def _refuse_huge(size: int) -> None:
+    if size > LARGEST:
+        raise OSError(f"it has {in_words(size)}, more than any photo or list of them")
 
 
 def read_json(path: UPath, fix: str, **options: Any) -> Any:
@@ -156,6 +168,7 @@ class Archive:
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
         try:
+            _refuse_huge(self._zip.getinfo(self.files[member]).file_size)
             return asked_again(self._path, lambda: self._zip.read(self.files[member]))
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error
