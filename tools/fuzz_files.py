@@ -2,41 +2,34 @@
 
     python tools/fuzz_files.py --count 3000 --seed 0
 
-Each case, in a process of its own, ends in success or in one error of ours that names the file,
-within SECONDS of its processor and BYTES of memory. Prints every case that does not,
-with its number, and a line of counts; ends with 1 if there was any. `--only NUMBER` repeats one.
+    python tools/fuzz_files.py --seed 0 --only 17
+
+A checkpoint is loaded and made into Gaussians, a state is trained on; see attack.py.
 """
 
-import argparse
 import json
 import os
 import random
-import resource
 import shutil
-import signal
 import sys
-import tempfile
-import time
-import traceback
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from attack import Use, attack, refused
 from kill_training import RECIPE
 from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe, resolve
+from qgs.data.domain import Domain, verdict
 from qgs.engine.guard import TrainingError, refuse_broken
 from qgs.engine.training import train
+from qgs.io.checkpoint import load_domain, load_step
 from qgs.io.ply import write_ply
-
-SECONDS, BYTES = 5.0, 2_000_000_000
-LONGEST = 60
-"""Seconds of the clock after which a case hangs, on however busy a machine."""
 
 STEPS = 2
 JUNK = (
@@ -60,11 +53,15 @@ TYPES = ("F64", "F16", "BF16", "I64", "I32", "U32", "I16", "I8", "U8", "BOOL", "
 
 @dataclass
 class File:
-    """A safetensors file, taken apart: what its header says of each tensor, metadata, bytes."""
+    """A safetensors file, taken apart: what its header says of each tensor, metadata, bytes.
+
+    header: what is written instead of the first two.
+    """
 
     tensors: dict[str, Any]
     metadata: Any
     data: bytearray
+    header: bytes = b""
 
     @classmethod
     def read(cls, path: Path) -> "File":
@@ -76,7 +73,7 @@ class File:
 
     def bytes(self) -> bytes:
         """What `read` would take apart."""
-        header = json.dumps({"__metadata__": self.metadata, **self.tensors}).encode()
+        header = self.header or json.dumps({"__metadata__": self.metadata, **self.tensors}).encode()
         return len(header).to_bytes(8, "little") + header + self.data
 
 
@@ -207,11 +204,24 @@ def other_recipe(file: File, dice: random.Random) -> None:
     file.metadata["qgs.recipe"] = json.dumps(joined)
 
 
+def other_header(file: File, dice: random.Random) -> None:
+    """JSON with keys twice, other spaces, other encodings, or more than JSON."""
+    text = json.dumps({"__metadata__": file.metadata, **file.tensors})
+    name, entry = a_tensor(file, dice)
+    twice = f"{{{json.dumps(name)}: {json.dumps(dice.choice((entry, {}, None)))}, {text[1:]}"
+    file.header = dice.choice((
+        *(twice.encode(), text.encode() + b" " * dice.choice((1, 8, 10**6)), b" " + text.encode()),
+        *(text.encode("utf-16"), text.encode("utf-8-sig"), text.encode() * 2),
+        text.encode() + b"\0",
+        *(text.replace("[", "[NaN, ", 1).encode(), b"[" * 100_000, b"{}", b"\xff" + text.encode()),
+    ))  # fmt: skip
+
+
 def raw(path: Path, dice: random.Random) -> None:
-    """The bytes themselves."""
+    """The bytes themselves, or something else in place of the file."""
     whole = bytearray(path.read_bytes())
     end = 8 + int.from_bytes(whole[:8], "little")
-    kind = dice.randrange(8)
+    kind = dice.randrange(9)
     if kind == 0:
         whole = whole[: dice.randrange(len(whole))]
     elif kind == 1:
@@ -222,16 +232,18 @@ def raw(path: Path, dice: random.Random) -> None:
     elif kind == 3:
         whole += bytes(dice.randint(1, 100))
     elif kind == 4:
-        whole = bytearray(
-            dice.choice((b"", b"PK\x03\x04", b"\x80\x02.", b"\0" * 100, b"{}", b"\xff" * 9))
-        )
-    elif kind == 5:
+        starts = b"PK\x03\x04", b"\x80\x02.", b"\x1f\x8b\x08", b"<!DOCTYPE html>"
+        junk = (b"", *starts, b"\0" * 100, b"{}", b"\xff" * 9)
+        whole = bytearray(dice.choice(junk) + dice.choice((b"", whole)))
+    elif kind in (5, 6, 7):
         path.unlink()
-        path.mkdir()
-        return
-    elif kind == 6:
-        path.unlink()
-        os.mkfifo(path)
+        what = dice.choice(("folder", "pipe", "/dev/zero", "/dev/null", path.name, "nowhere"))
+        if what == "folder":
+            path.mkdir()
+        elif what == "pipe":
+            os.mkfifo(path)
+        else:
+            path.symlink_to(what)
         return
     else:
         whole = whole[: end + dice.randrange(64)]
@@ -240,7 +252,7 @@ def raw(path: Path, dice: random.Random) -> None:
 
 CHANGES = (
     other_type, other_shape, cut_rows, other_offsets, other_name, other_values, other_metadata,
-    other_value_of_json, other_value_of_json, larger, other_recipe,
+    other_value_of_json, other_value_of_json, larger, other_recipe, other_header,
 )  # fmt: skip
 
 
@@ -274,85 +286,46 @@ def use_checkpoint(checkpoint: Path) -> None:
     with torch.no_grad():
         gaussians = model.decode(model.queries(1))
     write_ply(gaussians, checkpoint.with_suffix(".ply"))
+    load_step(checkpoint)
+    verdict(load_domain(checkpoint), Domain())
 
 
-def use_state(state: Path) -> None:
-    train(small(STEPS + 1), state.parent, console=Console(quiet=True), device="cpu", resume=True)
+def start_from(checkpoint: Path) -> None:
+    recipe = resolve(small(2).tree, [f"init_from={checkpoint}"])
+    train(recipe, checkpoint.parent / "other", console=Console(quiet=True), device="cpu")
 
 
-def outcome(use: Callable[[Path], None], path: Path, report: int) -> None:
-    """Run `use` in a process of its own, and write what it raised, if that is not ours."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-    try:
-        use(path)
-        os.write(report, b"success")
-    except (ValueError, OSError, TrainingError) as error:
-        told = str(path.parent) in str(error) and len(str(error)) < 20_000
-        text = f"refused {type(error).__name__}" if told else traceback.format_exc()[-3000:]
-        os.write(report, text.encode(errors="replace"))
-    except BaseException:
-        os.write(report, traceback.format_exc()[-3000:].encode(errors="replace"))
-    os._exit(0)
+def resume(file: Path) -> None:
+    train(small(STEPS + 1), file.parent, console=Console(quiet=True), device="cpu", resume=True)
+
+
+USES = (
+    *(("checkpoint", use) for use in (use_checkpoint, use_checkpoint, start_from, resume)),
+    *(("state", resume),) * 4,
+)
 
 
 def judged(use: Callable[[Path], None], path: Path) -> str:
-    """ "success", "refused ...", or what is wrong with this case."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if not child:
-        outcome(use, path, writing)
-    os.close(writing)
-    deadline = time.monotonic() + LONGEST
-    while True:
-        done, status, used = os.wait4(child, os.WNOHANG)
-        if done:
-            break
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.wait4(child, 0)
-            os.close(reading)
-            return f"hangs: no end after {LONGEST} s"
-        time.sleep(0.002)
-    with os.fdopen(reading, "rb") as pipe:
-        text = pipe.read().decode(errors="replace")
-    spent, peak = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024
-    if status:
-        return f"ended with status {status}"
-    if spent > SECONDS or peak > BYTES:
-        return f"took {spent:.1f} s and {peak / 1e9:.2f} GB, then: {text[:500]}"
-    return text
+    """How the use of a file ends. Raises what nobody should see."""
+    try:
+        use(path)
+    except (ValueError, OSError, TrainingError) as error:
+        return f"{path.stem} {refused(error, str(path))}"
+    return f"{path.stem} success"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", type=int, help="number of the one case to run")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    counts, wrong = Counter[str](), 0
-    with tempfile.TemporaryDirectory() as name:
-        scratch = Path(name)
-        train(small(STEPS), scratch / "run", console=Console(quiet=True), device="cpu")
-        numbers = range(options.count) if options.only is None else [options.only]
-        for number in numbers:
-            dice = random.Random(f"{options.seed} {number}")
-            run = scratch / f"case-{number}"
-            shutil.copytree(scratch / "run", run)
-            kind, use = dice.choice((("checkpoint", use_checkpoint), ("state", use_state)))
-            path = run / f"{kind}.safetensors"
-            ways = damage(path, dice)
-            found = judged(use, path)
-            if not found.startswith(("success", "refused")):
-                wrong += 1
-                print(f"case {number}: {kind}, {ways}: {found}\n", flush=True)
-                found = "WRONG"
-            counts[f"{kind} {found}"] += 1
-            shutil.rmtree(run)
-    print(f"{len(numbers)} cases, {wrong} wrong: {dict(sorted(counts.items()))}")
-    return 1 if wrong else 0
+def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
+    """Train a small model; cases are copies of its run."""
+    train(small(STEPS), scratch / "run", console=Console(quiet=True), device="cpu")
+
+    def case_in(dice: random.Random, folder: Path) -> tuple[str, Use]:
+        shutil.copytree(scratch / "run", folder, dirs_exist_ok=True)
+        kind, use = dice.choice(USES)
+        path = folder / f"{kind}.safetensors"
+        return f"{use.__name__} {kind}, {damage(path, dice)}", partial(judged, use, path)
+
+    return case_in
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(attack(__doc__, prepared))

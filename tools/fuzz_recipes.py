@@ -1,34 +1,30 @@
 """Resolve mutated recipes, each in a process of its own with limits, and see how each one ends.
 
-    python tools/fuzz_recipes.py --cases 1000 --seed 0
-    python tools/fuzz_recipes.py --seed 0 --case 17       # one again, with its recipe and its error
+    python tools/fuzz_recipes.py --count 1000 --seed 0
+    python tools/fuzz_recipes.py --seed 0 --only 17       # one again, with its recipe and its end
 
 A case is a shipped recipe in which values, types, structure, files or text were changed. It passes
 when it resolves, builds on "meta" and resolves to itself again, or when it is refused by one
-RecipeError that names a place, in less than 5 s of processor time and 2 GB, with a short message.
-Prints what fails, and one line at the end; ends with 1 if anything failed.
+RecipeError that names a place, within the limits of attack.py, with a short message.
 """
 
-import argparse
 import json
 import os
 import random
-import resource
-import select
 import shutil
-import signal
 import sys
-import tempfile
-import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from decimal import Decimal
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
+from attack import FaultError, Use, attack, refused
 
 from qgs.cli.recipe_tables import parameter_counts
 from qgs.composer import PluginError, Recipe, RecipeError, resolve
@@ -39,10 +35,6 @@ from qgs.contracts import MissingExtraError
 from qgs.io.differences import differing_options
 
 RECIPES = Path(__file__).parents[1] / "recipes"
-SECONDS, MEGABYTES, CHARACTERS = 5.0, 2000, 100_000
-"""What a case may take: processor time, memory beyond that of this process, its message."""
-DEADLINE = 30.0
-"""Seconds by the clock after which a case that waits is ended."""
 
 BOMB = "[&a [1,1,1,1,1,1,1,1,1], " + ", ".join(
     f"&{b} [{','.join([f'*{a}'] * 9)}]" for a, b in zip("abcdefg", "bcdefgh", strict=True)
@@ -73,12 +65,22 @@ RAW = (
         "{open",
         "a: b",
     ),
+    *("&a {<<: *a}", "{<<: [&b {x: 1}, *b], y: *b}", "{&c a: *c}", "{<<: 1}", "{? {a: 1} : 1}"),
+    *("!!python/name:os.system", "!!map [1]", "!!seq {a: 1}", "!!omap [a: 1]", "!!null x", "0o"),
+    *("1e99999999", "-.nan", "0x" + "f" * 300, "0b" + "1" * 2000, "1__0", "0.0e+0", "+.inf", "١"),
 )
 EXTENDS = (
     *("/dev/zero", "/dev/stdin", "/proc/self/mem", "/etc/passwd", "/", ".", "..", "''", "fifo"),
     *("loop", "chain0.yaml", "diamond0.yaml", "binary", "empty", "bom.yaml", "latin.yaml", "huge"),
     *('"a\\0b"', '"a\\ud800"', "x" * 5000, "absent.yaml", "link.yaml", "many.yaml", "list.yaml"),
     *("[]", "[[a]]", "{a: b}", "3", "[null]", "[chain900.yaml, wide.yaml]", "wide.yaml", "~/x"),
+    *(
+        "utf16.yaml",
+        "anchors.yaml",
+        "https://127.0.0.1:9/x.yaml",
+        "file:///etc/passwd",
+        "memory://x",
+    ),
 )
 
 
@@ -114,6 +116,7 @@ class Case:
     text: list[Callable[[str], str]] = field(default_factory=list)
     overrides: list[str] = field(default_factory=list)
     mapping: bool = False
+    encoding: str = "utf-8"
 
     def as_is(self, yaml_text: str) -> str:
         """A mark in place of which `yaml_text` is written."""
@@ -129,6 +132,11 @@ class Case:
         for change in self.text:
             text = change(text)
         return text
+
+    def bytes(self) -> bytes:
+        """The file."""
+        how = "surrogatepass" if self.encoding.startswith("utf") else "replace"
+        return self.written().encode(self.encoding, how)
 
     def path(self) -> tuple[str, ...]:
         """The path of any option or mapping of the resolved recipe."""
@@ -235,51 +243,66 @@ def sections(case: Case) -> None:
 
 def broken_text(case: Case) -> None:
     """The text cut, a piece of it repeated, or characters put into it."""
-    draw = case.random
-    odd = [
-        "\t",
-        "\0",
-        "\ud800",
-        "\u2028",
-        "\x85",
-        "\r",
-        "\ufeff",
-        ":",
-        "- ",
-        "? ",
-        "&a ",
-        "*a ",
-        "#",
-    ]
-    odd += [
-        "---\n",
-        "...\n",
-        "%YAML 9.9\n",
-        "!!",
-        "|",
-        ">",
-        "[",
-        "{",
-        "}",
-        "'",
-        '"',
-        "  ",
-        "\n",
-        "<<: ",
-    ]
+    draw = random.Random(case.random.random())  # the same however often it is written
+    odd = (
+        *(
+            "\t",
+            "\0",
+            "\ud800",
+            "\u2028",
+            "\x85",
+            "\r",
+            "\ufeff",
+            ":",
+            "- ",
+            "? ",
+            "&a ",
+            "*a ",
+            "#",
+        ),
+        *(
+            "---\n",
+            "...\n",
+            "%YAML 9.9\n",
+            "!!",
+            "|",
+            ">",
+            "[",
+            "{",
+            "}",
+            "'",
+            '"',
+            "  ",
+            "\n",
+            "<<: ",
+        ),
+    )
 
     def change(text: str) -> str:
         a, b = sorted(draw.randrange(len(text) + 1) for _ in range(2))
-        how = draw.randrange(4)
+        how = draw.randrange(6)
         if how == 0:
             return text[:a]
         if how == 1:
             return text[:a] + text[b:]
         if how == 2:
             return text[:a] + text[a:b] * draw.choice([2, 10, 3000]) + text[b:]
-        return text[:a] + draw.choice(odd) * draw.choice([1, 1, 2, 500]) + text[a:]
+        if how == 3:
+            return text[:a] + draw.choice(odd) * draw.choice([1, 1, 2, 500]) + text[a:]
+        lines = text.splitlines(keepends=True)
+        place = draw.randrange(len(lines) + 1)
+        line = draw.choice([*lines[place : place + 1], "extends: []\n", "<<: {seed: 1}\n"])
+        if how == 4:  # the same key twice
+            return "".join([*lines[:place], line, *lines[place:]])
+        indented = line.replace("  ", draw.choice(["\t", " ", "   ", ""]), 1)
+        return "".join([*lines[:place], indented, *lines[place + 1 :]])
 
     case.text.append(change)
+
+
+def other_encoding(case: Case) -> None:
+    """The text in bytes of another encoding."""
+    case.encoding = case.random.choice(["utf-16", "utf-16-be", "utf-32", "utf-8-sig", "cp500"])
 
 
 def python_value(case: Case) -> None:
@@ -290,18 +313,21 @@ def python_value(case: Case) -> None:
     knot: dict[str, Any] = {}
     knot["k"] = knot
     odd = [
-        10**400,
-        -(10**5000),
-        b"x",
-        {1, 2},
-        object(),
-        float("nan"),
-        1j,
-        "\ud800",
-        "a\0",
-        range(9),
+        *(
+            10**400,
+            -(10**5000),
+            b"x",
+            {1, 2},
+            object(),
+            float("nan"),
+            1j,
+            "\ud800",
+            "a\0",
+            range(9),
+        ),
+        *(deep, knot, (1, 2), Path("x"), Path("a\0b"), {3: 4}, {None: 1}, ["x"] * 30_000),
+        *(np.float32(1), np.array([1.0, 2]), np.int64(3), torch.ones(2), True, Decimal("1"), print),
     ]
-    odd += [deep, knot, (1, 2), Path("x"), Path("a\0b"), {3: 4}, {None: 1}, ["x"] * 30_000, print]
     case.mapping = True
     case.put(case.path(), case.random.choice(odd))
 
@@ -309,13 +335,12 @@ def python_value(case: Case) -> None:
 MUTATIONS = (
     *(any_value, any_value, any_value, any_override, any_override, scaled, scaled, scaled),
     *(other_type, other_type, layers_and_swaps, structure, odd_files, sections),
-    *(broken_text, python_value),
+    *(broken_text, broken_text, python_value, other_encoding),
 )
 
 
-def made(seed: int, number: int) -> Case:
-    """Case `number` of `seed`: always the same."""
-    draw = random.Random(f"{seed}/{number}")
+def made(draw: random.Random) -> Case:
+    """A case: always the same of equal dice."""
     name = draw.choice(names())
     tree = json.loads(json.dumps(base(name)[0]))
     case = Case(name, tree, draw)
@@ -332,6 +357,8 @@ def odd_folder(folder: Path) -> None:
     (folder / "link.yaml").symlink_to("diamond17.yaml")
     texts = {"empty": b"", "binary": bytes(range(256)) * 40, "latin.yaml": b"recipe: 1 # \xe9\n"}
     texts["bom.yaml"] = "\ufeffrecipe: 1\n".encode()
+    texts["utf16.yaml"] = "recipe: 1\n".encode("utf-16")
+    texts["anchors.yaml"] = b"recipe: 1\nmodel: &m {<<: *m}\n"
     texts["many.yaml"] = f"extends: [{'link.yaml, ' * 3000}link.yaml]\n".encode()
     texts["list.yaml"] = f"extends: [{'empty, ' * 30}bom.yaml]\n".encode()
     wide = [f"part{n}.yaml" for n in range(60)]
@@ -352,22 +379,23 @@ def odd_folder(folder: Path) -> None:
 
 
 def judged(case: Case, folder: Path) -> str:
-    """What is wrong with how `case` ends; "" if nothing is. Raises what nobody should see."""
+    """How `case` ends. Raises what nobody should see."""
     path = (folder / case.name).with_name("case.yaml")
     try:
         if case.mapping:
             recipe = resolve(case.tree, case.overrides)
         else:
-            path.write_bytes(case.written().encode("utf-8", "surrogatepass"))
+            path.write_bytes(case.bytes())
             recipe = resolve(path, case.overrides)
         model = recipe.build_model("meta")
         recipe.rate_factors(model)
         recipe.build_losses()
         recipe.build_metrics()
     except RecipeError as error:
-        return refusal_fault(error)
-    except MissingExtraError:
-        return ""
+        refuse_faulty(error)
+        return refused(error)
+    except MissingExtraError as error:
+        return refused(error)
     parameter_counts(model)
     differing_options(base(case.name)[1].tree, recipe.tree)
     texts = {"JSON": json.dumps(recipe.tree), "YAML": annotated(recipe)}
@@ -375,96 +403,37 @@ def judged(case: Case, folder: Path) -> str:
         path.write_bytes(text.encode())
         again = resolve(json.loads(text) if kind == "JSON" else path)
         if again.tree != recipe.tree:
-            return f"resolves to another recipe when it is written as {kind}"
-    return ""
+            raise FaultError(f"resolves to another recipe when it is written as {kind}")
+    return "success"
 
 
-def refusal_fault(error: RecipeError) -> str:
-    """What is wrong with a refusal: no place, too long, or a component that failed inside."""
-    if len(str(error)) > CHARACTERS:
-        return f"a message of {len(str(error)):,} characters"
-    if not str(error).replace("\n", "").isprintable():
-        return f"a message that no terminal prints as it is: {str(error)[:500]!r}"
+def refuse_faulty(error: RecipeError) -> None:
+    """Raise FaultError for a problem without a place, or one of a component that failed inside."""
     for problem in error.problems:
         if problem.cause and not isinstance(problem.cause, PluginError):
-            return "".join(traceback.format_exception(problem.cause))
+            raise FaultError("".join(traceback.format_exception(problem.cause)))
         if not problem.file:
-            return f"a problem without a place: {problem}"
-    return ""
+            raise FaultError(f"a problem without a place: {problem}")
 
 
-def memory() -> int:
-    """Bytes of data that this process has mapped."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
-
-
-def run(seed: int, number: int, folder: Path) -> tuple[str, float]:
-    """What is wrong with a case, "" if nothing is, and its seconds of processor time."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if not child:
-        limit = memory() + MEGABYTES * 10**6
-        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        try:
-            fault = judged(made(seed, number), folder)
-        except BaseException:  # whatever a user would see as a traceback
-            fault = traceback.format_exc()
-        fault = fault[:1000] + " ... " + fault[-2000:] if len(fault) > 3000 else fault
-        os.write(writing, b"." + fault.encode("utf-8", "replace"))
-        os._exit(0)
-    os.close(writing)
-    ready, _, _ = select.select([reading], [], [], DEADLINE)
-    answer = os.read(reading, 60_000).decode() if ready else ""
-    os.close(reading)
-    if not ready:
-        os.kill(child, signal.SIGKILL)
-    _, status, used = os.wait4(child, 0)
-    seconds = used.ru_utime + used.ru_stime
-    if not answer:
-        code = os.waitstatus_to_exitcode(status)
-        return (f"ended with {code}" if ready else f"hangs for {DEADLINE:g} s"), seconds
-    slow = f"takes {seconds:.1f} s" if seconds > SECONDS else ""
-    return answer[1:] or slow, seconds
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=1000)
-    parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--case", type=int, help="show this one alone")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
+    """Resolve all that cases begin with; make them in a copy of the recipes with odd files."""
+    types()
     for name in names():
         base(name)
-    types()
-    numbers = range(options.first, options.first + options.cases)
-    faults, longest, began = 0, 0.0, time.monotonic()
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch, "recipes")
-        shutil.copytree(RECIPES, folder)
-        for inside in [folder, *(path for path in folder.iterdir() if path.is_dir())]:
-            odd_folder(inside)
-        if options.case is not None:
-            case = made(options.seed, options.case)
-            what = case.tree if case.mapping else case.written()
-            print(f"{case.name} {str(what)[:5000]}\n{[x[:300] for x in case.overrides]}\n")
-            print(judged(case, folder) or "passes")
-            return 0
-        for number in numbers:
-            fault, seconds = run(options.seed, number, folder)
-            longest = max(longest, seconds)
-            if fault:
-                faults += 1
-                print(f"--seed {options.seed} --case {number}: {fault}\n", flush=True)
-    print(
-        f"{len(numbers)} cases, {faults} failed, the longest took {longest:.1f} s of processor "
-        f"time, all of them {time.monotonic() - began:.0f} s"
-    )
-    return 1 if faults else 0
+    folder = scratch / "recipes"
+    shutil.copytree(RECIPES, folder)
+    for inside in [folder, *(path for path in folder.iterdir() if path.is_dir())]:
+        odd_folder(inside)
+
+    def case_in(dice: random.Random, _: Path) -> tuple[str, Use]:
+        case = made(dice)
+        what = "a mapping" if case.mapping else case.written()[:3000]
+        shown = f"{case.name}, {[text[:300] for text in case.overrides]}\n{what!s}"
+        return shown.encode(errors="replace").decode(), partial(judged, case, folder)
+
+    return case_in
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(attack(__doc__, prepared))

@@ -1,4 +1,4 @@
-"""Small data sets in every format, each with one hostile change that a seed chooses."""
+"""Small data sets in every format, each with one hostile change that dice choose."""
 
 import importlib
 import io
@@ -11,6 +11,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 formats: Any = importlib.import_module("photo_formats")
+Image: Any = formats.Image
 
 _SIZE = (30, 40)
 _DEEP = 100_000
@@ -29,9 +31,13 @@ _HOSTILE: Sequence[Any] = (
 )  # fmt: skip
 
 
-def write_data_set(folder: Path, seed: int) -> str:
-    """Write the data set of a seed to `folder`; its format and change in words."""
-    chance = random.Random(seed)
+_PRESS = zlib.compressobj(9, zlib.DEFLATED, -15)
+_BOMB = (_PRESS.compress(bytes(10**6)) + _PRESS.flush(zlib.Z_FULL_FLUSH)) * 4000 + _PRESS.flush()
+"""4 GB of zeros."""
+
+
+def write_data_set(folder: Path, chance: random.Random) -> str:
+    """Write a data set to `folder`; its format and change in words."""
     kind = chance.choice(sorted(_WRITERS))
     write, listings, own = _WRITERS[kind]
     content = write(folder, chance)
@@ -40,13 +46,18 @@ def write_data_set(folder: Path, seed: int) -> str:
         lambda: _image(folder, chance),
         *(lambda change=change: change(folder, content, chance) for change in own),
     ]
+    chosen = chance.choices([*changes[:2], *changes[2:] * 2], k=chance.choice([1, 1, 1, 2]))
+    said = [kind]
     try:
-        return f"{kind}: {chance.choice([*changes[:2], *changes[2:] * 2])()}"
-    except (ValueError, TypeError, RuntimeError) as error:  # what cannot be written either
-        return f"{kind}: no change ({error})"
+        for change in chosen:
+            said.append(change())
+        return ": ".join(said)
+    except Exception as error:  # what cannot be written either, or is no more there
+        return f"{': '.join(said)}: no change ({error})"
 
 
-def _photos(folder: Path, chance: random.Random, suffix: str = "png") -> Any:
+def _photos(folder: Path, chance: random.Random, suffix: str = "") -> Any:
+    suffix = suffix or chance.choice(["png", "png", "jpg"])
     place = folder.parent / f"{folder.name}-photos"
     photos = formats.synthetic(place, 5, _SIZE, suffix, chance.randrange(1000))
     return formats.centred(photos)
@@ -95,8 +106,12 @@ def _zipped(folder: Path, inner: Path, chance: random.Random) -> str:
     if what is None:
         with zipfile.ZipFile(archive, "a") as opened:
             name = chance.choice(["../out", "/etc/out", "a/transforms.json/b", "transforms.json"])
-            opened.writestr(name, "x")
-            said = f"holds {name}"
+            name = chance.choice([name, "images/view_001.png", "\x1b[2J", "a" * 5000])
+            member = zipfile.ZipInfo(name)
+            opened.writestr(member, _BOMB if (large := chance.random() < 0.3) else b"x")
+            if large:  # what the directory at the end says is believed
+                member.compress_type, member.file_size = zipfile.ZIP_DEFLATED, 4 * 10**9
+            said = f"holds {name[:40]!r}{' of 4 GB' * large}"
         if chance.random() < 0.5:
             said = _bytes(archive, chance)
     return said
@@ -164,10 +179,18 @@ def _record(folder: Path, record: dict[str, Any], chance: random.Random) -> str:
 def _json(folder: Path, _: Any, chance: random.Random) -> str:
     """Replace or remove a value of a JSON file, or nest it deeply."""
     file = chance.choice(sorted(folder.rglob("*.json")))
-    if chance.random() < 0.08:
-        file.write_text("[" * _DEEP + "]" * _DEEP)
-        return f"{file.name} is {_DEEP} deep"
-    data = json.loads(file.read_text())
+    whole = file.read_text()
+    if chance.random() < 0.15:
+        told, data = chance.choice([
+            ("deep", ("[" * _DEEP + "]" * _DEEP).encode()), ("twice", (whole * 2).encode()),
+            ("UTF-16", whole.encode("utf-16")), ("with a mark", whole.encode("utf-8-sig")),
+            ("a number", b"7"), ("a list", b"[]"), ("another's key", b'{"frames": {"a": [1]}}'),
+            ("keys twice", (whole[0] + whole[1:-1] + ", " + whole[1:]).encode()),
+            ("no UTF-8", whole.encode() + b'\xff'), ("100 MB of spaces", b" " * 10**8),
+        ])  # fmt: skip
+        file.write_bytes(data)
+        return f"{file.name} is {told}"
+    data = json.loads(whole)
     holder, path = data, []
     while True:
         key = chance.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
@@ -233,7 +256,7 @@ def _text(folder: Path, _: Any, chance: random.Random) -> str:
 def _bytes(file: Path, chance: random.Random) -> str:
     """Damage the bytes of a file, or put something else in its place."""
     data = bytearray(file.read_bytes())
-    what = chance.choice(["cut", "flip", "zeros", "empty", "random", "count", "place"])
+    what = chance.choice(["cut", "flip", "zeros", "empty", "random", "count", "place", "NaN"])
     at = chance.randrange(max(len(data), 1))
     if what == "cut":
         del data[at:]
@@ -242,6 +265,8 @@ def _bytes(file: Path, chance: random.Random) -> str:
             data[place] = 0 if what == "zeros" else data[place] ^ chance.randrange(1, 256)
     elif what == "count":
         data[:8] = struct.pack("<Q", chance.choice([0, 2**40, 2**63, 2**64 - 1]))
+    elif what == "NaN":  # of whatever numbers lie there
+        data[at : at + 8] = struct.pack("<d", chance.choice([float("nan"), 1e308, -1.0, 0.0]))
     elif what == "place":
         return _in_place_of(file, chance)
     else:
@@ -252,11 +277,14 @@ def _bytes(file: Path, chance: random.Random) -> str:
 
 def _in_place_of(file: Path, chance: random.Random) -> str:
     file.unlink()
-    what = chance.choice(["pipe", "folder", "loop", "nothing", "/dev/zero", "no target"])
+    what = chance.choice(["pipe", "folder", "loop", "nothing", "/dev/zero", "no target", "1 TB"])
     if what == "pipe":
         os.mkfifo(file)
     elif what == "folder":
         file.mkdir()
+    elif what == "1 TB":
+        with file.open("wb") as opened:
+            opened.truncate(10**12)
     elif what != "nothing":
         target = {"loop": file.name, "no target": "nowhere"}.get(what, what)
         file.symlink_to(target)
@@ -265,7 +293,8 @@ def _in_place_of(file: Path, chance: random.Random) -> str:
 
 def _image(folder: Path, chance: random.Random) -> str:
     """Damage or replace a photo, a mask or a depth map."""
-    found = [f for f in sorted(folder.rglob("*")) if f.suffix in (".png", ".npy") and f.is_file()]
+    kinds_of_file = (".png", ".jpg", ".npy")
+    found = [f for f in sorted(folder.rglob("*")) if f.suffix in kinds_of_file and f.is_file()]
     if not found:
         return "no change: its photos are inside of another file"
     file = chance.choice(found)
@@ -276,6 +305,21 @@ def _image(folder: Path, chance: random.Random) -> str:
         "no pixels": lambda: _png(0, 0),
         "float": lambda: formats.encoded(_float(), "TIFF"),
         "PostScript": lambda: formats.encoded(np.zeros((*_SIZE, 3), np.uint8), "EPS"),
+        "48 megapixels": _of_48_megapixels,
+        "turned": lambda: formats.encoded(_grey(), "JPEG", exif=_turned()),
+        "16 bits": lambda: formats.encoded(np.full(_SIZE, 40_000, np.uint16)),
+        "text bomb": lambda: _png(40, 30, b"zTXt", b"a\0\0" + zlib.compress(b" " * 10**8)),
+        "profile": lambda: _png(40, 30, b"iCCP", b"a\0\0" + zlib.compress(b"\xff" * 10**6)),
+        "many frames": lambda: formats.encoded(
+            _grey(),
+            "GIF",
+            save_all=True,
+            append_images=[Image.new("L", _SIZE[::-1], shade) for shade in range(1, 200)],
+        ),
+        "many pages": lambda: formats.encoded(
+            _grey(), "TIFF", save_all=True, append_images=[Image.new("L", (1, 1))] * 50
+        ),
+        "web page": lambda: b"<!DOCTYPE html><title>404</title>" * 9,
     }
     kind = chance.choice([*kinds, "bytes", "bytes", "place"])
     if kind == "bytes":
@@ -287,11 +331,28 @@ def _image(folder: Path, chance: random.Random) -> str:
 
 
 def _float() -> Any:
-    return formats.Image.fromarray(np.ones(_SIZE, np.float32))
+    return Image.fromarray(np.ones(_SIZE, np.float32))
 
 
-def _png(width: int, height: int) -> bytes:
-    """A black 1-bit PNG."""
+def _grey() -> Any:
+    return Image.new("L", _SIZE[::-1], 128)
+
+
+def _turned() -> Any:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    return exif
+
+
+@cache
+def _of_48_megapixels() -> bytes:
+    """A photo of a phone, with noise, of the same shape as the others."""
+    noise = np.random.default_rng(0).integers(0, 256, (1000, 1000, 3), np.uint8)
+    return formats.encoded(Image.fromarray(np.tile(noise, (6, 8, 1))), "JPEG")
+
+
+def _png(width: int, height: int, kind: bytes = b"", data: bytes = b"") -> bytes:
+    """A black 1-bit PNG. kind, data: of one more chunk."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -300,7 +361,8 @@ def _png(width: int, height: int) -> bytes:
 
     rows = zlib.compress(bytes((1 + (width + 7) // 8) * height), 1)
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    more = chunk(kind, data) if kind else b""
+    return b"\x89PNG\r\n\x1a\n" + header + more + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def _colmap(kind: str) -> Callable[[Path, random.Random], Any]:

@@ -1,13 +1,14 @@
 """Kill a process again and again, many times while it writes, and see that nothing is lost.
 
-    python tools/kill_training.py --kills 50 --seed 0
-    python tools/kill_training.py --what evaluation --kills 50
-    python tools/kill_training.py --what packing --kills 50
+    python tools/kill_training.py --count 50 --seed 0
+    python tools/kill_training.py --what evaluation --count 50
+    python tools/kill_training.py --what packing --count 50
 
 After each kill -9 of a training the state and the checkpoint must be whole, and the run must go on
 from there; at the end its weights must equal, to the bit, those of the same run without a kill.
-Killed evaluations and packings leave whole files alone and the run as it was, and in the end,
-called again, what they leave without a kill. Prints one line and ends with 1 if anything is lost.
+Evaluations and packings are killed as they open, move or remove one of their files, or a moment
+later. They leave whole files alone and the run as it was, and in the end, called again, what they
+leave without a kill. Prints one line and ends with 1 if anything is lost.
 """
 
 import argparse
@@ -15,15 +16,17 @@ import os
 import random
 import shutil
 import signal
+import sys
 import tempfile
 import time
-import traceback
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import torch
+from attack import in_child
 from qgs_datatools import packing
 from qgs_datatools.entries import Encoding
 from rich.console import Console
@@ -61,21 +64,7 @@ def recipe_of(width: int, steps: int, save_every: int) -> Recipe:
 def start(recipe: Recipe, run: Path) -> int:
     """Train in a process of its own; its number."""
     quiet = Console(quiet=True)
-    return in_child(partial(train, console=quiet, device="cpu", resume=True), recipe, run)
-
-
-def in_child(work: Callable[..., Any], *arguments: Any) -> int:
-    """Do `work` in a process of its own; its number."""
-    child = os.fork()
-    if child:
-        return child
-    torch.set_num_threads(1)
-    try:
-        work(*arguments)
-    except BaseException:
-        traceback.print_exc()
-        os._exit(1)
-    os._exit(0)
+    return in_child(partial(train, recipe, run, console=quiet, device="cpu", resume=True))
 
 
 def kill(child: int, run: Path, longest: float) -> bool:
@@ -105,7 +94,7 @@ def kill_training(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as scratch:
         run = Path(scratch, "run")
         kills = inside = lost = last = 0
-        while kills < options.kills and kill(start(recipe, run), run, options.longest):
+        while kills < options.count and kill(start(recipe, run), run, options.longest):
             kills += 1
             inside += any(map(is_leftover, run.iterdir()))
             step = saved_step(run)
@@ -124,7 +113,7 @@ def kill_training(options: argparse.Namespace) -> int:
         + ("equal" if equal else "DIFFER from")
         + " those without kills"
     )
-    return 0 if equal and not lost and kills == options.kills else 1
+    return 0 if equal and not lost and kills == options.count else 1
 
 
 def evaluate_run(run: Path, out: Path) -> None:
@@ -140,6 +129,28 @@ def pack_rooms(recipe: Recipe, out: Path) -> None:
     packing.pack(
         source, splits, opened_path(str(out)), {}, Encoding(False, None), chunk_bytes=4_000
     )
+
+
+WRITES = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.chmod")
+"""What Python tells of a process that changes files (audit events)."""
+
+
+def watched(folder: Path, last: int, pause: float) -> Iterator[int]:
+    """Kill this process `pause` seconds after it began its `last`-th change of files in `folder`.
+
+    A kernel's timer kills as kill -9 does: nothing of this process runs any more. Gives the numbers
+    of the changes that are yet to come.
+    """
+    numbers = count(1)
+
+    def see(event: str, arguments: tuple[Any, ...]) -> None:
+        changes = event in WRITES and str(arguments[0]).startswith(str(folder))
+        if changes and (event != "open" or arguments[2] & os.O_ACCMODE) and next(numbers) == last:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_REAL, pause)
+
+    sys.addaudithook(see)
+    return numbers
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -158,34 +169,48 @@ def kill_command(options: argparse.Namespace) -> int:
         before = files_of(run)
         of_kind = {"evaluation": (evaluate_run, run), "packing": (pack_rooms, recipe)}
         command, subject = of_kind[options.what]
-        began = time.monotonic()
-        os.waitpid(in_child(command, subject, through), 0)
-        longest, whole = time.monotonic() - began, files_of(through)
-        kills = inside = damaged = 0
-        while kills < options.kills:
-            child = in_child(command, subject, out)
-            time.sleep(random.uniform(0, longest))
-            os.kill(child, signal.SIGKILL)
-            code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-            if code not in (0, -signal.SIGKILL):
+
+        def killed(place: Path, last: int, pause: float) -> int:
+            """How the command ends when it is killed so; that it was, as a negative number."""
+
+            def work() -> None:
+                numbers = watched(Path(scratch), last, pause)
+                command(subject, place)
+                Path(scratch, "changes").write_text(str(next(numbers)))
+
+            return os.waitstatus_to_exitcode(os.waitpid(in_child(work), 0)[1])
+
+        assert killed(through, 10**9, 0) == 0
+        whole = files_of(through)
+        changes = int(Path(scratch, "changes").read_text())
+        kills = ended = amid = damaged = 0
+        while kills < options.count:
+            code = killed(
+                out, random.randrange(1, changes), random.choice([1e-6, random.uniform(0, 0.01)])
+            )
+            if code not in (0, -signal.SIGALRM):
                 print(f"called again after {kills} kills, {options.what} ended with {code}")
                 return 1
-            kills += code == -signal.SIGKILL
             found = files_of(out)
-            inside += 0 < len(found.keys() & whole.keys()) < len(whole)
+            kills += code != 0
+            ended += code == 0
+            left = any(map(is_leftover, out.rglob("*")))
+            amid += code != 0 and (left or 0 < len(found.keys() & whole.keys()) < len(whole))
             parts = [name for name in found.keys() & whole.keys() if found[name] != whole[name]]
             damaged += bool(parts) or files_of(run) != before
             if code == 0 and found != whole:
                 differing = sorted(n for n in found | whole if found.get(n) != whole.get(n))
                 print(f"ended, after {kills} kills, with other files than without: {differing}")
                 return 1
-            if out.exists() and found == whole:
+            if code == 0:
                 shutil.rmtree(out)
-        os.waitpid(in_child(command, subject, out), 0)
-        equal = files_of(out) == whole
+        equal = killed(out, 10**9, 0) == 0 and files_of(out) == whole
     print(
-        f"{kills} kills of {options.what}, {inside} amid its files; {damaged} times "
-        f"a file was damaged; in the end {'equal to' if equal else 'UNLIKE'} one without kills"
+        f"{kills} kills of {options.what}, each amid its {changes} changes of files, {amid} left "
+        f"some of its files or parts of them, {ended} ends between; "
+        f"{damaged} times a file was damaged; in the end "
+        + ("equal to" if equal else "UNLIKE")
+        + " one without kills"
     )
     return 0 if equal and not damaged else 1
 
@@ -193,7 +218,7 @@ def kill_command(options: argparse.Namespace) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--what", choices=("training", "evaluation", "packing"), default="training")
-    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--count", type=int, default=50, help="how many kills")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--width", type=int, default=256)
     parser.add_argument("--longest", type=float, default=1.0, help="seconds until a kill")

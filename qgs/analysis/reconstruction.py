@@ -221,9 +221,7 @@ def reconstruct(
     return Reconstruction(sample, gaussians, rendering, scores, world, tuning, refinement)
 
 
-def remarks_on(
-    result: Reconstruction, scene: Scene, head: Head, trained_on: str | None
-) -> list[str]:
+def remarks_on(result: Reconstruction, scene: Scene, head: Head, trained_on: Domain) -> list[str]:
     """What is to be said of a prediction for photos of `scene`. trained_on: see `verdict`."""
     sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)

@@ -16,6 +16,7 @@ from qgs.cli.options import Device, Overrides, Threads, use_threads
 
 if TYPE_CHECKING:
     from qgs.composer import Recipe
+    from qgs.data.domain import Domain
     from qgs.engine.results import Evaluation
     from qgs.model import QueryGaussianModel
 
@@ -73,12 +74,11 @@ def evaluate(
         raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
     from qgs.composer import resolve
-    from qgs.data.domain import KEY
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
     from qgs.engine.guard import refuse_broken
-    from qgs.io.checkpoint import load, load_extra, load_recipe, load_step
+    from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
     from qgs.io.models import is_own_path
 
     use_threads(threads)
@@ -89,14 +89,13 @@ def evaluate(
                 + ", ".join(SECTIONS)
             )
     checkpoint = checkpoint_of(runs[0])
-    recipe = load_recipe(checkpoint)
+    recipe, trained_on = load_recipe(checkpoint), load_domain(checkpoint)
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
     refuse_broken(model, checkpoint)
     folder = out or evaluation_folder(checkpoint, bool(settings), is_own_path(runs[0]))
     step = load_step(checkpoint)
-    trained_on = load_extra(checkpoint).get(KEY, "")
     evaluation = evaluate_into(model, recipe, step, folder, console, batch, trained_on)
     run = RunFolder(checkpoint.parent)
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
@@ -149,7 +148,7 @@ def evaluate_into(
     folder: Path,
     console: Console,
     batch: int = 1,
-    trained_on: str | None = None,
+    trained_on: Domain | None = None,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
     from qgs.engine.evaluation import evaluate as judge

@@ -97,17 +97,16 @@ def reconstruct(
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
-    from qgs.data.domain import KEY
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.engine.guard import refuse_broken
     from qgs.engine.tuning import tune as fit
     from qgs.engine.tuning import tuning_loss
-    from qgs.io.checkpoint import load, load_extra, load_recipe
+    from qgs.io.checkpoint import load, load_domain, load_recipe
 
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
-    model, recipe = load(file, device), load_recipe(file)
+    model, recipe, trained = load(file, device), load_recipe(file), load_domain(file)
     refuse_broken(model, file)
     if overrides:
         recipe = resolve(recipe.tree, overrides)
@@ -128,7 +127,7 @@ def reconstruct(
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, tuned, record)
-    remarks = remarks_on(result, scene, model.head, load_extra(file).get(KEY))
+    remarks = remarks_on(result, scene, model.head, trained)
     result = replace(result, remarks=remarks)
     console.print(score_table(result, "feed-forward" if refine else ""))
     console.print("\n".join(remarks), soft_wrap=True, highlight=False, markup=False)

@@ -7,12 +7,11 @@ from qgs.cli import contest
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import SceneSource, SceneSourceConfig
-from qgs.data.domain import KEY
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import checkpoint_of
-from qgs.io.checkpoint import load, load_extra, load_recipe
+from qgs.io.checkpoint import load, load_domain, load_recipe
 
 WINDOWS = 6
 """Scenes, and windows of a scene, that are judged of a user's photos."""
@@ -31,6 +30,7 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
     Raises as `load` and the data do, and ValueError where the recipes do not judge alike.
     """
     recipes = {name: load_recipe(file) for name, file in files.items()}
+    trained = {name: load_domain(file) for name, file in files.items()}
     if photos is not None:
         recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
     (first, other), entries = next(iter(recipes.items())), []
@@ -38,7 +38,7 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
         contest.refuse_unequal(name, recipe, first, other, contest.JUDGED)
     for name, recipe in recipes.items():
         model = load(files[name], choose_device(device))
-        evaluation = evaluate(model, recipe, trained_on=load_extra(files[name]).get(KEY, ""))
+        evaluation = evaluate(model, recipe, trained_on=trained[name])
         entries.append(contest.entry_of(name, recipe, evaluation, model))
     return entries
 

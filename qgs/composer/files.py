@@ -1,6 +1,7 @@
 """A recipe file with everything it extends, and `--set` overrides laid over it."""
 
 import errno
+import json
 import os
 import stat
 from collections.abc import Mapping, Sequence
@@ -31,6 +32,17 @@ MAX_BYTES = 256 * 1024
 """Of all files of a recipe together; the longest that we ship resolves to 10 KiB."""
 MAX_EXTENDS = 64
 """Names in all `extends` of a recipe's files together, each file's counted once."""
+
+
+def refuse_beyond_reading(resolved: Mapping[str, Any], origin: Origin, problems: Problems) -> None:
+    """Add a problem for a resolved recipe that no run or checkpoint could be read with again."""
+    try:
+        from_plain(resolved, origin, Count())
+        if len(json.dumps(resolved)) > MAX_BYTES:
+            raise RecipeSizeError(f"it is longer than {MAX_BYTES // 1024} KiB")
+    except RecipeSizeError as error:
+        fix = "name fewer losses, metrics and parts, with shorter names and values"
+        problems.add(origin, "", f"with every option written out, {error}", fix)
 
 
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:

@@ -29,7 +29,7 @@ class UnfitValueError(ValueError):
 
 @dataclass
 class Count:
-    """Counts the values of a recipe over all its files, those of aliases each time."""
+    """Counts the values and keys of a recipe over all its files, those of aliases each time."""
 
     values: int = field(default=0, init=False)
 
@@ -38,7 +38,8 @@ class Count:
         self.values += 1
         if self.values > MAX_VALUES:
             raise RecipeSizeError(
-                f"there are more than {MAX_VALUES:,} values, those of aliases counted each time"
+                f"there are more than {MAX_VALUES:,} values and keys, those of aliases counted "
+                "each time"
             )
         if depth > MAX_NESTING:
             raise RecipeSizeError(
@@ -105,6 +106,8 @@ def from_plain(value: Any, origin: Origin, count: Count, path: KeyPath = ()) -> 
     count.one(len(path))
     if isinstance(value, Mapping):
         keys = [(_checked(str(key), path), item) for key, item in value.items()]
+        for _ in keys:  # as the scanner of YAML counts
+            count.one(len(path))
         entries = ((k, from_plain(item, origin, count, (*path, k)), origin) for k, item in keys)
         return MapNode(origin, entries)
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):

@@ -118,10 +118,18 @@ def _matches(pattern: str, path: KeyPath) -> bool:
 
 
 def near_pattern(pattern: str, paths: Iterable[KeyPath]) -> str:
-    """A fix: the name of one of `paths`, or of it at all layers, that is nearest to `pattern`."""
-    names = {name for path in paths for name in (".".join(path), _starred(path))}
-    near = nearest(pattern.removeprefix("model."), {n.removeprefix("model.") for n in names})
-    return f"did you mean `{near}`?" if near else ""
+    """A fix: the nearest name of `paths`, at the layers of `pattern` if it is there, else at all.
+
+    Layers are compared as one: of hundreds, each has the same names.
+    """
+    names = {".".join(path).removeprefix("model.") for path in paths}
+    given = tuple(pattern.removeprefix("model.").split("."))
+    near = nearest(_starred(given), {_starred(tuple(name.split("."))) for name in names})
+    if not near:
+        return ""
+    pairs = zip(near.split("."), given, strict=False)
+    at_layers = ".".join(own if own.isdigit() and x == "*" else x for x, own in pairs)
+    return f"did you mean `{at_layers if at_layers in names else near}`?"
 
 
 def _starred(path: KeyPath) -> str:

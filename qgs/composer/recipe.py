@@ -12,7 +12,7 @@ from qgs import contracts
 from qgs.composer.build import build, build_model
 from qgs.composer.decode import Chosen, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
-from qgs.composer.files import apply_overrides, merge, read_recipe
+from qgs.composer.files import MAX_BYTES, apply_overrides, merge, read_recipe, refuse_beyond_reading
 from qgs.composer.flow import check_flow, check_options, idle_fields
 from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
@@ -126,6 +126,8 @@ def resolve(
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     out = _spell_out(tree, settings, registry, chosen)
+    refuse_beyond_reading(out.values, tree.origin, problems)
+    problems.raise_any()
     return Recipe(
         tree=out.values,
         provenance=out.provenance,
@@ -252,8 +254,15 @@ def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:
     return values
 
 
+WIDEST = 100
+"""Characters of a line beyond which a comment is not aligned to it: files have a size."""
+
+
 def annotated(recipe: Recipe) -> str:
-    """The resolved recipe in YAML; comments, aligned at the right, say what set each value."""
+    """The resolved recipe in YAML; comments, aligned at the right, say what set each value.
+
+    One that would be too long to be read again has no comments.
+    """
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():
@@ -265,5 +274,6 @@ def annotated(recipe: Recipe) -> str:
                 yield f"{name}: {inline(value)}", recipe.provenance[".".join(below)]
 
     lines = list(lines_of(recipe.tree, ()))
-    width = max(len(text) for text, _ in lines)
-    return "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)
+    width = min(max(len(text) for text, _ in lines), WIDEST)
+    text = "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)
+    return text if len(text.encode()) < MAX_BYTES else inline(recipe.tree)

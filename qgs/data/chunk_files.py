@@ -27,7 +27,7 @@ from upath import UPath
 
 from qgs.data.images import decode_mask, encoded_size
 from qgs.data.lenses import Intrinsics, Size
-from qgs.data.paths import is_local, open_file, read_json, stays_inside
+from qgs.data.paths import StoreError, is_local, open_file, read_json, stays_inside
 from qgs.data.photos.checks import (
     LARGEST_SIDE,
     FrameProblem,
@@ -250,10 +250,14 @@ def load_chunk(path: UPath) -> list[Any]:
     Raises FileNotFoundError, and ValueError for a file that is no list.
     """
     try:
-        open_file(path).close()  # raises for what is no file
-        file = str(path) if is_local(path) else io.BytesIO(path.read_bytes())
+        file = open_file(path)  # raises for what is no file
+        if is_local(path):
+            file.close()
+            file = str(path)
         mapped = is_local(path) and path.stat().st_size > 0 and zipfile.is_zipfile(file)
         data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+    except StoreError:
+        raise
     except FileNotFoundError:
         raise FileNotFoundError(
             f"chunk {path} does not exist: download it, or take its scenes out of index.json"

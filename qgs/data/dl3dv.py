@@ -10,7 +10,7 @@ from pydantic import Field
 from upath import UPath
 
 from qgs.contracts import SceneSource
-from qgs.data.paths import ArchivePath, opened_path, read_json
+from qgs.data.paths import ArchivePath, opened_path, read_file, read_json
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
 from qgs.data.scenes import LazyScenes, LazySource, warn_once
@@ -169,7 +169,7 @@ def read_scene_list(file: UPath) -> list[str]:
                 f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
             )
     else:
-        text = file.read_text(encoding="utf-8-sig")
+        text = read_file(file).decode("utf-8-sig")
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
         names = [line for line in lines if line]
     if not names:

@@ -60,10 +60,14 @@ class Domain:
 
     @classmethod
     def read(cls, text: str) -> Domain:
-        """What `text` wrote."""
+        """What `text` wrote. Raises ValueError, TypeError, KeyError or AttributeError for else."""
         plain = json.loads(text)
-        ends = {k: [math.inf if v is None else v for v in r] for k, r in plain["ranges"].items()}
-        return cls({name: (low, high) for name, (low, high) in ends.items()}, plain["samples"])
+        ends = {
+            name: [math.inf if end is None else float(end) for end in plain["ranges"][name]]
+            for name in WORDS
+            if name in plain["ranges"]
+        }
+        return cls({name: (low, high) for name, (low, high) in ends.items()}, int(plain["samples"]))
 
     def differences(self, found: Domain) -> list[str]:
         """In what `found` leaves these ranges, in words."""
@@ -77,18 +81,17 @@ class Domain:
         return told
 
 
-def verdict(trained: str | None, found: Domain) -> str:
-    """A sentence: how photos lie to what a model was trained on. trained: `Domain.text`, if known.
+def verdict(trained: Domain, found: Domain) -> str:
+    """A sentence: how photos lie to what a model was trained on; empty where that is not known.
 
     The model need not know their content either: only the cameras are compared.
     """
-    domain = Domain.read(trained) if trained else Domain()
-    if not domain.ranges:
+    if not trained.ranges:
         return (
             "whether the photos are like those that this model was trained on is not known: its "
             "checkpoint does not tell, since an older qgs or other code trained it"
         )
-    if apart := domain.differences(found):
+    if apart := trained.differences(found):
         return (
             f"the photos lie outside what this model was trained on: {', '.join(apart)}. Expect a "
             "poor result; choose other input photos, or train on photos like these"

@@ -14,7 +14,7 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene
-from qgs.data.paths import open_file
+from qgs.data.paths import StoreError, open_file
 from qgs.data.scenes import warn_once
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
@@ -78,10 +78,12 @@ def framing(scene: Scene, frame: int) -> str:
 
 @contextmanager
 def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
-    """`path`, open. Raises ValueError for what goes wrong inside, whatever a decoder raises."""
+    """`path`, open. Raises StoreError, else ValueError for whatever a decoder raises inside."""
     try:
         with open_file(path) as file:
             yield file
+    except StoreError:
+        raise
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise ValueError(

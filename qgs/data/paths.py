@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import io
 import json
+import logging
+import time
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, TypeVar
 
 from upath import UPath
+
+from qgs.memory import in_words
+
+PAUSES = (1.0, 4.0)
+"""Seconds before a remote store that failed is asked again."""
+
+LARGEST = 10**9
+"""Bytes of a file that is read whole; a small archive may promise any number."""
+
+Answer = TypeVar("Answer")
+_log = logging.getLogger(__name__)
 
 _PROTOCOLS = {  # the packages that file systems of fsspec need: the protocols that they serve
     "requests aiohttp": ("http", "https"),
@@ -48,17 +61,57 @@ def is_local(path: Path | UPath) -> bool:
     return isinstance(path, Path)
 
 
+class StoreError(OSError):
+    """A remote store that failed again and again; the message names the URL."""
+
+
+def asked_again(path: Path | UPath, action: Callable[[], Answer]) -> Answer:
+    """What `action` gives, which reads `path`; of a remote store, asked again after PAUSES.
+
+    Raises as `action`, what is absent or forbidden at once; StoreError after the last pause.
+    """
+    if is_local(path) or isinstance(path, ArchivePath):
+        return action()
+    for pause in (*PAUSES, None):
+        try:
+            return action()
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError):
+            raise
+        except Exception as error:  # each file system raises its own
+            said = str(error) or type(error).__name__
+            if pause is None:
+                raise StoreError(
+                    f"{path} cannot be read: its store failed {len(PAUSES) + 1} times in a row, at "
+                    f"last with: {said}. See that it can be reached, then repeat the command"
+                ) from error
+            _log.warning("%s: %s; the store is asked again in %g s", path, said, pause)
+            time.sleep(pause)
+    raise AssertionError
+
+
 def open_file(path: Path | UPath) -> IO[bytes]:
-    """`path`, open for reading bytes. Raises OSError, also for a pipe, a device or a folder."""
-    if is_local(path) and path.exists() and not path.is_file():
+    """`path`, open for reading bytes; a remote one is read whole, see `asked_again`.
+
+    Raises OSError, also for a pipe, a device or a folder.
+    """
+    if not is_local(path):
+        return io.BytesIO(asked_again(path, path.read_bytes))
+    if path.exists() and not path.is_file():
         raise OSError("it is no regular file, but a folder, a pipe or a device")
     return path.open("rb")
 
 
 def read_file(path: Path | UPath) -> bytes:
-    """The bytes of `path`. Raises as `open_file`."""
+    """The bytes of `path`. Raises as `open_file`, and OSError for one beyond LARGEST."""
     with open_file(path) as file:
+        if is_local(path):
+            _refuse_huge(path.stat().st_size)
         return file.read()
+
+
+def _refuse_huge(size: int) -> None:
+    if size > LARGEST:
+        raise OSError(f"it has {in_words(size)}, more than any photo or list of them")
 
 
 def read_json(path: UPath, fix: str, **options: Any) -> Any:
@@ -71,7 +124,7 @@ def read_json(path: UPath, fix: str, **options: Any) -> Any:
         # Python refuses more than 4300 digits, and NumPy more than 18 among floats
         number = lambda digits: int(digits) if len(digits) <= 18 else float(digits)  # noqa: E731
         return json.loads(read_file(path), parse_int=number, **options)
-    except FileNotFoundError:
+    except (FileNotFoundError, StoreError):
         raise
     except RecursionError:
         reason = "its brackets are nested too deeply"
@@ -91,7 +144,7 @@ class Archive:
 
     def __init__(self, path: UPath) -> None:
         try:
-            self._zip = zipfile.ZipFile(str(path) if is_local(path) else path.open("rb"))
+            self._path, self._zip = path, asked_again(path, lambda: _opened_zip(path))
         except (zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(
                 f"{path} is no zip archive or is cut off ({error}): download it again"
@@ -115,11 +168,16 @@ class Archive:
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
         try:
-            return self._zip.read(self.files[member])
+            _refuse_huge(self._zip.getinfo(self.files[member]).file_size)
+            return asked_again(self._path, lambda: self._zip.read(self.files[member]))
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error
         except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
             raise OSError(f"the archive is damaged there: {error}") from error
+
+
+def _opened_zip(path: UPath) -> zipfile.ZipFile:
+    return zipfile.ZipFile(str(path) if is_local(path) else path.open("rb"))
 
 
 open_archive = lru_cache(maxsize=8)(Archive)

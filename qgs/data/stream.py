@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import threading
-import time
 import traceback
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,9 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import Scene, SceneSource, ViewsConfig
 from qgs.data.evaluation import one_line
-from qgs.data.paths import is_local, opened_path
 from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
-from qgs.memory import is_out_of_memory
 from qgs.wording import listed
 
 
@@ -37,11 +34,6 @@ class Share:
 
 MAX_REPLACED = 10
 """Samples that may take the place of one that cannot be made; then training stops."""
-
-PAUSES = (1.0, 4.0)
-"""Seconds before a remote store is asked again for a sample."""
-
-_log = logging.getLogger(__name__)
 
 
 class SampleError(ValueError):
@@ -116,16 +108,13 @@ class SampleStream:
     """Samples by number, each of (seed, number) alone. Raises ValueError without scenes.
 
     skips: a sample that cannot be made gives way to one of the next scene, the first of
-    MAX_REPLACED that can be made. Reading from a remote store is tried again after PAUSES.
+    MAX_REPLACED that can be made.
     """
 
     def __init__(
         self, source: SceneSource, views: ViewsConfig, seed: int, skips: bool = False
     ) -> None:
         self._views, self._seed, self._skips = views, seed, skips
-        path = getattr(source.config, "path", None)
-        remote = isinstance(path, str) and not is_local(opened_path(path))
-        self._pauses = PAUSES if remote else ()
         self._scenes = source.scenes("train")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
@@ -155,16 +144,10 @@ class SampleStream:
         scene = self._scenes[self.order.scene(number + attempt)]
         mirror = bool(rng.random() < self._views.mirror)
         inputs, targets = draw_frames(scene, self._views, rng)
-        for pause in (*self._pauses, None):
-            try:
-                return make_sample(scene, inputs, targets, self._views, mirror)
-            except Exception as error:
-                failure = SampleError(_what_failed(scene, (*inputs, *targets), error))
-                if pause is None or is_out_of_memory(error):
-                    raise failure from error
-                _log.warning("%s; the store is asked again in %g s", failure, pause)
-                time.sleep(pause)
-        raise AssertionError
+        try:
+            return make_sample(scene, inputs, targets, self._views, mirror)
+        except Exception as error:
+            raise SampleError(_what_failed(scene, (*inputs, *targets), error)) from error
 
 
 def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:

@@ -24,7 +24,7 @@ from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import (
     CheckpointError,
-    load_extra,
+    load_domain,
     load_weights,
     opened_tensors,
     read_tensors,
@@ -205,8 +205,7 @@ class Saver:
             if fault:
                 raise damaged(self.folder.state, f"its part `{name}` cannot be restored ({fault})")
         if self.folder.checkpoint.is_file():
-            known = load_extra(self.folder.checkpoint).get(KEY)
-            self.domain = Domain.read(known) if known else Domain()
+            self.domain = load_domain(self.folder.checkpoint)
 
     def _extra(self, step: int) -> dict[str, str]:
         return {"step": str(step), KEY: self.domain.text}
@@ -267,9 +266,10 @@ def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:
 
 
 def broken(state: State, part: str) -> str:
-    """The tensors of `state` with NaN, of weights infinity too; "" if none has."""
-    sound = (lambda t: ~torch.isnan(t)) if part == "moments" else torch.isfinite
-    names = [k for k, v in state.items() if isinstance(v, Tensor) and not bool(sound(v).all())]
+    """The tensors of `state` with NaN or infinity, which only squares may reach; "" for none."""
+    tensors = {k: v for k, v in state.items() if isinstance(v, Tensor)}
+    squares = {k for k, v in tensors.items() if part == "moments" and bool((v >= 0).all())}
+    names = [k for k, v in tensors.items() if k not in squares and not bool(v.isfinite().all())]
     return f"not finite: {listed(names)}" if names else ""
 
 
@@ -386,8 +386,9 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
     ]
     if differing:
         raise OtherRunError(
-            f"the run in {folder.path} has another recipe and cannot be continued with this one:"
-            + "".join(f"\n  {line}" for line in differing)
+            f"{folder.state if saved else folder.recipe} is of a run with another recipe, which "
+            "cannot be continued with this one:"
+            + "".join(f"\n  {line:.500}" for line in differing)
             + f"\nContinue it with its own recipe, {folder.recipe}, or choose another folder. "
             f"Only these may change: {', '.join(FREE)}."
         )
@@ -401,12 +402,12 @@ def refuse_other_data(saved: State, now: State, folder: RunFolder) -> None:
     """
     if saved["step_size"] != now["step_size"]:
         raise OtherRunError(
-            f"an optimiser step of the run in {folder.path} sees {saved['step_size']} samples, "
-            f"here it would see {now['step_size']}: choose training.batch_size, "
+            f"{folder.state} is of a run whose optimiser steps see {saved['step_size']} samples, "
+            f"here they would see {now['step_size']}: choose training.batch_size, "
             "training.accumulate and the number of processes with the same product"
         )
     if saved["scenes"] != now["scenes"]:
         raise OtherRunError(
-            f"the data lists other training scenes than when the run in {folder.path} was saved: "
-            "bring back what was added or removed, or start a new run"
+            f"the data lists other training scenes than when {folder.state} was saved: bring back "
+            "what was added or removed, or start a new run"
         )

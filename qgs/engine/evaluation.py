@@ -35,14 +35,14 @@ def evaluate(
     step: int | None = None,
     batch: int = 1,
     observe: Callable[[int, int], None] | None = None,
-    trained_on: str | None = None,
+    trained_on: Domain | None = None,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
     A scene that fails is named in the result with the reason, and the others go on. Leaves the
     model in the mode it was in. step: optimiser steps behind the weights. batch: scenes that pass
     through the model together; with tuned tokens each passes alone. observe: called with how many
-    scenes are done, and how many there are. trained_on: `Domain.text` of the model, "" where it
+    scenes are done, and how many there are. trained_on: the domain of the model, empty where it
     is not known; None says nothing of it.
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene at all could be judged or `batch` is less than 1.

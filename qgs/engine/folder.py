@@ -53,8 +53,9 @@ class RunFolder:
             )
         if self.checkpoint.exists():
             raise FileExistsError(
-                f"{self.path} holds a checkpoint but no {self.state.name}, so its run cannot be "
-                "continued, and starting again would overwrite it; choose another folder"
+                f"{self.state} is missing or no file, so the run whose {self.checkpoint.name} is "
+                "there cannot be continued, and starting again would overwrite it; choose another "
+                "folder"
             )
         if not self.recipe.is_file():
             raise FileExistsError(

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
+from qgs.engine.checkpoint import broken
 from qgs.engine.folder import checkpoint_of
 from qgs.io.checkpoint import (
     CheckpointError,
@@ -36,6 +37,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     path = checkpoint_of(recipe.init_from)
     learned_by = load_recipe(path)
     learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
+    if fault := broken(learned, "weights"):
+        raise CheckpointError(f"init_from: {path} has weights that are {fault}: take another file")
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()

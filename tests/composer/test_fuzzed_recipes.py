@@ -1,21 +1,23 @@
 """A short run of tools/fuzz_recipes.py; see there."""
 
+import os
 import random
+import time
 from pathlib import Path
 
 import pytest
-from fuzz_recipes import Case, base, judged, made, main, names, refusal_fault
+from attack import FaultError, attack, ended, refused
+from fuzz_recipes import Case, base, judged, made, names, prepared, refuse_faulty
 
 from qgs.composer import RecipeError, RecipeProblem
 
 
 def test_cases_are_the_same_each_time() -> None:
     for number in range(20):
-        first, second = made(3, number), made(3, number)
+        first, second = made(random.Random(number)), made(random.Random(number))
         assert first.overrides == second.overrides
         if not first.mapping:
-            assert first.written() == second.written()
-    assert made(3, 1).written() != made(4, 1).written()
+            assert first.bytes() == second.bytes()
 
 
 def test_a_refusal_is_judged(tmp_path: Path) -> None:
@@ -23,16 +25,30 @@ def test_a_refusal_is_judged(tmp_path: Path) -> None:
     name = names()[0]
     case = Case(name, {**base(name)[0], "seed": -1}, random.Random(0))
     (tmp_path / name).parent.mkdir(exist_ok=True)
-    assert judged(case, tmp_path) == ""
-    long = RecipeError([RecipeProblem("a", "x" * 200_000, "", "f", 1)])
-    failed = RecipeError([RecipeProblem("a", "x", "", "f", 1, KeyError("inside"))])
-    assert "characters" in refusal_fault(long)
-    assert "inside" in refusal_fault(failed)
+    assert judged(case, tmp_path) == "refused RecipeError"
+    with pytest.raises(FaultError, match="characters"):
+        refused(RecipeError([RecipeProblem("a", "x" * 200_000, "", "f", 1)]))
+    with pytest.raises(FaultError, match="no file is named"):
+        refused(ValueError("/tmp/run is bad"), "/tmp/run/state.safetensors")
+    with pytest.raises(FaultError, match="no terminal"):
+        refused(ValueError("\x1b[31m"))
+    with pytest.raises(FaultError, match="inside"):
+        refuse_faulty(RecipeError([RecipeProblem("a", "x", "", "f", 1, KeyError("inside"))]))
+
+
+def test_ends_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ended(lambda: "success").said == "success"
+    assert "ZeroDivisionError" in ended(lambda: str(1 / 0)).fault
+    assert "ended with 3" in ended(lambda: os._exit(3)).fault
+    monkeypatch.setattr("attack.BYTES", 10**8)
+    assert "MB, then: done" in ended(lambda: b"x" * 10**8 and "done").fault
+    monkeypatch.setattr("attack.LONGEST", 0.1)
+    assert "hangs" in ended(lambda: time.sleep(60) or "").fault
 
 
 @pytest.mark.slow
 def test_mutated_recipes_pass_or_are_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["fuzz_recipes", "--cases", "150", "--seed", "17"])
-    assert main() == 0, capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["fuzz_recipes", "--count", "150", "--seed", "17"])
+    assert attack("", prepared) == 0, capsys.readouterr().out

@@ -1,5 +1,6 @@
 """What no recipe does to whoever resolves it: hang, fill memory, hide where its mistake is."""
 
+import json
 import os
 import time
 from collections.abc import Callable
@@ -9,9 +10,11 @@ from typing import Any
 import pytest
 from refusals import refused
 
-from qgs.composer import RecipeError, RecipeProblem, resolve
+from qgs.composer import RecipeError, RecipeProblem, places, resolve
 from qgs.composer.errors import MAX_PROBLEMS
 from qgs.composer.files import MAX_BYTES, MAX_EXTENDS
+from qgs.composer.places import near_pattern
+from qgs.composer.recipe import annotated
 
 Write = Callable[..., Path]
 
@@ -142,8 +145,6 @@ def test_control_characters_do_not_reach_a_terminal(write: Write) -> None:
 
 
 def test_a_recipe_without_losses_is_a_recipe(write: Write) -> None:
-    from qgs.composer.recipe import annotated
-
     dropped = "losses: {photometric: null, visibility: null}"
     for text in ("losses: {}", "losses: null", dropped):
         recipe = resolve(write(f"recipe: 1\n{text}\nmetrics: {{psnr: null}}\n"))
@@ -152,9 +153,38 @@ def test_a_recipe_without_losses_is_a_recipe(write: Write) -> None:
         assert (recipe.build_losses() == {}) == (text != "losses: null")
 
 
+@pytest.mark.parametrize("losses", [300, 800, 1500])
+def test_what_resolves_is_read_again_as_a_run_has_it(losses: int, write: Write) -> None:
+    """With long values and many, whose defaults are written out with comments."""
+    many = {f"n{number}": {"type": "qgs/visibility"} for number in range(losses)}
+    tree = {"recipe": 1, "init_from": "x" * 9000, "losses": many}
+    if losses == 1500:
+        problem = refused(tree, by=resolve)
+        assert "with every option written out, there are more than 20,000 values" in problem.reason
+        return
+    recipe = resolve(tree)
+    assert resolve(write(annotated(recipe))).tree == recipe.tree
+    assert resolve(json.loads(json.dumps(recipe.tree))).tree == recipe.tree
+
+
 @pytest.mark.parametrize("option", ["encoder.mlp_ratio", "queries.count"])
 def test_tensors_that_no_machine_holds_are_told_by_their_place(option: str, write: Write) -> None:
     recipe = resolve(write("recipe: 1\n"), [f"model.{option}={2**62}"])
     problem = refused("meta", by=recipe.build_model)
     assert problem.option == f"model.{option.split('.')[0]}"
     assert "tensors that no machine can hold" in problem.reason
+
+
+def test_layers_are_compared_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comparing a pattern with the names of each of hundreds of layers takes seconds."""
+    slots = ("cross_attention", "self_attention")
+    paths = [("model", "decoder", "layers", str(n), slot) for n in range(256) for slot in slots]
+    seen: list[int] = []
+    known = places.nearest
+    monkeypatch.setattr(
+        places, "nearest", lambda word, names: seen.append(len(names)) or known(word, names)
+    )
+    for given, near in (("7", "7"), ("300", "*"), ("*", "*")):
+        fix = near_pattern(f"decoder.layers.{given}.cros_attention", paths)
+        assert fix == f"did you mean `decoder.layers.{near}.cross_attention`?"
+    assert seen == [2, 2, 2]

@@ -67,7 +67,7 @@ def test_a_domain_is_read_as_it_was_written() -> None:
 
 def test_the_sentence() -> None:
     near, far = [[-0.1, 0, 0], [0.1, 0, 0]], [[-0.2, 0, 0], [0.2, 0, 0]]
-    trained = domain(around([0, 0, 1], near), around([0, 0, 2], far)).text
+    trained = domain(around([0, 0, 1], near), around([0, 0, 2], far))
     within = domain(around([0, 0, 1.5], [[-0.15, 0, 0], [0.15, 0, 0]]))
     assert verdict(trained, within).startswith("the cameras lie within what this model was trained")
     wide = domain(around([0, 0, 1.5], [[-1.5, 0, 0], [1.5, 0, 0], [0, 0, 0]], focal=4.0))
@@ -76,8 +76,7 @@ def test_the_sentence() -> None:
         "(trained: 2), the input cameras stand 3 apart (trained: 0.2 to 0.4), their axes differ by "
         "90 degrees (trained: 11.4), their field of view is 152 degrees wide (trained: 90). Expect"
     )
-    for unknown in (None, Domain().text):
-        assert "is not known: its checkpoint does not tell" in verdict(unknown, within)
+    assert "is not known: its checkpoint does not tell" in verdict(Domain(), within)
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:

@@ -9,7 +9,7 @@ import torch
 
 from qgs.composer import resolve
 from qgs.data.sampling import Batch
-from qgs.data.stream import Share, training_batches
+from qgs.data.stream import SampleError, SampleStream, Share, training_batches
 from qgs.engine import training
 from qgs.engine.training import train
 
@@ -26,12 +26,34 @@ def spoiled(*arguments: Any, share: Share, **options: Any) -> Generator[Batch, N
         stream.close()
 
 
+def without(bad: int) -> None:
+    """Make sample number `bad`, which takes the place of none, one that cannot be made."""
+    made = SampleStream._made
+
+    def failing(stream: SampleStream, number: int, attempt: int) -> Any:
+        if number == bad and not attempt:
+            raise SampleError(f"scene 'x', frame {bad} (a.png): cannot be read")
+        return made(stream, number, attempt)
+
+    SampleStream._made = failing
+
+
 def main(recipe: str, run: str, spoil: str = "") -> None:
     """Train, and print what this process knows of it."""
     torch.set_num_threads(1)
-    if spoil:
+    if spoil.isdecimal():
+        without(int(spoil))
+    elif spoil:
         training.training_batches = spoiled
-    result = train(resolve(Path(recipe)), run, device="cpu", resume=True)
+    try:
+        result = train(resolve(Path(recipe)), run, device="cpu", resume=True)
+    except (
+        SampleError
+    ) as error:  # told by both, though a launcher ends the others of one that fails
+        print(f"refused: {error}; {error.__notes__ if hasattr(error, '__notes__') else ''}")
+        return
+    for reason, times in result.left_out.items():
+        print(f"left out: {times} times {reason}")
     total = sum(float(p.detach().double().abs().sum()) for p in result.model.parameters())
     print(f"{result.main} {result.steps} {total:.6f}")
 

@@ -279,8 +279,8 @@ def test_skipping_changes_no_sound_sample(
     "command",
     [
         ("fuzz_files.py", "--count=150", "--seed=7"),
-        ("kill_training.py", "--what=evaluation", "--kills=8"),
-        ("kill_training.py", "--what=packing", "--kills=8"),
+        ("kill_training.py", "--what=evaluation", "--count=8"),
+        ("kill_training.py", "--what=packing", "--count=8"),
     ],
     ids=lambda command: " ".join(command),
 )

@@ -17,7 +17,7 @@ import qgs
 from qgs.composer import Recipe
 from qgs.engine.checkpoint import read_state
 from qgs.engine.distributed import StopRequest
-from qgs.engine.training import Trainer
+from qgs.engine.training import ELSEWHERE, Trainer
 
 WORKER = Path(__file__).with_name("distributed.py")
 FSDP = {"ACCELERATE_USE_FSDP": "true"}
@@ -26,8 +26,8 @@ PARTS = 'optimizer.parts={"decoder.0.feed_forward": 0, "head": 0.5}'
 """One sublayer stays as it is, and the head learns slower."""
 
 
-def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "", **environment: str) -> None:
-    """Continue or start `run` by torchrun; both processes must say the same of it."""
+def told_by_two(recipe: Recipe, run: Path, spoil: str = "", **environment: str) -> str:
+    """Continue or start `run` by torchrun; what both processes print."""
     file = run.with_suffix(".yaml")
     file.write_text(yaml.safe_dump(dict(recipe.tree)))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
@@ -39,8 +39,14 @@ def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "", **environ
         timeout=240,
     )
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "", **environment: str) -> None:
+    """As `told_by_two`; both processes must say the same of the run."""
+    told = told_by_two(recipe, run, spoil, **environment)
     # wherever they stand: what libraries print meanwhile lands in the same lines
-    said = re.findall(r"(True|False) (\d+) (\d+\.\d+)", done.stdout)
+    said = re.findall(r"(True|False) (\d+) (\d+\.\d+)", told)
     assert sorted(main for main, *_ in said) == ["False", "True"]
     assert said[0][1:] == said[1][1:] == ("4", said[0][2]), "the same weights everywhere"
 
@@ -105,3 +111,29 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path:
     assert [(record["step"], record["weights"]) for record in judged] == [
         (step, weights) for step in (2, 4) for weights in ("raw", "ema")
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bad", "steps"), [(1, 0), (5, 2)], ids=["first", "later"])
+def test_two_processes_stop_together_at_a_sample_that_one_cannot_make(
+    tiny: Tiny, tmp_path: Path, bad: int, steps: int
+) -> None:
+    """Samples with odd numbers are those of the second process."""
+    recipe = tiny("locus", "training.batch_size=1")
+    told = told_by_two(recipe, tmp_path / "run", str(bad))
+    assert told.count("refused: ") == 2
+    assert told.count(f"refused: scene 'x', frame {bad} (a.png): cannot be read") == 1
+    assert told.count(f"refused: {ELSEWHERE}") == 1
+    assert told.count(f"saved at step {steps}; continue with --resume") == 2 * bool(steps)
+    assert (tmp_path / "run").exists() == bool(steps)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bad", [1, 5])
+def test_two_processes_go_on_without_a_sample_that_one_cannot_make(
+    tiny: Tiny, tmp_path: Path, bad: int
+) -> None:
+    recipe = tiny("locus", "training.batch_size=1", "training.on_bad_sample=skip")
+    told = told_by_two(recipe, tmp_path / "run", str(bad))
+    assert told.count(f"left out: 1 times scene 'x', frame {bad}") == 2
+    assert len(losses(tmp_path / "run")) == 4

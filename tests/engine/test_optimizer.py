@@ -103,7 +103,8 @@ def test_the_last_pattern_that_matches_counts(tiny: Tiny) -> None:
     ("pattern", "fix"),
     [
         ("encodr", r"did you mean `encoder`\?"),
-        ("decoder.9.self_attention", r"did you mean `decoder\.\d\.self_attention`\?"),
+        ("decoder.9.self_attention", r"did you mean `decoder\.\*\.self_attention`\?"),
+        ("decoder.1.self_atention", r"did you mean `decoder\.1\.self_attention`\?"),
         ("decoder.*.self_atention", r"did you mean `decoder\.\*\.self_attention`\?"),
         ("decoder.layers.*.self_atention", r"did you mean `decoder\.layers\.\*\.self_attention`\?"),
         ("decoder.refinment.x", r"did you mean `decoder\.refinement`\?"),

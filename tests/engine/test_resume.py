@@ -335,7 +335,7 @@ def test_killed_runs_go_on_from_whole_files(
     """inside: how many kills, at least, must have come inside a save for this to prove anything."""
     tool = Path(__file__).parents[2] / "tools" / "kill_training.py"
     done = subprocess.run(
-        [sys.executable, str(tool), f"--kills={kills}", *options],
+        [sys.executable, str(tool), f"--count={kills}", *options],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

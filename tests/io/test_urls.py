@@ -1,8 +1,26 @@
 import sys
+import zipfile
+import zlib
+from pathlib import Path
 
 import pytest
+import torch
+from fsspec.implementations.memory import MemoryFileSystem
+from photo_formats import opened, scene, synthetic, write_nerfstudio
+from upath import UPath
 
-from qgs.data.paths import is_local, opened_path, stays_inside
+from qgs.contracts import ViewsConfig
+from qgs.data.chunk_files import load_chunk
+from qgs.data.paths import (
+    Archive,
+    StoreError,
+    is_local,
+    opened_path,
+    read_file,
+    read_json,
+    stays_inside,
+)
+from qgs.data.stream import SampleError, SampleStream
 
 
 def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
@@ -37,3 +55,103 @@ def test_names_that_stay_inside(name):
 @pytest.mark.parametrize("name", ["..", "a/../b", "/a", "\\a", "a\\..\\..\\b", "c:/a", "", "C:a"])
 def test_names_that_lead_outside(name):
     assert not stays_inside(name)
+
+
+class Store:
+    """A store in memory that fails so many times before a file can be read."""
+
+    left = 0
+
+
+@pytest.fixture
+def flaky(tmp_path, monkeypatch) -> str:
+    """The URL of a scene in it."""
+    whole = MemoryFileSystem._open
+
+    def failing(store, path, mode="rb", **options):
+        if Store.left and mode == "rb":
+            Store.left -= 1
+            raise ConnectionResetError("the peer hung up")
+        return whole(store, path, mode, **options)
+
+    monkeypatch.setattr(Store, "left", 0)
+    folder, url = tmp_path / "scene", f"memory://{tmp_path.name}"
+    write_nerfstudio(folder, synthetic(tmp_path / "photos"))
+    for file in filter(Path.is_file, folder.rglob("*")):
+        place = UPath(url) / file.relative_to(folder).as_posix()
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(file.read_bytes())
+    monkeypatch.setattr(MemoryFileSystem, "_open", failing)
+    return url
+
+
+@pytest.fixture
+def pauses(monkeypatch) -> list[float]:
+    waited: list[float] = []
+    monkeypatch.setattr("qgs.data.paths.time.sleep", waited.append)
+    return waited
+
+
+def test_a_store_that_fails_is_asked_again(flaky, tmp_path, pauses, caplog):
+    expected = scene(tmp_path / "scene").images([2])
+    Store.left = 2
+    photos = scene(flaky)  # its listing
+    assert pauses == [1.0, 4.0]
+    Store.left = 1
+    assert torch.equal(photos.images([2]), expected)
+    assert pauses == [1.0, 4.0, 1.0]
+    assert "view_002.png: the peer hung up; the store is asked again in 1 s" in caplog.text
+    source, views = opened(flaky, holdout=0), ViewsConfig(inputs=2, targets=1, gap=(1, 3))
+    Store.left = 2
+    assert SampleStream(source, views, 0).batch([0]).scenes
+    with pytest.raises(FileNotFoundError):
+        read_file(UPath(f"{flaky}/nothing"))
+    assert len(pauses) == 5
+
+
+def test_a_store_that_fails_for_good_is_one_error_with_the_url(flaky, pauses):
+    photos, source = scene(flaky), opened(flaky, holdout=0)
+    Store.left = 99
+    for action in (
+        lambda: photos.images([2]),
+        lambda: scene(flaky),
+        lambda: read_file(UPath(flaky) / "transforms.json"),
+    ):
+        with pytest.raises(
+            StoreError, match=r"failed 3 times in a row, at last with: the peer"
+        ) as e:
+            action()
+        assert str(e.value).startswith(flaky)
+    assert pauses == [1.0, 4.0] * 3
+    views = ViewsConfig(inputs=2, targets=1, gap=(1, 3))
+    with pytest.raises(SampleError, match=f"{flaky}/images/view_.*failed 3 times in a row"):
+        SampleStream(source, views, 0).batch([0])
+
+
+def test_a_remote_archive_and_a_remote_chunk_are_asked_again(flaky, tmp_path, pauses):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as opened_zip:
+        opened_zip.writestr("a.txt", "x" * 100)
+    archive, chunk = UPath(flaky) / "a.zip", UPath(flaky) / "0.torch"
+    archive.write_bytes((tmp_path / "a.zip").read_bytes())
+    torch.save([], tmp_path / "0.torch")
+    chunk.write_bytes((tmp_path / "0.torch").read_bytes())
+    Store.left = 2
+    assert Archive(archive).read("a.txt") == b"x" * 100
+    Store.left = 2
+    assert load_chunk(chunk) == []
+    Store.left = 3
+    with pytest.raises(StoreError, match=f"^{flaky}/0.torch"):
+        load_chunk(chunk)
+    assert pauses == [1.0, 4.0] * 3
+
+
+def test_a_file_that_is_read_whole_has_a_limit(tmp_path):
+    with (tmp_path / "huge.json").open("wb") as file:
+        file.truncate(2 * 10**9)
+    with pytest.raises(ValueError, match=r"huge.json .* \(it has 2 GB, more than any photo"):
+        read_json(UPath(tmp_path / "huge.json"), "")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr(member := zipfile.ZipInfo("bomb"), zlib.compress(b"")[2:-4])
+        member.compress_type, member.file_size = zipfile.ZIP_DEFLATED, 4 * 10**9
+    with pytest.raises(OSError, match="4 GB, more than any photo"):
+        Archive(UPath(tmp_path / "a.zip")).read("bomb")

@@ -4,6 +4,7 @@ Points, which are most of a model, are not read, and models may lie on any file 
 pycolmap's own readers do not offer; pycolmap says what the parameters of a camera model mean.
 """
 
+import io
 import math
 import struct
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from upath import UPath
 
 from qgs.contracts import MissingExtraError
 from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
+from qgs.data.paths import open_file
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
 
@@ -110,7 +112,7 @@ def _text_images(model: UPath) -> Iterator[Image]:
 
 def _lines(file: UPath, after: int = 0) -> Iterator[str]:
     """The lines of a file less comments, empty ones, and so many `after` each of the others."""
-    with file.open("r", encoding="utf-8") as opened:
+    with io.TextIOWrapper(open_file(file), encoding="utf-8") as opened:
         for line in map(str.strip, opened):
             if line and not line.startswith("#"):
                 yield line
@@ -121,7 +123,7 @@ def _lines(file: UPath, after: int = 0) -> Iterator[str]:
 def _binary_cameras(model: UPath) -> Iterator[Camera]:
     import pycolmap
 
-    with (model / "cameras.bin").open("rb") as file:
+    with open_file(model / "cameras.bin") as file:
         for _ in range(_unpacked("<Q", file)[0]):
             number, kind, width, height = _unpacked("<IiQQ", file)
             name = pycolmap.CameraModelId(kind).name
@@ -130,7 +132,7 @@ def _binary_cameras(model: UPath) -> Iterator[Camera]:
 
 
 def _binary_images(model: UPath) -> Iterator[Image]:
-    with (model / "images.bin").open("rb") as file:
+    with open_file(model / "images.bin") as file:
         end = file.seek(0, 2)
         file.seek(0)
         for _ in range(_unpacked("<Q", file)[0]):

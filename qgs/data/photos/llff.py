@@ -6,7 +6,7 @@ import numpy as np
 from upath import UPath
 
 from qgs.data.images import load_array
-from qgs.data.paths import open_file
+from qgs.data.paths import StoreError, open_file
 from qgs.data.photos.checks import listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_files, image_folder
 
@@ -52,6 +52,8 @@ def _rows(file: UPath) -> np.ndarray:
     try:
         with open_file(file) as opened:
             rows = load_array(opened)
+    except StoreError:
+        raise
     except Exception as error:  # NumPy raises anything on damaged headers
         raise ValueError(
             f"{file} is no NumPy file of numbers ({error}): export it again"
