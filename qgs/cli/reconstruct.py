@@ -95,17 +95,17 @@ def reconstruct(
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
-    from qgs.data.domain import KEY, Domain, verdict
+    from qgs.data.domain import Domain, verdict
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.engine.guard import refuse_broken
     from qgs.engine.tuning import tune as fit
     from qgs.engine.tuning import tuning_loss
-    from qgs.io.checkpoint import load, load_extra, load_recipe
+    from qgs.io.checkpoint import load, load_domain, load_recipe
 
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
-    model, recipe = load(file, device), load_recipe(file)
+    model, recipe, trained = load(file, device), load_recipe(file), load_domain(file)
     refuse_broken(model, file)
     if overrides:
         recipe = resolve(recipe.tree, overrides)
@@ -127,7 +127,7 @@ def reconstruct(
     result = run(model, sample, world, seen, tuned, record)
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    result = replace(result, likeness=verdict(load_extra(file).get(KEY), found))
+    result = replace(result, likeness=verdict(trained, found))
     console.print(score_table(result, "feed-forward" if refine else ""))
     console.print(result.likeness, soft_wrap=True, highlight=False)
     paths = write_reconstruction(model, result, out)

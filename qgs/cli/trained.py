@@ -7,13 +7,13 @@ from qgs.cli import contest
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import SceneSource, SceneSourceConfig
-from qgs.data.domain import KEY, Domain, verdict
+from qgs.data.domain import Domain, verdict
 from qgs.data.recognition import open_for
 from qgs.data.sampling import Sample
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import checkpoint_of
-from qgs.io.checkpoint import load, load_extra, load_recipe
+from qgs.io.checkpoint import load, load_domain, load_recipe
 
 WINDOWS = 6
 """Scenes, and windows of a scene, that are judged of a user's photos."""
@@ -32,6 +32,8 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
     Raises as `load` and the data do, and ValueError where the recipes do not judge alike.
     """
     recipes = {name: load_recipe(file) for name, file in files.items()}
+    for file in files.values():
+        load_domain(file)  # a damaged one is told before the work
     if photos is not None:
         recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
     (first, other), entries = next(iter(recipes.items())), []
@@ -50,7 +52,7 @@ def likeness(files: Mapping[str, Path], samples: Sequence[Sample]) -> list[str]:
         found.see(sample.inputs.cameras, sample.targets.cameras)
     told: dict[str, list[str]] = {}
     for name, file in files.items():
-        told.setdefault(verdict(load_extra(file).get(KEY), found), []).append(name)
+        told.setdefault(verdict(load_domain(file), found), []).append(name)
     return [f"{', '.join(models)}: {sentence}" for sentence, models in told.items()]
 
 

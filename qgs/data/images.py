@@ -142,7 +142,10 @@ def load_array(file: IO[bytes]) -> np.ndarray:
     version = np.lib.format.read_magic(file)
     of_version = {(1, 0): np.lib.format.read_array_header_1_0}
     shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
-    held, promised = -file.tell() + file.seek(0, 2), math.prod(shape) * dtype.itemsize
+    count = math.prod(shape)
+    held, promised = -file.tell() + file.seek(0, 2), count * dtype.itemsize
+    if max(count, promised // 8) > _MOST_PIXELS:
+        raise ValueError(f"it has {count} numbers of {dtype}: scale it down")
     if held < promised or min(shape, default=0) < 0:
         raise ValueError(f"its header promises {promised} bytes, and {held} follow")
     file.seek(0)

@@ -14,6 +14,8 @@ from typing import IO, Any, Literal
 
 from upath import UPath
 
+from qgs.memory import in_words
+
 _PROTOCOLS = {  # the packages that file systems of fsspec need: the protocols that they serve
     "requests aiohttp": ("http", "https"),
     "s3fs": ("s3", "s3a"),
@@ -55,10 +57,19 @@ def open_file(path: Path | UPath) -> IO[bytes]:
     return path.open("rb")
 
 
-def read_file(path: Path | UPath) -> bytes:
-    """The bytes of `path`. Raises as `open_file`."""
+LARGEST = 1_000_000_000
+"""Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels."""
+
+_LARGEST_JSON = 50_000_000  # which may take forty times as much once parsed
+
+
+def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
+    """The bytes of `path`. Raises as `open_file`, and OSError for more than `most`."""
     with open_file(path) as file:
-        return file.read()
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(f"it is larger than {in_words(most)}")
+    return content
 
 
 def read_json(path: UPath, fix: str, **options: Any) -> Any:
@@ -70,7 +81,7 @@ def read_json(path: UPath, fix: str, **options: Any) -> Any:
     try:
         # Python refuses more than 4300 digits, and NumPy more than 18 among floats
         number = lambda digits: int(digits) if len(digits) <= 18 else float(digits)  # noqa: E731
-        return json.loads(read_file(path), parse_int=number, **options)
+        return json.loads(read_file(path, _LARGEST_JSON), parse_int=number, **options)
     except FileNotFoundError:
         raise
     except RecursionError:
@@ -115,7 +126,10 @@ class Archive:
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
         try:
-            return self._zip.read(self.files[member])
+            info = self._zip.getinfo(self.files[member])
+            if info.file_size > LARGEST:
+                raise OSError(f"{member} is larger than {in_words(LARGEST)}")
+            return self._zip.read(info)
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error
         except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:

@@ -23,6 +23,7 @@ from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
 from qgs.io.files import replacing_entries
+from qgs.io.metadata import number_in
 from qgs.types import named_tensors
 from qgs.wording import listed
 
@@ -108,9 +109,9 @@ class Guard:
         return {**counts, "detector": detector, "alive": self._alive}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self.incidents, self.skipped = state["incidents"], state["skipped"]
+        self.incidents, self.skipped = (number_in(state, key) for key in ("incidents", "skipped"))
         self.detector.load_state(state["detector"])
-        self._alive = {name: float(n) for name, n in state.get("alive", {}).items()}
+        self._alive = {name: float(n) for name, n in state["alive"].items()}
 
     def passed(self, numbers: Mapping[str, float]) -> None:
         """Take note of a finite step."""
@@ -279,8 +280,8 @@ class CollapseDetector:
         return {"dead": self.dead_steps, "symptom": self.symptom, "has_drawn": self._has_drawn}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self.dead_steps, self.symptom = state["dead"], state["symptom"]
-        self._has_drawn = state["has_drawn"]
+        self.dead_steps, self.symptom = number_in(state, "dead"), str(state["symptom"])
+        self._has_drawn = bool(number_in(state, "has_drawn", bool))
 
 
 LOSS_OF_QUALITY = 1.0
@@ -332,12 +333,13 @@ class GoodWeights:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self._copies = []
-        quality = (state.get(name) for name in ("psnr", "best"))
+        quality = (state[name] for name in ("psnr", "best"))
         self._psnr, self._best = (None if value is None else float(value) for value in quality)
         for i, step in enumerate(state["steps"]):
             copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
             self._weights.refuse_unlike(copy)
-            self._copies.append((int(step), copy if self._keep else {}))
+            step = number_in({"steps": step}, "steps")
+            self._copies.append((step, copy if self._keep else {}))
         self.step, self.tensors = self._copies[0]
 
 

@@ -35,7 +35,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         return []
     path = checkpoint_of(recipe.init_from)
     learned_by = load_recipe(path)
-    learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
+    stored = read_tensors(path)
+    learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()

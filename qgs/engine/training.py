@@ -51,6 +51,7 @@ from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.io.files import write_text
+from qgs.io.metadata import number_in
 from qgs.model import QueryGaussianModel
 
 ELSEWHERE = "another process of this training has no next batch; its own message tells why"
@@ -247,7 +248,7 @@ class Trainer:
                 if self.average:
                     self.average.update()
                 self.guard.passed(numbers)
-            self.saver.see(batches)
+                self.saver.see(batches)
             self.step += 1
             self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
             self._tick()
@@ -313,9 +314,10 @@ class Trainer:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
         refuse_other_data(state, self._conditions, self.folder)
-        self.step, self.samples, self.seconds = state["step"], state["samples"], state["seconds"]
-        if not (0 <= self.step <= self.samples and 0 <= self.seconds < math.inf):
-            raise ValueError(f"{self.step} steps of {self.samples} samples in {self.seconds} s")
+        self.step, self.samples = number_in(state, "step"), number_in(state, "samples")
+        self.seconds = float(number_in(state, "seconds", float))
+        if self.step > self.samples:
+            raise ValueError(f"{self.step} steps of {self.samples} samples")
         if self.accelerator.is_main_process:
             self.left_out = Counter({key: int(n) for key, n in state.get("left_out", {}).items()})
 

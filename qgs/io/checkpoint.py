@@ -17,6 +17,7 @@ import qgs
 from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
+from qgs.data.domain import KEY, Domain
 from qgs.io.differences import differing_tensors, differing_types, shapes_of
 from qgs.io.files import replacing, told_where_full
 from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
@@ -182,6 +183,13 @@ def load_step(path: str | os.PathLike[str]) -> int | None:
     step = load_extra(path).get("step")
     with reading(path, _EXTRA + "step"):
         return int(step) if step else None
+
+
+def load_domain(path: str | os.PathLike[str]) -> Domain:
+    """On what views a checkpoint was trained; empty where it does not tell. Raises as `load`."""
+    key, metadata = _EXTRA + KEY, _read_metadata(path)
+    with reading(path, key):
+        return Domain.read(mapping_in(metadata, key, path)) if key in metadata else Domain()
 
 
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:

@@ -1,6 +1,7 @@
 """The metadata of our safetensors files, read as data that may be damaged or hostile."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -50,6 +51,17 @@ def mapping_in(
         if not isinstance(found, dict):
             raise TypeError(f"it holds {'null' if found is None else type(found).__name__}")
         return found
+
+
+def number_in(state: Mapping[str, Any], name: str, kind: type = int) -> Any:
+    """The finite number, 0 or more, of `kind` (int or float) that `state` has under `name`.
+
+    Raises ValueError for anything else, KeyError for nothing.
+    """
+    value = state[name]
+    if type(value) not in (kind, int) or not 0 <= value < math.inf:
+        raise ValueError(f"{name} is {str(value)[:100]!r}")
+    return value
 
 
 def refuse_newer(

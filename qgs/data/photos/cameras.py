@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Mapping
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from upath import UPath
 
-from qgs.data.paths import read_file, read_json
+from qgs.data.paths import open_file, read_json
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
     Listing,
@@ -33,20 +35,27 @@ class CamerasJson(PhotoReader):
 
     name = "cameras"
     listing = "cameras.json"
-    poses = "opencv"
+    poses = "opencv c2w"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
         """See `PhotoReader`: other programs give other files this name."""
-        file = folder / cls.listing
-        content = read_file(file) if file.is_file() else b""
-        return all(key in content for key in (b'"c2w"', b'"K"'))
+        file, missing, end = folder / cls.listing, {b'"c2w"', b'"K"'}, b""
+        if not file.is_file():
+            return False
+        with open_file(file) as opened:  # which is asked often: no more of it than is needed
+            for part in islice(iter(partial(opened.read, 2**16), b""), 256):
+                missing = {key for key in missing if key not in end + part}
+                if not missing:
+                    return True
+                end = part[-4:]
+        return False
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """See `PhotoReader`. Raises ValueError for unnamed images of another number."""
         file = folder / cls.listing
-        cameras = _cameras(read_json(file, f"write {_FORM}"))
+        cameras = _cameras(file, read_json(file, f"write {_FORM}"))
         names = [next((n for k in _NAMES if isinstance(n := c.get(k), str)), "") for c in cameras]
         if not cameras:
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
@@ -67,22 +76,29 @@ class CamerasJson(PhotoReader):
         return Listing(file, [_frame(folder, place, *camera) for camera in named])
 
 
-def _cameras(data: Any) -> list[Mapping[str, Any]]:
-    """What is said of each camera, with what is said of all."""
+def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
+    """What is said of each camera, with what is said of all. ValueError."""
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
     if not isinstance(given, list):
         columns: Any = [top.get(key) for key in ("c2w", "K", "images")]
         poses, matrices, names = columns
-        poses = poses if isinstance(poses, list) else []
-        shared = np.ndim(numbers(matrices)) < 3
-        matrices = [matrices] * len(poses) if shared else matrices
-        names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
-        if len(matrices) != len(poses):
+        if not isinstance(poses, list):
             return []
+        matrices = [matrices] * len(poses) if _is_one(numbers(matrices)) else matrices
+        names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
+        if not isinstance(matrices, list) or len(matrices) != len(poses):
+            count = len(matrices) if isinstance(matrices, list) else 0
+            raise ValueError(f"{file} has {len(poses)} matrices c2w and {count} K: write {_FORM}")
         rows = zip(poses, matrices, names, strict=True)
         given = [{"c2w": c2w, "K": K, "image": name or None} for c2w, K, name in rows]
     return [{**top, **camera} if isinstance(camera, Mapping) else {} for camera in given]
+
+
+def _is_one(matrix: np.ndarray) -> bool:
+    """Whether K is that of one camera; (4, 4) may be fx, fy, cx, cy of four."""
+    square = matrix.shape == (4, 4) and np.array_equal(matrix[3], [0, 0, 0, 1])
+    return square or matrix.shape in ((3, 3), (4,))
 
 
 def _frame(folder: UPath, place: UPath, values: Mapping[str, Any], name: str) -> PhotoFrame:
