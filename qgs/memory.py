@@ -2,9 +2,15 @@
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+
+
+_FILES_1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+_FILES_2 = "memory.max", "memory.current", "inactive_file"
+"""Of a control group of version 1 and 2: files of its limit and use, and what of memory.stat the
+system gives back when asked."""
 
 
 class TooLargeError(ValueError):
@@ -38,12 +44,7 @@ def available_bytes() -> int:
     if len(limits) == 1:
         with suppress(ValueError, OSError):  # a system that does not tell
             limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    with suppress(OSError, ValueError, KeyError):  # "max", or no control group of version 2
-        group = Path("/sys/fs/cgroup")
-        used = int((group / "memory.current").read_text())
-        of_kinds = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        used -= int(of_kinds["inactive_file"])  # which the system gives back when asked
-        limits.append(int((group / "memory.max").read_text()) - used)
+    limits += _left_by_groups(Path("/"))
     with suppress(ImportError, OSError, ValueError):
         import resource  # Windows has none
 
@@ -52,6 +53,27 @@ def available_bytes() -> int:
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             limits.append(own - pages * os.sysconf("SC_PAGE_SIZE"))
     return max(0, min(limits))
+
+
+def _left_by_groups(root: Path) -> Iterator[int]:
+    """What each control group with a limit, of this process or above it, leaves to it, in bytes."""
+    with suppress(OSError):
+        for line in (root / "proc/self/cgroup").read_text().splitlines():
+            _, kinds, inside = line.split(":", 2)
+            of_version_1 = "memory" in kinds.split(",")
+            if kinds and not of_version_1:
+                continue
+            top = root / "sys/fs/cgroup" / ("memory" if of_version_1 else "")
+            limit, taken, given_back = _FILES_1 if of_version_1 else _FILES_2
+            innermost = top / inside.strip("/")
+            for group in (innermost, *innermost.parents):
+                if not group.is_relative_to(top):
+                    break
+                with suppress(OSError, ValueError, KeyError):  # no limit, or seen from inside
+                    stat = (group / "memory.stat").read_text().splitlines()
+                    used = int((group / taken).read_text())
+                    used -= int(dict(row.split() for row in stat)[given_back])
+                    yield int((group / limit).read_text()) - used
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -15,6 +15,7 @@ from upath import UPath
 
 from qgs.data.paths import open_file
 from qgs.data.scenes import warn_once
+from qgs.memory import is_out_of_memory
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
 TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
@@ -65,6 +66,8 @@ def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
         with open_file(path) as file:
             yield file
     except Exception as error:
+        if is_out_of_memory(error):
+            raise
         reason = str(error) or type(error).__name__
         raise ValueError(
             f"{path} cannot be read as {kind} ({reason}): replace the file, or remove its frame"
@@ -214,7 +217,7 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
             yield image
     except UnidentifiedImageError as error:
         raise OSError("its header is none of a known image format") from error
-    except OSError:
+    except (OSError, MemoryError):
         raise
     except Exception as error:  # decoders raise anything on damaged files
         raise OSError(str(error) or type(error).__name__) from error

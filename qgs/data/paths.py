@@ -66,8 +66,9 @@ _LARGEST_JSON = 50_000_000  # which may take forty times as much once parsed
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     """The bytes of `path`. Raises as `open_file`, and OSError for more than `most`."""
     with open_file(path) as file:
-        content = file.read(most + 1)
-    if len(content) > most:
+        held = path.stat().st_size if is_local(path) else 0
+        content = file.read(most + 1) if held <= most else b""
+    if max(held, len(content)) > most:
         raise OSError(f"it is larger than {in_words(most)}")
     return content
 

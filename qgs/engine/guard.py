@@ -4,7 +4,7 @@ import json
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -44,21 +44,26 @@ MAX_SKIPPED = 10
 MAX_SAVED = 20
 """Incidents of a run that are saved; later ones are logged and counted."""
 
-COLLAPSE_CAUSES = (
-    "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
-    "optimizer.warmup)",
-    "a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
-    "behind_camera: invisible)",
-    "an initialisation that hides every Gaussian (raise model.head.opacity_bias, check "
-    "views.scale_factor against the anchors' and the scenes' depth)",
-)
+_TOO_FAST = {
+    "optimizer.learning_rate": "a learning rate too high for this model (lower "
+    "optimizer.learning_rate, lengthen optimizer.warmup)"
+}
 
-NONFINITE_CAUSES = (
-    COLLAPSE_CAUSES[0],
-    "a range that bfloat16 does not hold (training.precision: float32)",
-    "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; with "
-    "views.scale distance, at input cameras that almost stand on one point)",
-)
+COLLAPSE_CAUSES = _TOO_FAST | {
+    "losses.visibility": "a visibility loss too strong or absent (try losses.visibility.weight 0.1 "
+    "with behind_camera: invisible)",
+    "model.head.opacity_bias": "an initialisation that hides every Gaussian (raise "
+    "model.head.opacity_bias)",
+    "views.scale": "a scale of the world that leaves none before the cameras (check views.scale "
+    "and views.scale_factor against the anchors' and the scenes' depth)",
+}
+"""By the option that each is about."""
+
+NONFINITE_CAUSES = _TOO_FAST | {
+    "training.precision": "a range that bfloat16 does not hold (training.precision: float32)",
+    "data": "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; "
+    "with views.scale distance, at input cameras that almost stand on one point)",
+}
 
 
 class TrainingError(RuntimeError):
@@ -143,7 +148,7 @@ class Guard:
         second = (
             f"The data is to blame, see `qgs data check`: {found}"
             if in_data
-            else f"{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES)}"
+            else f"{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES.values())}"
         )
         raise NonFiniteError(f"step {step + 1} is not finite{first}.\n{second}")
 
@@ -214,13 +219,15 @@ class Guard:
         if problem := broken_tensors(self._saver.model):
             self._collapse(step, problem, NONFINITE_CAUSES)
 
-    def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
+    def _collapse(self, step: int, problem: str, causes: Mapping[str, str]) -> NoReturn:
         self._saver.save_checkpoint(self.good.step, self.good.tensors)
-        if self.detector.dead_steps:
-            causes = [blamed(self._recipe, self._alive or None, self._objective.owners), *causes]
+        alive = self._alive or (None if self.detector.dead_steps else {})
+        likely, stands_out = blamed(self._recipe, alive, self._objective.owners)
+        others = [text for option, text in causes.items() if option not in likely]
+        told = _as_list([likely, *([] if stands_out else others)])
         raise CollapseError(
             f"training collapsed at step {step}: {problem}. The weights of step {self.good.step} "
-            f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
+            f"are kept in {self._saver.folder.checkpoint}. Likely causes:{told}"
         )
 
     def _save_incident(
@@ -230,6 +237,7 @@ class Guard:
         place = self._saver.folder.path / "incidents" / name
         weights = Weights(model).state()
         if self._accelerator.is_main_process:
+            self._saver.folder.refuse_gone()
             with replacing_entries(place.parent) as fresh:
                 _write_batches(fresh / name / "batch.safetensors", batches)
                 path = fresh / name / "weights.safetensors"
@@ -243,7 +251,7 @@ class Guard:
         return place
 
 
-def _as_list(causes: Sequence[str]) -> str:
+def _as_list(causes: Iterable[str]) -> str:
     return "".join(f"\n  - {cause}" for cause in causes)
 
 

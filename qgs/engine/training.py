@@ -211,7 +211,8 @@ class Trainer:
         flag = torch.tensor(float(bool(self.feed.error)))
         failed = mean(self.accelerator, flag.to(self.accelerator.device))
         if float(failed):
-            raise self.feed.error or SampleError(ELSEWHERE)
+            with explained(self.step):
+                raise self.feed.error or SampleError(ELSEWHERE)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
@@ -271,7 +272,8 @@ class Trainer:
                 self.guard.save_to_go_on(self.step)
                 error = self.feed.error or SampleError(ELSEWHERE)
                 error.add_note(f"The run is saved at step {self.step}; continue with --resume")
-                raise error
+                with explained(self.step):
+                    raise error
         stopped_by = stopped_by or self._stopped_by(stop)
         self.guard.finish(self.step, stopped=stopped_by is not None)
         if self.average and not stopped_by and self.evaluations.latest != self.step:
@@ -287,8 +289,8 @@ class Trainer:
         place = next(path for path in places if not path.exists())
         self.folder.close()
         self.folder = self.saver.folder = RunFolder(place)
-        self._folder_is_open, self._resumes = False, False
-        self._open_folder()
+        self.folder.take()
+        write_text(self.folder.recipe, annotated(self.recipe) + "\n")
         self.saver.save(self.step)
         self.folder.close()
         note = f"The run, without its history, is saved at step {self.step} in {place}; it goes on"

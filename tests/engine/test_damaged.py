@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ from qgs.data.sampling import Batch
 from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
 from qgs.engine import training
 from qgs.engine.checkpoint import read_state
-from qgs.engine.fit import OutOfMemoryError
+from qgs.engine.fit import OutOfMemoryError, explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.io.checkpoint import CheckpointError
 from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
@@ -192,6 +193,27 @@ def test_out_of_memory_is_told_and_the_run_is_saved(
     assert run(recipe, tmp_path / "run", resume=True).resumed_at == 2
 
 
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory.\nTried")])
+def test_running_out_of_memory_is_told_in_one_line(error: Exception) -> None:
+    with pytest.raises(OutOfMemoryError, match=rf"available\): {type(error).__name__}.*batch_size"):
+        with explained(3):
+            raise error
+
+
+def test_what_torch_holds_in_reserve_is_free(
+    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, gpu = tiny("tokengs"), SimpleNamespace(num_processes=1, device=torch.device("cuda"))
+    monkeypatch.setattr("qgs.engine.fit.wants_shards", lambda accelerator: False)
+    for name, bytes_ in {"memory_reserved": 10**12, "memory_allocated": 10**3}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda device, bytes_=bytes_: bytes_)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 10**12))
+    refuse_unfit(recipe, gpu)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 10**12)
+    with pytest.raises(TooLargeError, match="on the GPU, .* 0 bytes are available"):
+        refuse_unfit(recipe, gpu)
+
+
 @pytest.mark.parametrize("how", ["deleted", "replaced"])
 def test_a_folder_lost_while_training_is_told_and_what_was_learnt_is_kept(
     tiny: Tiny, tmp_path: Path, how: str
@@ -213,7 +235,8 @@ def test_a_folder_lost_while_training_is_told_and_what_was_learnt_is_kept(
 def test_a_run_whose_folder_was_deleted_goes_on_beside_it(
     tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe, folder = tiny("tokengs"), tmp_path / "run"
+    pytest.importorskip("tensorboard")
+    recipe, folder = tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run"
     gone = RunFolder.append
 
     def lose(self: RunFolder, record: Any) -> None:
@@ -228,7 +251,26 @@ def test_a_run_whose_folder_was_deleted_goes_on_beside_it(
     place = tmp_path / "run-saved-1"
     assert str(place) in caught.value.__notes__[0]
     assert not folder.exists()
+    saved = {path.name for path in place.iterdir()}
+    assert saved == {"recipe.yaml", "checkpoint.safetensors", "state.safetensors"}
     assert run(recipe, place, resume=True).resumed_at == 3
+
+
+def test_a_step_that_is_not_finite_does_not_make_a_lost_folder_again(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(batch: Batch, numbers: Sequence[int]) -> None:
+        if numbers[0] == 4:
+            batch.targets.images[0, 0, 0, 0, 0] = torch.nan
+
+    def lose(trainer: Any, stop: Any) -> None:
+        if trainer.step == 2:
+            shutil.rmtree(tmp_path / "run")
+
+    change_batches(monkeypatch, spoil)
+    with pytest.raises(FolderGoneError):
+        run_calling(lose, tiny("tokengs"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def bad_frames(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool]) -> None:
