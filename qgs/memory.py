@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-
 _FILES_1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
 _FILES_2 = "memory.max", "memory.current", "inactive_file"
 """Of a control group of version 1 and 2: files of its limit and use, and what of memory.stat the

@@ -54,6 +54,11 @@ from qgs.io.files import write_text
 from qgs.io.metadata import number_in
 from qgs.model import QueryGaussianModel
 
+MAX_REASONS = 100
+"""Reasons of samples left out that a process counts on their own; further ones are OTHERS."""
+
+OTHERS = "for other reasons"
+
 ELSEWHERE = "another process of this training has no next batch; its own message tells why"
 
 _log = logging.getLogger(__name__)
@@ -231,9 +236,11 @@ class Trainer:
             with explained(self.step, self.guard.save_to_go_on if alone else None):
                 measured = self._gradients(batches)
             for bad in (bad for batch in batches for bad in batch.left_out):
-                if not self.left_out[bad]:
+                known = bad in self.left_out or len(self.left_out) < MAX_REASONS
+                reason = bad if known else OTHERS
+                if not self.left_out[reason]:
                     _log.warning("a sample is left out: %s", bad)
-                self.left_out[bad] += 1
+                self.left_out[reason] += 1
             if not stop and self.step + 1 < self.config.steps:
                 self.feed.fetch()
             numbers, asked_to_stop, no_data = self._means(measured, stop)
@@ -321,7 +328,7 @@ class Trainer:
         if self.step > self.samples:
             raise ValueError(f"{self.step} steps of {self.samples} samples")
         if self.accelerator.is_main_process:
-            self.left_out = Counter({key: int(n) for key, n in state.get("left_out", {}).items()})
+            self.left_out = Counter({key: int(n) for key, n in state["left_out"].items()})
 
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""

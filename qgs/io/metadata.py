@@ -9,7 +9,6 @@ from typing import Any
 
 import qgs
 from qgs.composer import Recipe, RecipeError, resolve
-from qgs.composer.slots import with_moved
 
 LARGEST = 50_000_000
 """Characters of one entry; states of runs with thousands of processes have fewer."""
@@ -92,4 +91,4 @@ def stored_recipe(metadata: Mapping[str, str], key: str, path: str | os.PathLike
         why = f"the recipe in it has `{unresolved[0]}`; one that qgs writes is resolved"
         raise damaged(path, why)
     with reading(path, key):
-        return resolve(with_moved(tree))
+        return resolve(tree)

@@ -130,7 +130,9 @@ def test_files_of_that_name_from_other_programs_are_no_photos(tmp_path, photos):
 
 def test_a_folder_without_cameras_is_told_what_would_do(tmp_path, photos):
     copied(photos, tmp_path / "scene" / "frames")
+    copied(photos, tmp_path / "scene" / "a" / "b" / "images")
     with pytest.raises(
-        FileNotFoundError, match=r"images: 6 in frames/\).*The smallest transf.*fl_x"
+        FileNotFoundError,
+        match=r"images: 6 in a/b/images/, 6 in frames/\).*The smallest transf.*fl_x",
     ):
         scene(tmp_path / "scene")

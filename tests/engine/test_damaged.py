@@ -24,7 +24,7 @@ from qgs.engine.checkpoint import read_state
 from qgs.engine.fit import OutOfMemoryError, explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.io.checkpoint import CheckpointError
-from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
+from qgs.memory import TooLargeError, _left_by_groups, in_words, refuse_beyond_memory
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -172,6 +172,33 @@ def test_what_fits_is_not_refused() -> None:
     assert [in_words(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]
 
 
+@pytest.mark.parametrize(
+    ("line", "folder", "files"),
+    [
+        ("0::/a/b", "a", ("memory.max", "memory.current", "inactive_file")),
+        ("0::/a/b", "", ("memory.max", "memory.current", "inactive_file")),
+        ("0::/../c", "", ("memory.max", "memory.current", "inactive_file")),
+        (
+            "3:cpu,memory:/not/seen/here",
+            "memory",
+            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        ),
+    ],
+)
+def test_the_limit_of_a_control_group_is_found(
+    tmp_path: Path, line: str, folder: str, files: tuple[str, str, str]
+) -> None:
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text(f"5:pids:/x\n{line}\n")
+    group = tmp_path / "sys/fs/cgroup" / folder
+    (group / "b").mkdir(parents=True)
+    (group / "b" / files[0]).write_text("max\n")
+    for name, text in zip(files[:2], ("1000\n", "300\n"), strict=True):
+        (group / name).write_text(text)
+    (group / "memory.stat").write_text(f"anon 3\n{files[2]} 100\n")
+    assert list(_left_by_groups(tmp_path)) == [800]
+
+
 def test_out_of_memory_is_told_and_the_run_is_saved(
     tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,14 +222,12 @@ def test_out_of_memory_is_told_and_the_run_is_saved(
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory.\nTried")])
 def test_running_out_of_memory_is_told_in_one_line(error: Exception) -> None:
-    with pytest.raises(OutOfMemoryError, match=rf"available\): {type(error).__name__}.*batch_size"):
-        with explained(3):
-            raise error
+    words = rf"available\): {type(error).__name__}.*batch_size"
+    with pytest.raises(OutOfMemoryError, match=words), explained(3):
+        raise error
 
 
-def test_what_torch_holds_in_reserve_is_free(
-    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_torch_holds_in_reserve_is_free(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe, gpu = tiny("tokengs"), SimpleNamespace(num_processes=1, device=torch.device("cuda"))
     monkeypatch.setattr("qgs.engine.fit.wants_shards", lambda accelerator: False)
     for name, bytes_ in {"memory_reserved": 10**12, "memory_allocated": 10**3}.items():
@@ -210,7 +235,7 @@ def test_what_torch_holds_in_reserve_is_free(
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 10**12))
     refuse_unfit(recipe, gpu)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 10**12)
-    with pytest.raises(TooLargeError, match="on the GPU, .* 0 bytes are available"):
+    with pytest.raises(TooLargeError, match=r"on the GPU, .* 0 bytes are available"):
         refuse_unfit(recipe, gpu)
 
 
@@ -300,6 +325,17 @@ def test_bad_samples_are_skipped_counted_and_named_if_asked_for(
     assert caplog.text.count("a sample is left out") == 2
     state = read_state(tmp_path / "skips" / "state.safetensors").parts["counters"]
     assert state["left_out"] == result.left_out
+
+
+def test_the_reasons_of_left_out_samples_do_not_grow_without_end(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "MAX_REASONS", 2)
+    bad_frames(monkeypatch, lambda number: number % 2 == 1)
+    result = run(tiny("tokengs", "training.on_bad_sample=skip"), tmp_path / "run")
+    *told, others = result.left_out.items()
+    assert len(told) == 2
+    assert others == (training.OTHERS, 2)
 
 
 def test_too_many_bad_samples_in_a_row_end_a_run_all_the_same(

@@ -201,7 +201,7 @@ def test_a_plugin_adds_an_optimiser_by_one_class(
 def test_moments_of_any_shape_and_none_are_restored(
     tiny: Tiny, tmp_path: Path, install: Callable[..., None], made: str
 ) -> None:
-    code = PLAIN.replace("import SGD", "import SGD, Adafactor").replace("(\"plain\"", "(\"other\"")
+    code = PLAIN.replace("import SGD", "import SGD, Adafactor").replace('("plain"', '("other"')
     install("other", "other", code.replace("SGD(groups, lr=self.config.rate, momentum=0.9)", made))
     tree = {**tiny("tokengs").tree, "plugins": ["rooms", "other"]}
     tree["optimizer"] = {"type": "other/sgd"}
