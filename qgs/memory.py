@@ -56,23 +56,20 @@ def available_bytes() -> int:
 
 def _left_by_groups(root: Path) -> Iterator[int]:
     """What each control group with a limit, of this process or above it, leaves to it, in bytes."""
-    with suppress(OSError):
-        for line in (root / "proc/self/cgroup").read_text().splitlines():
-            _, kinds, inside = line.split(":", 2)
-            of_version_1 = "memory" in kinds.split(",")
-            if kinds and not of_version_1:
-                continue
-            top = root / "sys/fs/cgroup" / ("memory" if of_version_1 else "")
-            limit, taken, given_back = _FILES_1 if of_version_1 else _FILES_2
-            innermost = top / inside.strip("/")
-            for group in (innermost, *innermost.parents):
-                if not group.is_relative_to(top):
-                    break
-                with suppress(OSError, ValueError, KeyError):  # no limit, or seen from inside
-                    stat = (group / "memory.stat").read_text().splitlines()
-                    used = int((group / taken).read_text())
-                    used -= int(dict(row.split() for row in stat)[given_back])
-                    yield int((group / limit).read_text()) - used
+    member = root / "proc/self/cgroup"
+    lines = member.read_text().splitlines() if member.is_file() else []
+    for kinds, inside in (line.split(":", 2)[1:] for line in lines):
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        top = root / "sys/fs/cgroup" / ("memory" if kinds else "")
+        limit, taken, given_back = _FILES_1 if kinds else _FILES_2
+        groups = [top / inside.strip("/"), *(top / inside.strip("/")).parents]
+        for group in groups[: groups.index(top) + 1]:
+            with suppress(OSError, ValueError, KeyError):  # no limit, or a path seen from inside
+                stat = (group / "memory.stat").read_text().splitlines()
+                used = int((group / taken).read_text())
+                used -= int(dict(row.split() for row in stat)[given_back])
+                yield int((group / limit).read_text()) - used
 
 
 def is_out_of_memory(error: BaseException) -> bool:

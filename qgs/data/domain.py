@@ -51,18 +51,16 @@ class Domain:
     def see(self, inputs: Cameras, targets: Cameras) -> None:
         """Count samples in: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
-            numbers = [float(f"{value:.4g}") for value in values.flatten().tolist()]
-            self.values.setdefault(name, []).extend(n for n in numbers if not math.isnan(n))
+            told = values[~values.isnan()].tolist()
+            self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in told)
         self.samples += len(inputs.c2w)
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """The span of each but for OUTLIERS of its values at either end."""
-        spans = {}
-        for name, values in self.values.items():
-            left_out, ordered = int(OUTLIERS * len(values)), sorted(values)
-            spans[name] = ordered[left_out], ordered[-1 - left_out]
-        return spans
+        ordered = {name: sorted(values) for name, values in self.values.items() if values}
+        places = {name: int(OUTLIERS * len(values)) for name, values in ordered.items()}
+        return {name: (v[places[name]], v[-1 - places[name]]) for name, v in ordered.items()}
 
     def state(self) -> dict[str, Any]:
         """See `qgs.engine.checkpoint.Stateful`."""
@@ -72,7 +70,7 @@ class Domain:
         """Go on from `state`. Raises ValueError, TypeError and the like for anything else."""
         told = {"samples": [state["samples"]], **state["values"]}
         for name, numbers in told.items():
-            sound = bool(numbers) and all(isinstance(n, int | float) and n >= 0 for n in numbers)
+            sound = all(isinstance(n, int | float) and n >= 0 for n in numbers)
             if not sound or name not in ("samples", *WORDS):
                 raise ValueError(f"{name[:50]} is {str(numbers)[:100]}")
         self.samples, self.values = int(state["samples"]), dict(state["values"])
@@ -86,11 +84,8 @@ class Domain:
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
         """What `text` wrote, parsed. Raises as `load_state`."""
-        ends = {
-            name: [math.inf if end is None else end for end in (low, high)]
-            for name, (low, high) in plain["ranges"].items()
-        }
-        domain = cls()
+        told, domain = plain["ranges"].items(), cls()
+        ends = {k: [math.inf if v is None else v for v in (low, high)] for k, (low, high) in told}
         domain.load_state({"samples": plain["samples"], "values": ends})
         return domain
 

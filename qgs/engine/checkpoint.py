@@ -191,8 +191,8 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            fault = broken(saved.parts[name], name)
             try:
+                fault = broken(saved.parts[name], name)
                 if not fault:
                     part.load_state(saved.parts[name])
             except OtherRunError:
@@ -268,9 +268,10 @@ class OptimizerState:
     def load_state(self, state: State) -> None:
         self._optimizer.state.clear()
         names = {path: path.rpartition("/")[0] for path in state if path != "idle"}
-        if differing := {*names.values(), *state["idle"]} ^ self._parameters.keys():
+        kept = {*names.values()}
+        if differing := sorted((kept | {*state["idle"]}) ^ self._parameters.keys()):
             raise CheckpointError(f"not of the parameters that are trained: {listed(differing)}")
-        wanted = {k: v for k, v in self._made().items() if k.rpartition("/")[0] in names.values()}
+        wanted = {k: v for k, v in self._made().items() if k.rpartition("/")[0] in kept}
         refuse_other_tensors({key: state[key] for key in wanted if key in state}, wanted)
         for path, name in names.items():
             parameter, value = self._parameters[name], state[path]
@@ -285,12 +286,12 @@ class OptimizerState:
             for name, p in self._parameters.items()
         }
         memo = {id(p): alike[name] for name, p in self._parameters.items()}
-        optimizer = deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo)
-        for group in optimizer.param_groups:
-            group.update({key: False for key in ("fused", "foreach") if key in group})
         for parameter in alike.values():
             parameter.grad = torch.empty_like(parameter)
         try:
+            optimizer = deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo)
+            for group in optimizer.param_groups:
+                group.update({key: False for key in ("fused", "foreach") if key in group})
             optimizer.step()
         except Exception:  # whatever an optimiser does with numbers that are not there
             return {}

@@ -313,6 +313,7 @@ def test_a_state_with_damaged_metadata_is_refused_by_its_name(tiny: Tiny, tmp_pa
     ):
         damaged = {**parts, part: {**parts[part], key: value}}
         damage(message, state=json.dumps(damaged))
+    damage("`guard` cannot be restored", state=json.dumps({**parts, "guard": []}))
     del parts["counters"]["step"]
     damage("`counters` cannot be restored .*'step'", state=json.dumps(parts))
 

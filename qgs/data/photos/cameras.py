@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from functools import partial
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from qgs.data.photos.reader import (
 
 _LISTS = ("frames", "cameras", "views")
 _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")
+_START = 4_000_000  # bytes of a file that are looked at; a thousand cameras have a tenth of that
 _FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
 
 
@@ -40,16 +39,12 @@ class CamerasJson(PhotoReader):
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
         """See `PhotoReader`: other programs give other files this name."""
-        file, missing, end = folder / cls.listing, {b'"c2w"', b'"K"'}, b""
+        file = folder / cls.listing
         if not file.is_file():
             return False
-        with open_file(file) as opened:  # which is asked often: no more of it than is needed
-            for part in islice(iter(partial(opened.read, 2**16), b""), 256):
-                missing = {key for key in missing if key not in end + part}
-                if not missing:
-                    return True
-                end = part[-4:]
-        return False
+        with open_file(file) as opened:
+            start = opened.read(_START)
+        return all(key in start for key in (b'"c2w"', b'"K"'))
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
@@ -85,20 +80,16 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
         poses, matrices, names = columns
         if not isinstance(poses, list):
             return []
-        matrices = [matrices] * len(poses) if _is_one(numbers(matrices)) else matrices
+        one = numbers(matrices)  # (4, 4) may be fx, fy, cx, cy of four cameras
+        shared = one.shape in ((3, 3), (4,)) or (one.shape == (4, 4) and not one[3, :3].any())
+        matrices = [matrices] * len(poses) if shared else matrices
         names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
-        if not isinstance(matrices, list) or len(matrices) != len(poses):
-            count = len(matrices) if isinstance(matrices, list) else 0
+        matrices = matrices if isinstance(matrices, list) else []
+        if (count := len(matrices)) != len(poses):
             raise ValueError(f"{file} has {len(poses)} matrices c2w and {count} K: write {_FORM}")
         rows = zip(poses, matrices, names, strict=True)
         given = [{"c2w": c2w, "K": K, "image": name or None} for c2w, K, name in rows]
     return [{**top, **camera} if isinstance(camera, Mapping) else {} for camera in given]
-
-
-def _is_one(matrix: np.ndarray) -> bool:
-    """Whether K is that of one camera; (4, 4) may be fx, fy, cx, cy of four."""
-    square = matrix.shape == (4, 4) and np.array_equal(matrix[3], [0, 0, 0, 1])
-    return square or matrix.shape in ((3, 3), (4,))
 
 
 def _frame(folder: UPath, place: UPath, values: Mapping[str, Any], name: str) -> PhotoFrame:
