@@ -57,6 +57,8 @@ def told_where_full(path: Path, needed: str = "") -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno not in _FULL:
+            if error.filename is None:
+                error.add_note(f"while {path} was written")
             raise
         free = shutil.disk_usage(path.parent).free
         raise DiskFullError(

@@ -83,6 +83,16 @@ def test_a_disk_is_called_full_only_where_it_is(
     assert not list(tmp_path.iterdir())
 
 
+def test_another_error_that_names_no_file_is_told_with_it(tmp_path: Path) -> None:
+    def fail() -> None:
+        with replacing(tmp_path / "a.txt"):
+            raise OSError(errno.EFBIG, "File too large")
+
+    with pytest.raises(OSError, match="too large") as caught:
+        fail()
+    assert caught.value.__notes__ == [f"while {tmp_path / 'a.txt'} was written"]
+
+
 def test_records_nested_too_deeply_are_left_out(tmp_path: Path) -> None:
     file = tmp_path / "history.jsonl"
     file.write_text('{"step": 1}\n{"step": 2, "x": ' + "[" * 100_000 + '\n{"step": 3}\n')
