@@ -2,9 +2,14 @@
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+
+_FILES_1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+_FILES_2 = "memory.max", "memory.current", "inactive_file"
+"""Of a control group of version 1 and 2: files of its limit and use, and what of memory.stat the
+system gives back when asked."""
 
 
 class TooLargeError(ValueError):
@@ -38,12 +43,7 @@ def available_bytes() -> int:
     if len(limits) == 1:
         with suppress(ValueError, OSError):  # a system that does not tell
             limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    with suppress(OSError, ValueError, KeyError):  # "max", or no control group of version 2
-        group = Path("/sys/fs/cgroup")
-        used = int((group / "memory.current").read_text())
-        of_kinds = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        used -= int(of_kinds["inactive_file"])  # which the system gives back when asked
-        limits.append(int((group / "memory.max").read_text()) - used)
+    limits += _left_by_groups(Path("/"))
     with suppress(ImportError, OSError, ValueError):
         import resource  # Windows has none
 
@@ -52,6 +52,24 @@ def available_bytes() -> int:
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             limits.append(own - pages * os.sysconf("SC_PAGE_SIZE"))
     return max(0, min(limits))
+
+
+def _left_by_groups(root: Path) -> Iterator[int]:
+    """What each control group with a limit, of this process or above it, leaves to it, in bytes."""
+    member = root / "proc/self/cgroup"
+    lines = member.read_text().splitlines() if member.is_file() else []
+    for kinds, inside in (line.split(":", 2)[1:] for line in lines):
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        top = root / "sys/fs/cgroup" / ("memory" if kinds else "")
+        limit, taken, given_back = _FILES_1 if kinds else _FILES_2
+        groups = [top / inside.strip("/"), *(top / inside.strip("/")).parents]
+        for group in groups[: groups.index(top) + 1]:
+            with suppress(OSError, ValueError, KeyError):  # no limit, or a path seen from inside
+                stat = (group / "memory.stat").read_text().splitlines()
+                used = int((group / taken).read_text())
+                used -= int(dict(row.split() for row in stat)[given_back])
+                yield int((group / limit).read_text()) - used
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -67,6 +67,7 @@ def main() -> None:
             raise
         # A note of several lines is the traceback of another process.
         notes = [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
-        for line in (f"error: {error}", *notes, "(QGS_DEBUG=1 shows where it was raised)"):
+        told = f"error: {str(error) or type(error).__name__}"
+        for line in (told, *notes, "(QGS_DEBUG=1 shows where it was raised)"):
             print(line, file=sys.stderr)
         raise SystemExit(2) from None

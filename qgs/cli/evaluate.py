@@ -79,7 +79,6 @@ def evaluate(
     from qgs.engine.folder import RunFolder, checkpoint_of
     from qgs.engine.guard import refuse_broken
     from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
-    from qgs.io.models import is_own_path
 
     use_threads(threads)
     for setting in settings:
@@ -94,7 +93,8 @@ def evaluate(
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
     refuse_broken(model, checkpoint)
-    folder = out or evaluation_folder(checkpoint, bool(settings), is_own_path(runs[0]))
+    own = Path(runs[0]).expanduser().exists()  # so that results may be written beside it
+    folder = out or evaluation_folder(checkpoint, bool(settings), own)
     step = load_step(checkpoint)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch, trained_on)
     run = RunFolder(checkpoint.parent)

@@ -83,7 +83,9 @@ class OneCycleAdamW(Optimizer):
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         start = state["descent_starts"]
-        self._descent_starts = None if start is None else float(start)
+        if start is not None and not 0 <= start <= 1:
+            raise ValueError(f"descent_starts is {start}, no fraction of the budget")
+        self._descent_starts = start
 
 
 def _cosine(start: float, end: float, part: float) -> float:

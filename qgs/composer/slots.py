@@ -67,21 +67,6 @@ MOVED = {
 """Keys and types of older recipes, and what to write in their place."""
 
 
-def with_moved(tree: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A stored recipe with what has MOVED in its place of today."""
-    if "optimizer" in tree:
-        return tree
-    training, judged, data = ({**(tree[k] or {})} for k in ("training", "evaluation", "data"))
-    optimizer = {key: training.pop(key) for key in _OF_OPTIMIZER if key in training}
-    plugins, weights = tree["plugins"], judged.pop("lpips_weights", None)
-    metrics = {n: {"type": f"qgs/{n}", "weights": weights} for n in judged.pop("metrics", ())}
-    metrics["ssim"] = {"covariance": judged.pop("ssim_covariance", "population")}
-    if data.get("type") == "qgs/rooms":
-        data, plugins = {**data, "type": "rooms/procedural"}, ["rooms", *plugins]
-    moved = {"training": training, "evaluation": judged, "optimizer": optimizer}
-    return {**tree, **moved, "metrics": metrics, "data": data or None, "plugins": plugins}
-
-
 def slot_at(path: KeyPath) -> Slot | None:
     """The slot at a place of a recipe; None where no component belongs."""
     match path:

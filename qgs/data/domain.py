@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,6 +23,9 @@ from qgs.types import Cameras
 
 SAMPLES = 256
 """Training samples that are measured, the first ones."""
+OUTLIERS = 0.02
+"""Share of the values at either end of a range that does not count: one pair of parallel axes looks
+infinitely far."""
 TOLERANCE = 1.1
 """Views are outside where they leave the trained range by more than this factor."""
 KEY = "trained_on"
@@ -39,35 +43,51 @@ WORDS = {
 
 @dataclass
 class Domain:
-    """Least and largest value of each of WORDS over `samples` samples, in four digits."""
+    """Values of each of WORDS over `samples` samples, in four digits; of a file, their ends."""
 
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    values: dict[str, list[float]] = field(default_factory=dict)
     samples: int = 0
 
     def see(self, inputs: Cameras, targets: Cameras) -> None:
         """Count samples in: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
-            known = self.ranges.get(name, ())
-            ends = [float(f"{float(value):.4g}") for value in (values.min(), values.max())]
-            self.ranges[name] = min(*known, *ends), max(*known, *ends)
+            told = values[~values.isnan()].tolist()
+            self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in told)
         self.samples += len(inputs.c2w)
 
     @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """The span of each but for OUTLIERS of its values at either end."""
+        ordered = {name: sorted(values) for name, values in self.values.items() if values}
+        places = {name: int(OUTLIERS * len(values)) for name, values in ordered.items()}
+        return {name: (v[places[name]], v[-1 - places[name]]) for name, v in ordered.items()}
+
+    def state(self) -> dict[str, Any]:
+        """See `qgs.engine.checkpoint.Stateful`."""
+        return {"samples": self.samples, "values": self.values}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state`. Raises ValueError, TypeError and the like for anything else."""
+        told = {"samples": [state["samples"]], **state["values"]}
+        for name, numbers in told.items():
+            sound = all(isinstance(n, int | float) and n >= 0 for n in numbers)
+            if not sound or name not in ("samples", *WORDS):
+                raise ValueError(f"{name[:50]} is {str(numbers)[:100]}")
+        self.samples, self.values = int(state["samples"]), dict(state["values"])
+
+    @property
     def text(self) -> str:
-        """As JSON; null stands for infinity."""
+        """Its ranges as JSON; null stands for infinity."""
         plain = {k: [v if math.isfinite(v) else None for v in r] for k, r in self.ranges.items()}
         return json.dumps({"samples": self.samples, "ranges": plain})
 
     @classmethod
-    def read(cls, text: str) -> Domain:
-        """What `text` wrote. Raises ValueError, TypeError, KeyError or AttributeError for else."""
-        plain = json.loads(text)
-        ends = {
-            name: [math.inf if end is None else float(end) for end in plain["ranges"][name]]
-            for name in WORDS
-            if name in plain["ranges"]
-        }
-        return cls({name: (low, high) for name, (low, high) in ends.items()}, int(plain["samples"]))
+    def read(cls, plain: Mapping[str, Any]) -> Domain:
+        """What `text` wrote, parsed. Raises as `load_state`."""
+        told, domain = plain["ranges"].items(), cls()
+        ends = {k: [math.inf if v is None else v for v in (low, high)] for k, (low, high) in told}
+        domain.load_state({"samples": plain["samples"], "values": ends})
+        return domain
 
     def differences(self, found: Domain) -> list[str]:
         """In what `found` leaves these ranges, in words."""
@@ -82,11 +102,11 @@ class Domain:
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """A sentence: how photos lie to what a model was trained on; empty where that is not known.
+    """A sentence: how photos lie to what a model was trained on; `trained` is empty if unknown.
 
     The model need not know their content either: only the cameras are compared.
     """
-    if not trained.ranges:
+    if not trained.values:
         return (
             "whether the photos are like those that this model was trained on is not known: its "
             "checkpoint does not tell, since an older qgs or other code trained it"

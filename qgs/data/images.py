@@ -16,6 +16,7 @@ from upath import UPath
 from qgs.contracts import Scene
 from qgs.data.paths import StoreError, open_file
 from qgs.data.scenes import warn_once
+from qgs.memory import is_out_of_memory
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
 TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
@@ -85,6 +86,8 @@ def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
     except StoreError:
         raise
     except Exception as error:
+        if is_out_of_memory(error):
+            raise
         reason = str(error) or type(error).__name__
         raise ValueError(
             f"{path} cannot be read as {kind} ({reason}): replace the file, or remove its frame"
@@ -162,7 +165,10 @@ def load_array(file: IO[bytes]) -> np.ndarray:
     version = np.lib.format.read_magic(file)
     of_version = {(1, 0): np.lib.format.read_array_header_1_0}
     shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
-    held, promised = -file.tell() + file.seek(0, 2), math.prod(shape) * dtype.itemsize
+    count = math.prod(shape)
+    held, promised = -file.tell() + file.seek(0, 2), count * dtype.itemsize
+    if max(count, promised // 8) > _MOST_PIXELS:
+        raise ValueError(f"it has {count} numbers of {dtype}: scale it down")
     if held < promised or min(shape, default=0) < 0:
         raise ValueError(f"its header promises {promised} bytes, and {held} follow")
     file.seek(0)
@@ -231,7 +237,7 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
             yield image
     except UnidentifiedImageError as error:
         raise OSError("its header is none of a known image format") from error
-    except OSError:
+    except (OSError, MemoryError):
         raise
     except Exception as error:  # decoders raise anything on damaged files
         raise OSError(str(error) or type(error).__name__) from error

@@ -22,7 +22,10 @@ PAUSES = (1.0, 4.0)
 """Seconds before a remote store that failed is asked again."""
 
 LARGEST = 10**9
-"""Bytes of a file that is read whole; a small archive may promise any number."""
+"""Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels; a
+small archive may promise any number."""
+
+_LARGEST_JSON = 50_000_000  # which may take forty times as much once parsed
 
 Answer = TypeVar("Answer")
 _log = logging.getLogger(__name__)
@@ -101,17 +104,18 @@ def open_file(path: Path | UPath) -> IO[bytes]:
     return path.open("rb")
 
 
-def read_file(path: Path | UPath) -> bytes:
-    """The bytes of `path`. Raises as `open_file`, and OSError for one beyond LARGEST."""
+def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
+    """The bytes of `path`. Raises as `open_file`, and OSError for more than `most`."""
     with open_file(path) as file:
-        if is_local(path):
-            _refuse_huge(path.stat().st_size)
-        return file.read()
+        held = path.stat().st_size if is_local(path) else 0
+        content = file.read(most + 1) if held <= most else b""
+    _refuse_larger(max(held, len(content)), most)
+    return content
 
 
-def _refuse_huge(size: int) -> None:
-    if size > LARGEST:
-        raise OSError(f"it has {in_words(size)}, more than any photo or list of them")
+def _refuse_larger(size: int, most: int = LARGEST) -> None:
+    if size > most:
+        raise OSError(f"it is larger than {in_words(most)}")
 
 
 def read_json(path: UPath, fix: str, **options: Any) -> Any:
@@ -123,7 +127,7 @@ def read_json(path: UPath, fix: str, **options: Any) -> Any:
     try:
         # Python refuses more than 4300 digits, and NumPy more than 18 among floats
         number = lambda digits: int(digits) if len(digits) <= 18 else float(digits)  # noqa: E731
-        return json.loads(read_file(path), parse_int=number, **options)
+        return json.loads(read_file(path, _LARGEST_JSON), parse_int=number, **options)
     except (FileNotFoundError, StoreError):
         raise
     except RecursionError:
@@ -168,8 +172,9 @@ class Archive:
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
         try:
-            _refuse_huge(self._zip.getinfo(self.files[member]).file_size)
-            return asked_again(self._path, lambda: self._zip.read(self.files[member]))
+            info = self._zip.getinfo(self.files[member])
+            _refuse_larger(info.file_size)
+            return asked_again(self._path, lambda: self._zip.read(info))
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error
         except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:

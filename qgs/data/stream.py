@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader, Dataset
 from qgs.contracts import Scene, SceneSource, ViewsConfig
 from qgs.data.evaluation import one_line
 from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
+from qgs.memory import is_out_of_memory
 from qgs.wording import listed
 
 
@@ -131,7 +132,7 @@ class SampleStream:
             try:
                 return self._made(number, attempt)
             except Exception as error:
-                if not self._skips:
+                if not self._skips or is_out_of_memory(error):
                     raise
                 left_out.append(one_line(error))
         raise SampleError(
@@ -151,14 +152,19 @@ class SampleStream:
 
 
 def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
-    """The first of `frames` that fails by itself, and why; else all of them."""
+    """The first of `frames` that fails by itself, and why; else all. No memory is raised."""
+    if is_out_of_memory(error):
+        raise error
     for frame in frames:
         try:
             scene.images([frame])
             scene.masks([frame])
         except Exception as own:
-            return f"scene {scene.name!r}, frame {scene.label(frame)}: {own}"
-    return f"scene {scene.name!r}, frames {listed(map(scene.label, sorted({*frames})))}: {error}"
+            if is_out_of_memory(own):
+                raise
+            return f"scene {scene.name!r}, frame {scene.label(frame)}: {one_line(own)}"
+    told = listed(map(scene.label, sorted({*frames})))
+    return f"scene {scene.name!r}, frames {told}: {one_line(error)}"
 
 
 @dataclass(frozen=True)
@@ -167,6 +173,7 @@ class _Failure:
 
     message: str
     trace: str
+    no_memory: bool
 
 
 class _Batches(Dataset[Batch | _Failure]):
@@ -201,7 +208,8 @@ class _Batches(Dataset[Batch | _Failure]):
         try:
             return self.batch(number)
         except Exception as error:
-            return _Failure(str(error), traceback.format_exc())
+            no_memory = is_out_of_memory(error)
+            return _Failure(str(error) or one_line(error), traceback.format_exc(), no_memory)
 
 
 def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
@@ -242,7 +250,7 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
                     "out of memory; lower training.workers, or views and image sizes"
                 ) from error
             if isinstance(batch, _Failure):
-                error = SampleError(batch.message)
+                error = (MemoryError if batch.no_memory else SampleError)(batch.message)
                 error.add_note(f"In a process that decodes data:\n{batch.trace}")
                 raise error
             yield batch

@@ -15,15 +15,20 @@ FAINT = 0.01
 
 def blamed(
     recipe: Recipe, last_alive: Mapping[str, float] | None, owners: Mapping[str, str]
-) -> str:
+) -> tuple[str, bool]:
     """The option of `recipe` that is most likely to blame for a collapse, with its value.
 
     last_alive: the numbers of the last step with signs of life, None when there never was one.
     owners: names of loss terms to the names of their losses.
+    Returns also whether it stands out, so that no other causes need to be thought of.
     """
     found = _from_the_start(recipe) if last_alive is None else _later(recipe, last_alive, owners)
-    _, text = max(found, key=lambda suspect: suspect[0])
-    return f"most likely in this recipe: {text}"
+    score, text = max(found, key=lambda suspect: suspect[0])
+    return f"most likely in this recipe: {text}", score > STANDS_OUT
+
+
+STANDS_OUT = 1.0
+"""How much must speak against an option, such as ten times its default, to blame it alone."""
 
 
 def _from_the_start(recipe: Recipe) -> Iterator[tuple[float, str]]:
@@ -39,10 +44,12 @@ def _from_the_start(recipe: Recipe) -> Iterator[tuple[float, str]]:
         )
     cap = head.get("scale_cap")
     small = f", or model.head.scale_cap, {cap:g}," if isinstance(cap, int | float) else ""
+    views = recipe.views
+    scaled = f"scale_factor is {views.scale_factor:g}" if views.scale != "auto" else "scale is auto"
     yield (
         1.0,
-        f"views.scale_factor is {recipe.views.scale_factor:g}, which with the places where "
-        f"model.queries start may leave no Gaussian before the cameras{small} too small to see",
+        f"views.{scaled}, which with the places where model.queries start may leave no Gaussian "
+        f"before the cameras{small} too small to see",
     )
 
 

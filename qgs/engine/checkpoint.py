@@ -1,10 +1,10 @@
 """What a run saves and continues from."""
 
 import json
-import math
 import os
 import random
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -24,7 +24,6 @@ from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import (
     CheckpointError,
-    load_domain,
     load_weights,
     opened_tensors,
     read_tensors,
@@ -119,9 +118,8 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
 
 
 def _refuse_others(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], path: Any) -> None:
-    """Raise CheckpointError unless `tensors` are those that were written; old files do not tell."""
-    found = _kinds(tensors)
-    wanted = mapping_in(metadata, _TENSORS, path) if _TENSORS in metadata else found
+    """Raise CheckpointError unless `tensors` are those that were written."""
+    found, wanted = _kinds(tensors), mapping_in(metadata, _TENSORS, path)
     differing = [
         f"{name[:200]}: {found.get(name, 'absent')} instead of {str(wanted.get(name))[:200]}"
         for name in dict.fromkeys([*wanted, *found])
@@ -144,8 +142,8 @@ class Saver:
         self, accelerator: Accelerator, folder: RunFolder, model: QueryGaussianModel
     ) -> None:
         self._accelerator, self.folder, self.model = accelerator, folder, model
-        self.parts: dict[str, Stateful] = {"weights": Weights(model)}
         self.domain = Domain()
+        self.parts: dict[str, Stateful] = {"weights": Weights(model), "domain": self.domain}
 
     def see(self, batches: Sequence[Batch]) -> None:
         """Count the cameras of a step's batches into `domain`, until it has enough."""
@@ -193,8 +191,8 @@ class Saver:
                 "it; continue the run with that version"
             )
         for name, part in self.parts.items():
-            fault = unlike(part.state(), saved.parts[name]) or broken(saved.parts[name], name)
             try:
+                fault = broken(saved.parts[name], name)
                 if not fault:
                     part.load_state(saved.parts[name])
             except OtherRunError:
@@ -204,8 +202,6 @@ class Saver:
                 fault = str(error) if known else f"{type(error).__name__}: {error}"
             if fault:
                 raise damaged(self.folder.state, f"its part `{name}` cannot be restored ({fault})")
-        if self.folder.checkpoint.is_file():
-            self.domain = load_domain(self.folder.checkpoint)
 
     def _extra(self, step: int) -> dict[str, str]:
         return {"step": str(step), KEY: self.domain.text}
@@ -214,28 +210,6 @@ class Saver:
         self.folder.flush(to_disk=True)
         assert self.model.recipe is not None
         write_state(self.folder.state, self.model.recipe, parts)
-
-
-def unlike(now: Any, saved: Any, name: str = "") -> str:
-    """Where JSON values that were saved are of another kind than those of today; "" if nowhere.
-
-    Numbers and mappings are compared; a text may have been null, a list of another length.
-    """
-    if isinstance(now, Mapping):
-        if not isinstance(saved, Mapping):
-            return f"{name or 'it'} is no mapping"
-        found = (
-            unlike(value, saved[key], f"{name}.{key}".removeprefix("."))
-            for key, value in now.items()
-            if not isinstance(value, Tensor)
-            if key in saved
-        )
-        return next(filter(None, found), "")
-    if isinstance(now, int | float):
-        sound = type(saved) is type(now) or (type(now), type(saved)) == (float, int)
-        if not sound or not (0 if type(now) is int else -math.inf) <= saved < math.inf:
-            return f"{name} is {str(saved)[:100]!r}"
-    return ""
 
 
 class Weights:
@@ -274,30 +248,56 @@ def broken(state: State, part: str) -> str:
 
 
 class OptimizerState:
-    """What torch's optimiser remembers of the parameters of `module`, by name."""
+    """What torch's optimiser remembers of the parameters of `module` that it trains, by name.
+
+    "idle" lists those of which it remembers nothing, because no gradient has reached them.
+    """
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
-        self._parameters = dict(module.named_parameters())
+        trained = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        self._parameters = {n: p for n, p in module.named_parameters() if id(p) in trained}
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        return {
+        kept = {name: self._optimizer.state.get(p, {}) for name, p in self._parameters.items()}
+        return {"idle": [name for name, values in kept.items() if not values]} | {
             f"{name}/{key}": whole(value) if isinstance(value, Tensor) else value
-            for name, parameter in self._parameters.items()
-            for key, value in self._optimizer.state.get(parameter, {}).items()
+            for name, values in kept.items()
+            for key, value in values.items()
         }
 
     def load_state(self, state: State) -> None:
         self._optimizer.state.clear()
-        unknown = [path for path in state if path.rpartition("/")[0] not in self._parameters]
-        if unknown:
-            raise CheckpointError(f"of no parameter of the model: {listed(unknown)}")
-        for path, value in state.items():
-            name, key = path.rsplit("/", 1)
-            parameter = self._parameters[name]
+        names = {path: path.rpartition("/")[0] for path in state if path != "idle"}
+        kept = {*names.values()}
+        if differing := sorted((kept | {*state["idle"]}) ^ self._parameters.keys()):
+            raise CheckpointError(f"not of the parameters that are trained: {listed(differing)}")
+        wanted = {k: v for k, v in self._made().items() if k.rpartition("/")[0] in kept}
+        refuse_other_tensors({key: state[key] for key in wanted if key in state}, wanted)
+        for path, name in names.items():
+            parameter, value = self._parameters[name], state[path]
             if isinstance(value, Tensor):
                 value = placed_like(value, parameter)
-            self._optimizer.state[parameter][key] = value
+            self._optimizer.state[parameter][path.removeprefix(f"{name}/")] = value
+
+    def _made(self) -> dict[str, Tensor]:
+        """What a first step makes, in shape and type; nothing where steps need numbers."""
+        alike = {
+            name: nn.Parameter(torch.empty(p.shape, dtype=p.dtype, device="meta"))
+            for name, p in self._parameters.items()
+        }
+        memo = {id(p): alike[name] for name, p in self._parameters.items()}
+        for parameter in alike.values():
+            parameter.grad = torch.empty_like(parameter)
+        try:
+            optimizer = deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo)
+            for group in optimizer.param_groups:
+                group.update({key: False for key in ("fused", "foreach") if key in group})
+            optimizer.step()
+        except Exception:  # whatever an optimiser does with numbers that are not there
+            return {}
+        kept = {f"{n}/{k}": v for n, p in alike.items() for k, v in optimizer.state[p].items()}
+        return {path: value for path, value in kept.items() if isinstance(value, Tensor)}
 
 
 class RandomStates:

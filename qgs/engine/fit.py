@@ -8,6 +8,7 @@ from accelerate import Accelerator
 
 from qgs.composer import Recipe
 from qgs.contracts import SceneSourceConfig
+from qgs.data.evaluation import one_line
 from qgs.data.sampling import image_bytes
 from qgs.engine.distributed import wants_shards
 from qgs.engine.guard import TrainingError
@@ -62,7 +63,9 @@ def refuse_unfit(recipe: Recipe, accelerator: Accelerator) -> None:
         )
     advice = f"To train with less, {LESS_MEMORY}."
     if accelerator.device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(accelerator.device)
+        device = accelerator.device
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        free = torch.cuda.mem_get_info(device)[0] + cached  # which torch takes again first
         refuse_beyond_memory("this training, on the GPU,", on_device, advice, free)
         on_device = {}
     refuse_beyond_memory("this training", {**on_device, **in_host}, advice)
@@ -91,6 +94,6 @@ def explained(step: int, save: Callable[[int], None] | None = None) -> Iterator[
             )
         raise OutOfMemoryError(
             f"out of memory in step {step + 1} ({in_words(available_bytes())} of main memory are "
-            f"available): {str(error).strip().splitlines()[0]}. {kept}A new run takes less when "
+            f"available): {one_line(error)}. {kept}A new run takes less when "
             f"you {LESS_MEMORY}."
         ) from error

@@ -4,7 +4,7 @@ import json
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
 from qgs.io.files import replacing_entries
+from qgs.io.metadata import number_in
 from qgs.types import named_tensors
 from qgs.wording import listed
 
@@ -43,21 +44,26 @@ MAX_SKIPPED = 10
 MAX_SAVED = 20
 """Incidents of a run that are saved; later ones are logged and counted."""
 
-COLLAPSE_CAUSES = (
-    "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
-    "optimizer.warmup)",
-    "a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
-    "behind_camera: invisible)",
-    "an initialisation that hides every Gaussian (raise model.head.opacity_bias, check "
-    "views.scale_factor against the anchors' and the scenes' depth)",
-)
+_TOO_FAST = {
+    "optimizer.learning_rate": "a learning rate too high for this model (lower "
+    "optimizer.learning_rate, lengthen optimizer.warmup)"
+}
 
-NONFINITE_CAUSES = (
-    COLLAPSE_CAUSES[0],
-    "a range that bfloat16 does not hold (training.precision: float32)",
-    "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; with "
-    "views.scale distance, at input cameras that almost stand on one point)",
-)
+COLLAPSE_CAUSES = _TOO_FAST | {
+    "losses.visibility": "a visibility loss too strong or absent (try losses.visibility.weight 0.1 "
+    "with behind_camera: invisible)",
+    "model.head.opacity_bias": "an initialisation that hides every Gaussian (raise "
+    "model.head.opacity_bias)",
+    "views.scale": "a scale of the world that leaves none before the cameras (check views.scale "
+    "and views.scale_factor against the anchors' and the scenes' depth)",
+}
+"""By the option that each is about."""
+
+NONFINITE_CAUSES = _TOO_FAST | {
+    "training.precision": "a range that bfloat16 does not hold (training.precision: float32)",
+    "data": "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; "
+    "with views.scale distance, at input cameras that almost stand on one point)",
+}
 
 
 class TrainingError(RuntimeError):
@@ -108,9 +114,9 @@ class Guard:
         return {**counts, "detector": detector, "alive": self._alive}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self.incidents, self.skipped = state["incidents"], state["skipped"]
+        self.incidents, self.skipped = (number_in(state, key) for key in ("incidents", "skipped"))
         self.detector.load_state(state["detector"])
-        self._alive = {name: float(n) for name, n in state.get("alive", {}).items()}
+        self._alive = {name: float(n) for name, n in state["alive"].items()}
 
     def passed(self, numbers: Mapping[str, float]) -> None:
         """Take note of a finite step."""
@@ -142,7 +148,7 @@ class Guard:
         second = (
             f"The data is to blame, see `qgs data check`: {found}"
             if in_data
-            else f"{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES)}"
+            else f"{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES.values())}"
         )
         raise NonFiniteError(f"step {step + 1} is not finite{first}.\n{second}")
 
@@ -213,13 +219,15 @@ class Guard:
         if problem := broken_tensors(self._saver.model):
             self._collapse(step, problem, NONFINITE_CAUSES)
 
-    def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
+    def _collapse(self, step: int, problem: str, causes: Mapping[str, str]) -> NoReturn:
         self._saver.save_checkpoint(self.good.step, self.good.tensors)
-        if self.detector.dead_steps:
-            causes = [blamed(self._recipe, self._alive or None, self._objective.owners), *causes]
+        alive = self._alive or (None if self.detector.dead_steps else {})
+        likely, stands_out = blamed(self._recipe, alive, self._objective.owners)
+        others = [text for option, text in causes.items() if option not in likely]
+        told = _as_list([likely, *([] if stands_out else others)])
         raise CollapseError(
             f"training collapsed at step {step}: {problem}. The weights of step {self.good.step} "
-            f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
+            f"are kept in {self._saver.folder.checkpoint}. Likely causes:{told}"
         )
 
     def _save_incident(
@@ -229,6 +237,7 @@ class Guard:
         place = self._saver.folder.path / "incidents" / name
         weights = Weights(model).state()
         if self._accelerator.is_main_process:
+            self._saver.folder.refuse_gone()
             with replacing_entries(place.parent) as fresh:
                 _write_batches(fresh / name / "batch.safetensors", batches)
                 path = fresh / name / "weights.safetensors"
@@ -242,7 +251,7 @@ class Guard:
         return place
 
 
-def _as_list(causes: Sequence[str]) -> str:
+def _as_list(causes: Iterable[str]) -> str:
     return "".join(f"\n  - {cause}" for cause in causes)
 
 
@@ -279,8 +288,8 @@ class CollapseDetector:
         return {"dead": self.dead_steps, "symptom": self.symptom, "has_drawn": self._has_drawn}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self.dead_steps, self.symptom = state["dead"], state["symptom"]
-        self._has_drawn = state["has_drawn"]
+        self.dead_steps, self.symptom = number_in(state, "dead"), str(state["symptom"])
+        self._has_drawn = bool(number_in(state, "has_drawn", bool))
 
 
 LOSS_OF_QUALITY = 1.0
@@ -332,12 +341,13 @@ class GoodWeights:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self._copies = []
-        quality = (state.get(name) for name in ("psnr", "best"))
+        quality = (state[name] for name in ("psnr", "best"))
         self._psnr, self._best = (None if value is None else float(value) for value in quality)
         for i, step in enumerate(state["steps"]):
             copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
             self._weights.refuse_unlike(copy)
-            self._copies.append((int(step), copy if self._keep else {}))
+            step = number_in({"steps": step}, "steps")
+            self._copies.append((step, copy if self._keep else {}))
         self.step, self.tensors = self._copies[0]
 
 

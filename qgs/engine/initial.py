@@ -36,7 +36,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         return []
     path = checkpoint_of(recipe.init_from)
     learned_by = load_recipe(path)
-    learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
+    stored = read_tensors(path)
+    learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
     if fault := broken(learned, "weights"):
         raise CheckpointError(f"init_from: {path} has weights that are {fault}: take another file")
     options = [

@@ -337,7 +337,7 @@ def read_results(path: str | Path) -> StoredResults:
             missing=list(summary["missing"]),
             null=summary["null_entries"],
         )
-    except (OSError, KeyError, ValueError, TypeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(
             f"the results in {folder} cannot be read ({type(error).__name__}: {error}): they were "
             "changed, or written by an earlier version; evaluate again with `qgs eval`"

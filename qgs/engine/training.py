@@ -51,7 +51,13 @@ from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.io.files import write_text
+from qgs.io.metadata import number_in
 from qgs.model import QueryGaussianModel
+
+MAX_REASONS = 100
+"""Reasons of samples left out that a process counts on their own; further ones are OTHERS."""
+
+OTHERS = "for other reasons"
 
 ELSEWHERE = "another process of this training has no next batch; its own message tells why"
 
@@ -210,7 +216,8 @@ class Trainer:
         flag = torch.tensor(float(bool(self.feed.error)))
         failed = mean(self.accelerator, flag.to(self.accelerator.device))
         if float(failed):
-            raise self.feed.error or SampleError(ELSEWHERE)
+            with explained(self.step):
+                raise self.feed.error or SampleError(ELSEWHERE)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
@@ -229,9 +236,11 @@ class Trainer:
             with explained(self.step, self.guard.save_to_go_on if alone else None):
                 measured = self._gradients(batches)
             for bad in (bad for batch in batches for bad in batch.left_out):
-                if not self.left_out[bad]:
+                known = bad in self.left_out or len(self.left_out) < MAX_REASONS
+                reason = bad if known else OTHERS
+                if not self.left_out[reason]:
                     _log.warning("a sample is left out: %s", bad)
-                self.left_out[bad] += 1
+                self.left_out[reason] += 1
             if not stop and self.step + 1 < self.config.steps:
                 self.feed.fetch()
             numbers, asked_to_stop, no_data = self._means(measured, stop)
@@ -247,7 +256,7 @@ class Trainer:
                 if self.average:
                     self.average.update()
                 self.guard.passed(numbers)
-            self.saver.see(batches)
+                self.saver.see(batches)
             self.step += 1
             self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
             self._tick()
@@ -270,7 +279,8 @@ class Trainer:
                 self.guard.save_to_go_on(self.step)
                 error = self.feed.error or SampleError(ELSEWHERE)
                 error.add_note(f"The run is saved at step {self.step}; continue with --resume")
-                raise error
+                with explained(self.step):
+                    raise error
         stopped_by = stopped_by or self._stopped_by(stop)
         self.guard.finish(self.step, stopped=stopped_by is not None)
         if self.average and not stopped_by and self.evaluations.latest != self.step:
@@ -286,8 +296,8 @@ class Trainer:
         place = next(path for path in places if not path.exists())
         self.folder.close()
         self.folder = self.saver.folder = RunFolder(place)
-        self._folder_is_open, self._resumes = False, False
-        self._open_folder()
+        self.folder.take()
+        write_text(self.folder.recipe, annotated(self.recipe) + "\n")
         self.saver.save(self.step)
         self.folder.close()
         note = f"The run, without its history, is saved at step {self.step} in {place}; it goes on"
@@ -313,11 +323,12 @@ class Trainer:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
         refuse_other_data(state, self._conditions, self.folder)
-        self.step, self.samples, self.seconds = state["step"], state["samples"], state["seconds"]
-        if not (0 <= self.step <= self.samples and 0 <= self.seconds < math.inf):
-            raise ValueError(f"{self.step} steps of {self.samples} samples in {self.seconds} s")
+        self.step, self.samples = number_in(state, "step"), number_in(state, "samples")
+        self.seconds = float(number_in(state, "seconds", float))
+        if self.step > self.samples:
+            raise ValueError(f"{self.step} steps of {self.samples} samples")
         if self.accelerator.is_main_process:
-            self.left_out = Counter({key: int(n) for key, n in state.get("left_out", {}).items()})
+            self.left_out = Counter({key: int(n) for key, n in state["left_out"].items()})
 
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""

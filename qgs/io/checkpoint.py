@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
 from qgs.data.domain import KEY, Domain
 from qgs.io.differences import differing_tensors, differing_types, shapes_of
-from qgs.io.files import replacing, told_where_full
+from qgs.io.files import replacing
 from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
 from qgs.io.models import checkpoint_path
 from qgs.memory import TooLargeError
@@ -45,11 +46,13 @@ def write_tensors(
     """
     needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
     told = f" It takes {needed / 1e6:.1f} MB beside the file that it replaces, and"
-    with replacing(path) as temporary, told_where_full(Path(path), told):
+    with replacing(path, told) as temporary:
         try:
             save_file(dict(tensors), temporary, dict(metadata))
-        except SafetensorError as error:  # which tells the reason in words alone
-            raise OSError(errno.ENOSPC, str(error)) from error
+        except SafetensorError as error:  # which tells the number in words alone
+            number = re.search(r"os error (\d+)", str(error))
+            code = int(number[1]) if number else errno.EIO
+            raise OSError(code, str(error), os.fspath(path)) from error
 
 
 @contextmanager
@@ -186,10 +189,10 @@ def load_step(path: str | os.PathLike[str]) -> int | None:
 
 
 def load_domain(path: str | os.PathLike[str]) -> Domain:
-    """On what views a checkpoint was trained, empty where it does not tell. Raises as `load`."""
-    text = load_extra(path).get(KEY)
-    with reading(path, _EXTRA + KEY):
-        return Domain.read(text) if text else Domain()
+    """On what views a checkpoint was trained; empty where it does not tell. Raises as `load`."""
+    key, metadata = _EXTRA + KEY, _read_metadata(path)
+    with reading(path, key):
+        return Domain.read(mapping_in(metadata, key, path)) if key in metadata else Domain()
 
 
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from qgs.memory import in_words
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 _log = logging.getLogger(__name__)
 
@@ -24,17 +24,17 @@ class DiskFullError(OSError):
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], needed: str = "") -> Iterator[Path]:
     """A temporary path beside `path` that takes its place when the block ends well.
 
     Makes missing parent folders; the file gets the usual permissions whatever wrote it. When the
     block raises, `path` stays as it was. The new file is on the disk before it takes the place of
-    the old one, and its name when the block has ended.
+    the old one, and its name when the block has ended. needed: see `told_where_full`.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    with told_where_full(target):
+    with told_where_full(target, needed):
         try:
             temporary.touch()
             mode = temporary.stat().st_mode
@@ -57,6 +57,8 @@ def told_where_full(path: Path, needed: str = "") -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno not in _FULL:
+            if error.filename is None:
+                error.add_note(f"while {path} was written")
             raise
         free = shutil.disk_usage(path.parent).free
         raise DiskFullError(
@@ -152,6 +154,6 @@ def read_records(path: Path) -> list[dict[str, Any]]:
             if not isinstance(record["step"], int):
                 raise TypeError
             records.append(record)
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, RecursionError):
             _log.warning("%s, line %d is damaged and left out: %.80r", path, number, line)
     return records

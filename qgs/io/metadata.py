@@ -1,6 +1,7 @@
 """The metadata of our safetensors files, read as data that may be damaged or hostile."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -8,7 +9,6 @@ from typing import Any
 
 import qgs
 from qgs.composer import Recipe, RecipeError, resolve
-from qgs.composer.slots import with_moved
 
 LARGEST = 50_000_000
 """Characters of one entry; states of runs with thousands of processes have fewer."""
@@ -52,6 +52,17 @@ def mapping_in(
         return found
 
 
+def number_in(state: Mapping[str, Any], name: str, kind: type = int) -> Any:
+    """The finite number, 0 or more, of `kind` (int or float) that `state` has under `name`.
+
+    Raises ValueError for anything else, KeyError for nothing.
+    """
+    value = state[name]
+    if type(value) not in (kind, int) or not 0 <= value < math.inf:
+        raise ValueError(f"{name} is {str(value)[:100]!r}")
+    return value
+
+
 def refuse_newer(
     metadata: Mapping[str, str], known: Mapping[str, int], version: str, path: Any
 ) -> None:
@@ -80,4 +91,4 @@ def stored_recipe(metadata: Mapping[str, str], key: str, path: str | os.PathLike
         why = f"the recipe in it has `{unresolved[0]}`; one that qgs writes is resolved"
         raise damaged(path, why)
     with reading(path, key):
-        return resolve(with_moved(tree))
+        return resolve(tree)

@@ -51,11 +51,6 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
     return file
 
 
-def is_own_path(name: str | os.PathLike[str]) -> bool:
-    """Whether `name` is a path of the user's, so that results may be written beside it."""
-    return Path(name).expanduser().exists()
-
-
 def cache_folder() -> Path:
     """Where downloaded checkpoints are kept: the environment's QGS_CACHE, else ~/.cache/qgs."""
     return Path(os.environ.get("QGS_CACHE") or "~/.cache/qgs").expanduser()
@@ -66,7 +61,10 @@ def _downloaded(url: str) -> Path:
     source = opened_path(url)
     key = hashlib.sha256(url.encode()).hexdigest()[:16]
     file = cache_folder() / key / (PurePosixPath(urlsplit(url).path).name or "checkpoint")
-    if not file.is_file():
+    kept = "kept as"
+    if file.is_file():
+        kept = "not downloaded again (delete the file to do so); it was kept as"
+    else:
         try:
             with replacing(file) as temporary:
                 with source.open("rb") as remote, temporary.open("wb") as local:
@@ -81,5 +79,5 @@ def _downloaded(url: str) -> Path:
             ) from error
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    print(f"{url}: sha256 {digest}, kept as {file}", file=sys.stderr)
+    print(f"{url}: sha256 {digest}, {kept} {file}", file=sys.stderr)
     return file

@@ -12,7 +12,6 @@ from torch import Tensor
 from qgs.composer import Recipe, resolve
 from qgs.contracts import WeightLayout
 from qgs.contracts.weights import Shapes
-from qgs.data.domain import KEY, trained_domain
 from qgs.io.checkpoint import (
     CheckpointError,
     load_extra,
@@ -122,16 +121,10 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Transfer:
 def export_half(checkpoint: str | Path, out: str | Path) -> None:
     """Write a checkpoint again with its real numbers as float16; all else stays as it is.
 
-    Where it does not tell on what views it was trained (`qgs.data.domain`), its data is asked.
-    Raises what opening the data does, as `export_weights` does, and CheckpointError where float16
-    cannot hold a weight.
+    Raises as `export_weights` does, and CheckpointError where float16 cannot hold a weight.
     """
     out = _new_safetensors(out)
-    recipe, extra, stored = (
-        load_recipe(checkpoint),
-        load_extra(checkpoint),
-        read_tensors(checkpoint),
-    )
+    recipe, stored = load_recipe(checkpoint), read_tensors(checkpoint)
     halved = {n: t.half() if t.is_floating_point() else t for n, t in stored.items()}
     broken = [name for name, tensor in halved.items() if not tensor.isfinite().all()]
     if broken:
@@ -139,10 +132,7 @@ def export_half(checkpoint: str | Path, out: str | Path) -> None:
             f"{checkpoint} has weights that float16 cannot hold (infinite, or beyond 65504): "
             f"{listed(broken)}; ship it as it is"
         )
-    if KEY not in extra and ("data",) in recipe.parts:
-        domain = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
-        extra = {**extra, KEY: domain.text}
-    write_checkpoint(out, halved, recipe.tree, extra)
+    write_checkpoint(out, halved, recipe.tree, load_extra(checkpoint))
 
 
 def _new_safetensors(path: str | Path) -> Path:

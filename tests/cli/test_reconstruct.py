@@ -154,6 +154,14 @@ def test_photos_that_are_not_there_are_refused(photos, tmp_path):
         frame_list("1.png", "--frames", twins)
 
 
+def test_a_damaged_domain_is_told_before_the_work(photos, tmp_path, monkeypatch):
+    file = tmp_path / "checkpoint.safetensors"
+    qgs.save(qgs.compose(RECIPE), file, extra={"trained_on": "[]"})
+    monkeypatch.setattr("qgs.analysis.reconstruction.choose_sample", None)
+    result = run(file, photos, "--out", tmp_path / "out")
+    assert re.search(r"checkpoint\.safetensors is damaged: .*trained_on", str(result.exception))
+
+
 def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tmp_path):
     weights = checkpoint.read_bytes()
     assert run(checkpoint, photos, "--out", tmp_path / "plain").exception is None

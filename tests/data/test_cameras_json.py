@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from photo_formats import copied, scene, synthetic
@@ -34,6 +35,11 @@ FORMS = {
     "names in images": lambda p: {"views": named(p, "name")},
     "no names": lambda p: cameras(p),
     "one K": lambda p: {"K": list(p.intrinsics), "c2w": [c[:3].tolist() for c in p.c2w]},
+    "numbers of each": lambda p: {"K": [list(p.intrinsics)] * 6, "c2w": p.c2w.tolist()},
+    "padded K": lambda p: {
+        "c2w": p.c2w.tolist(),
+        "K": np.vstack([np.c_[matrix(p), [0] * 3], [0, 0, 0, 1]]).tolist(),
+    },
     "K of each": lambda p: {
         "c2w": p.c2w.tolist(),
         "K": [matrix(p)] * 6,
@@ -69,6 +75,11 @@ def test_what_is_read(tmp_path, photos, form):
         ),
         (lambda p: [{"c2w": p.c2w[0].tolist(), "K": "x", "image": "a"}], "'K' has the shape"),
         (lambda p: {"K": 1, "c2w": {}}, "lists no cameras: expected"),
+        (
+            lambda p: {"K": [matrix(p)] * 5, "c2w": p.c2w.tolist()},
+            r"has 6 matrices c2w and 5 K: write",
+        ),
+        (lambda p: {"K": 7, "c2w": p.c2w.tolist()}, "has 6 matrices c2w and 0 K"),
         (lambda p: [*named(p), 7], "frame 6: no image is named"),
         (lambda p: cameras(p, w=0, h=3), "the listed size, 0 x 3 pixels, is none of a photo"),
         (
@@ -85,6 +96,30 @@ def test_what_is_refused_names_the_file(tmp_path, photos, content, message):
         scene(file.parent, format="cameras")
 
 
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_four_numbers_a_camera_are_those_of_each(tmp_path, photos, count):
+    folder, rows = tmp_path / "scene", [[50.0 + i, 51.0, 16.0, 12.0] for i in range(count)]
+    copied(photos, folder)
+    for file in sorted(folder.iterdir())[count:]:
+        file.unlink()
+    content = {"K": rows, "c2w": photos.c2w[:count].tolist()}
+    (folder / "cameras.json").write_text(json.dumps(content))
+    read = scene(folder).cameras.intrinsics
+    torch.testing.assert_close(read, torch.tensor(rows).double())
+
+
+def test_no_more_of_a_listing_is_read_than_tells_what_it_is(tmp_path, photos):
+    copied(photos, tmp_path / "scene")
+    file = tmp_path / "scene" / "cameras.json"
+    apart = {"c2w": photos.c2w.tolist(), "more": "x" * 200_000, "K": matrix(photos)}
+    file.write_text(json.dumps(apart))
+    assert formats_of(file.parent) == ["cameras"]
+    with file.open("w") as opened:
+        opened.write(json.dumps(named(photos)))
+        opened.truncate(10**12)  # with a hole, which takes no space
+    assert formats_of(file.parent) == ["cameras"]
+
+
 def test_files_of_that_name_from_other_programs_are_no_photos(tmp_path, photos):
     copied(photos, tmp_path / "scene")
     (tmp_path / "scene" / "cameras.json").write_text('[{"id": 0, "position": [0, 0, 0]}]')
@@ -94,7 +129,9 @@ def test_files_of_that_name_from_other_programs_are_no_photos(tmp_path, photos):
 
 def test_a_folder_without_cameras_is_told_what_would_do(tmp_path, photos):
     copied(photos, tmp_path / "scene" / "frames")
+    copied(photos, tmp_path / "scene" / "a" / "b" / "images")
     with pytest.raises(
-        FileNotFoundError, match=r"images: 6 in frames/\).*The smallest transf.*fl_x"
+        FileNotFoundError,
+        match=r"images: 6 in a/b/images/, 6 in frames/\).*The smallest transf.*fl_x",
     ):
         scene(tmp_path / "scene")

@@ -1,7 +1,10 @@
 """What views a model was trained on: measured, stored, and told of others."""
 
+import json
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +14,7 @@ from qgs.composer import resolve
 from qgs.data.domain import KEY, Domain, trained_domain, verdict
 from qgs.engine.training import train
 from qgs.geometry.poses import look_at
-from qgs.io.checkpoint import load_extra
+from qgs.io.checkpoint import CheckpointError, load_domain, save
 from qgs.types import Cameras
 
 RECIPE = {
@@ -62,7 +65,41 @@ def test_a_domain_is_read_as_it_was_written() -> None:
     found = domain(around([0, 0, 2], [[0, 0, 0]]))
     assert found.ranges["depth"] == (math.inf, math.inf)
     assert "baseline" not in found.ranges
-    assert Domain.read(found.text) == found
+    read = Domain.read(json.loads(found.text))
+    assert (read.ranges, read.samples) == (found.ranges, 1)
+
+
+def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_trained() -> None:
+    near = around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])
+    parallel = replace(near, c2w=near.c2w.clone())
+    parallel.c2w[..., :3, :3] = torch.eye(3)
+    mixed = domain(*[near] * 97, *[parallel] * 3)
+    assert mixed.ranges["depth"] == pytest.approx((2.062, math.inf))
+    mixed = domain(*[near] * 98, *[parallel] * 2)
+    assert mixed.ranges["depth"] == pytest.approx((2.062, 2.062))
+    assert "meet at no point before them" in mixed.differences(domain(parallel))[-1]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        "{}",
+        "[]",
+        "null",
+        '{"samples": 1',
+        '{"samples": 1, "ranges": {"fov": ["a", "b"]}}',
+        '{"samples": 1, "ranges": {"fov": 50}}',
+        '{"samples": 1, "ranges": {"fov": [NaN, 1]}}',
+        '{"samples": -1, "ranges": {}}',
+        '{"samples": 1, "ranges": {"foo": [1, 2]}}',
+        '{"samples": 1, "ranges": ' + "[" * 9000 + "]" * 9000 + "}",
+    ],
+)
+def test_a_damaged_domain_is_one_error_with_the_file(told: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.safetensors"
+    save(resolve(RECIPE).build_model(), file, extra={KEY: told})
+    with pytest.raises(CheckpointError, match=r"a\.safetensors is damaged: .*trained_on"):
+        load_domain(file)
 
 
 def test_the_sentence() -> None:
@@ -83,14 +120,20 @@ def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued
     recipe = resolve(RECIPE)
     whole = train(recipe, tmp_path / "whole").folder
     half = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "half").folder
-    told = load_extra(half.checkpoint)[KEY]
-    assert Domain.read(told).samples == 6
+    told = load_domain(half.checkpoint)
+    assert told.samples == 6
+    shutil.copy(whole.checkpoint, half.checkpoint)  # as after a kill before the state was written
     train(recipe, tmp_path / "half", resume=True)
-    assert load_extra(half.checkpoint)[KEY] == load_extra(whole.checkpoint)[KEY] != told
-    found, first = (
-        Domain.read(load_extra(whole.checkpoint)[KEY]),
-        trained_domain(recipe.build_data(), recipe.views, recipe.seed),
-    )
+    found = load_domain(whole.checkpoint)
+    assert load_domain(half.checkpoint) == found != told
+    first = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
     assert found.samples == 12
     assert first.samples == 256
     assert not first.differences(found)
+
+
+def test_a_cut_checkpoint_does_not_hinder_going_on(tmp_path: Path) -> None:
+    folder = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "run").folder
+    folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:1000])
+    train(resolve(RECIPE), tmp_path / "run", resume=True)
+    assert load_domain(folder.checkpoint).samples == 12

@@ -47,6 +47,29 @@ def assert_same(first: Sequence[Batch], second: Sequence[Batch]) -> None:
             assert torch.equal(ours.cameras.intrinsics, theirs.cameras.intrinsics)
 
 
+@pytest.mark.parametrize("skips", [False, True])
+def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch, skips):
+    recipe = photos(tmp_path / "shelf")
+
+    def full(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("qgs.data.images.decode_rgb", full)
+    with pytest.raises(MemoryError):
+        batches(recipe, 1, 2, skips=skips)
+
+
+def test_the_reason_of_a_bad_sample_is_never_empty(tmp_path, monkeypatch):
+    recipe = photos(tmp_path / "shelf")
+
+    def fail(*_):
+        raise KeyError
+
+    monkeypatch.setattr("qgs.data.photos.source.PhotoScene.images", fail)
+    with pytest.raises(SampleError, match=r"frame \d+ \(.*\): KeyError$"):
+        batches(recipe, 1, 2)
+
+
 def test_worker_processes_change_nothing_and_end_with_the_stream(tmp_path):
     recipe = photos(tmp_path / "shelf")
     here = batches(recipe, 7, 2)

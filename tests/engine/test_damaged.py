@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,10 +21,10 @@ from qgs.data.sampling import Batch
 from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
 from qgs.engine import training
 from qgs.engine.checkpoint import read_state
-from qgs.engine.fit import OutOfMemoryError
+from qgs.engine.fit import OutOfMemoryError, explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.io.checkpoint import CheckpointError
-from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
+from qgs.memory import TooLargeError, _left_by_groups, in_words, refuse_beyond_memory
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -65,7 +66,7 @@ WEIGHT = "queries.features"
 MOMENT = "moments/model.queries.features/exp_avg"
 
 
-@pytest.mark.parametrize("lists", [True, False], ids=["listed", "written before lists"])
+@pytest.mark.parametrize("lists", [True, False], ids=["not as listed", "listed so"])
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -78,6 +79,10 @@ MOMENT = "moments/model.queries.features/exp_avg"
         (lambda t: t.update({"moments/foo/exp_avg": torch.ones(1)}), "foo"),
         (with_nan(f"weights/{WEIGHT}"), "not finite"),
         (with_nan(MOMENT), "not finite"),
+        (first_row(MOMENT), MOMENT.partition("/")[2]),
+        (lambda t: t.update({MOMENT: t[MOMENT].double()}), MOMENT.partition("/")[2]),
+        (lambda t: [t.pop(name) for name in list(t) if name.endswith("/exp_avg")], "exp_avg"),
+        (lambda t: [t.pop(n) for n in list(t) if n.startswith(MOMENT[:-7])], "queries.features"),
     ],
 )
 def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
@@ -97,9 +102,14 @@ def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
     assert before == {p.name: p.read_bytes() for p in copied.iterdir() if p.is_file()}
 
 
-def test_moments_of_another_shape_are_refused(copied: Path, tiny: Tiny) -> None:
-    rewrite(copied / "state.safetensors", first_row(MOMENT))
-    with pytest.raises(CheckpointError, match="not the tensors that were written"):
+def test_a_state_that_does_not_list_its_tensors_is_refused(copied: Path, tiny: Tiny) -> None:
+    state = copied / "state.safetensors"
+    with safe_open(state, "pt") as file:
+        tensors = {n: file.get_tensor(n).clone() for n in file.keys()}  # noqa: SIM118
+        known = file.metadata()
+    del known["qgs.tensors"]
+    save_file(tensors, state, known)
+    with pytest.raises(CheckpointError, match=r"qgs\.tensors"):
         run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
 
 
@@ -162,6 +172,33 @@ def test_what_fits_is_not_refused() -> None:
     assert [in_words(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]
 
 
+@pytest.mark.parametrize(
+    ("line", "folder", "files"),
+    [
+        ("0::/a/b", "a", ("memory.max", "memory.current", "inactive_file")),
+        ("0::/a/b", "", ("memory.max", "memory.current", "inactive_file")),
+        ("0::/../c", "", ("memory.max", "memory.current", "inactive_file")),
+        (
+            "3:cpu,memory:/not/seen/here",
+            "memory",
+            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        ),
+    ],
+)
+def test_the_limit_of_a_control_group_is_found(
+    tmp_path: Path, line: str, folder: str, files: tuple[str, str, str]
+) -> None:
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text(f"5:pids:/x\n{line}\n")
+    group = tmp_path / "sys/fs/cgroup" / folder
+    (group / "b").mkdir(parents=True)
+    (group / "b" / files[0]).write_text("max\n")
+    for name, text in zip(files[:2], ("1000\n", "300\n"), strict=True):
+        (group / name).write_text(text)
+    (group / "memory.stat").write_text(f"anon 3\n{files[2]} 100\n")
+    assert list(_left_by_groups(tmp_path)) == [800]
+
+
 def test_out_of_memory_is_told_and_the_run_is_saved(
     tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,6 +218,25 @@ def test_out_of_memory_is_told_and_the_run_is_saved(
     assert "batch_size" in str(e.value)
     monkeypatch.undo()
     assert run(recipe, tmp_path / "run", resume=True).resumed_at == 2
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory.\nTried")])
+def test_running_out_of_memory_is_told_in_one_line(error: Exception) -> None:
+    words = rf"available\): {type(error).__name__}.*batch_size"
+    with pytest.raises(OutOfMemoryError, match=words), explained(3):
+        raise error
+
+
+def test_what_torch_holds_in_reserve_is_free(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, gpu = tiny("tokengs"), SimpleNamespace(num_processes=1, device=torch.device("cuda"))
+    monkeypatch.setattr("qgs.engine.fit.wants_shards", lambda accelerator: False)
+    for name, bytes_ in {"memory_reserved": 10**12, "memory_allocated": 10**3}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda device, bytes_=bytes_: bytes_)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 10**12))
+    refuse_unfit(recipe, gpu)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 10**12)
+    with pytest.raises(TooLargeError, match=r"on the GPU, .* 0 bytes are available"):
+        refuse_unfit(recipe, gpu)
 
 
 @pytest.mark.parametrize("how", ["deleted", "replaced"])
@@ -204,7 +260,8 @@ def test_a_folder_lost_while_training_is_told_and_what_was_learnt_is_kept(
 def test_a_run_whose_folder_was_deleted_goes_on_beside_it(
     tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe, folder = tiny("tokengs"), tmp_path / "run"
+    pytest.importorskip("tensorboard")
+    recipe, folder = tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run"
     gone = RunFolder.append
 
     def lose(self: RunFolder, record: Any) -> None:
@@ -219,7 +276,26 @@ def test_a_run_whose_folder_was_deleted_goes_on_beside_it(
     place = tmp_path / "run-saved-1"
     assert str(place) in caught.value.__notes__[0]
     assert not folder.exists()
+    saved = {path.name for path in place.iterdir()}
+    assert saved == {"recipe.yaml", "checkpoint.safetensors", "state.safetensors"}
     assert run(recipe, place, resume=True).resumed_at == 3
+
+
+def test_a_step_that_is_not_finite_does_not_make_a_lost_folder_again(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(batch: Batch, numbers: Sequence[int]) -> None:
+        if numbers[0] == 4:
+            batch.targets.images[0, 0, 0, 0, 0] = torch.nan
+
+    def lose(trainer: Any, stop: Any) -> None:
+        if trainer.step == 2:
+            shutil.rmtree(tmp_path / "run")
+
+    change_batches(monkeypatch, spoil)
+    with pytest.raises(FolderGoneError):
+        run_calling(lose, tiny("tokengs"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def bad_frames(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool]) -> None:
@@ -249,6 +325,17 @@ def test_bad_samples_are_skipped_counted_and_named_if_asked_for(
     assert caplog.text.count("a sample is left out") == 2
     state = read_state(tmp_path / "skips" / "state.safetensors").parts["counters"]
     assert state["left_out"] == result.left_out
+
+
+def test_the_reasons_of_left_out_samples_do_not_grow_without_end(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "MAX_REASONS", 2)
+    bad_frames(monkeypatch, lambda number: number % 2 == 1)
+    result = run(tiny("tokengs", "training.on_bad_sample=skip"), tmp_path / "run")
+    *told, others = result.left_out.items()
+    assert len(told) == 2
+    assert others == (training.OTHERS, 2)
 
 
 def test_too_many_bad_samples_in_a_row_end_a_run_all_the_same(

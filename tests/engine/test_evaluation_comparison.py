@@ -101,6 +101,13 @@ def test_tables_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     assert "1 : 1" in out
 
 
+def test_results_nested_too_deeply_are_told(tmp_path: Path) -> None:
+    for name in ("summary", "protocol"):
+        (tmp_path / f"{name}.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match=r"cannot be read \(RecursionError"):
+        read_results(tmp_path)
+
+
 def test_folders_without_results_are_told(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no results in"):
         read_results(tmp_path)

@@ -2,6 +2,7 @@
 
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -217,6 +218,21 @@ def test_imported_weights_grow_too(tmp_path: Path) -> None:
     )
     model, _ = started(grown)
     assert torch.equal(model.queries.get_parameter("features")[:6], weights["gs_tokens"])
+
+
+def test_weights_that_are_no_real_numbers_are_taken_as_they_are(
+    learned: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = Recipe.build_model
+
+    def counting(recipe: Recipe, device: Any = None) -> QueryGaussianModel:
+        model = build(recipe, device)
+        model.head.register_buffer("seen", torch.tensor([3], device=device))
+        return model
+
+    monkeypatch.setattr(Recipe, "build_model", counting)
+    model, _ = started(learned("tokengs", "model.queries.count=30"))
+    assert model.head.get_buffer("seen").dtype == torch.int64
 
 
 def test_training_starts_from_a_run(tiny: Tiny, tmp_path: Path) -> None:

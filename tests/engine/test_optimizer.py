@@ -1,8 +1,10 @@
 """Which parameters decay, learn slower or stay; an optimiser of a plugin; the moving average."""
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,8 +12,9 @@ from refusals import refused
 from torch import nn
 from training_runs import Tiny, run, same, weights
 
+from qgs.components.optimizer import OneCycleAdamW
 from qgs.composer import resolve
-from qgs.engine.checkpoint import read_state
+from qgs.engine.checkpoint import read_state, write_state
 from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups
 from qgs.io.checkpoint import unique_tensors
 
@@ -192,7 +195,53 @@ def test_a_plugin_adds_an_optimiser_by_one_class(
     assert again.resumed_at == 2
     assert same(weights(again), weights(through))
     moments = read_state(again.folder.state).parts["moments"]
-    assert {key.rsplit("/")[-1] for key in moments} == {"momentum_buffer"}
+    assert {key.rsplit("/")[-1] for key in moments} == {"idle", "momentum_buffer"}
+
+
+@pytest.mark.parametrize("made", ["Adafactor(groups, lr=0.01)", "SGD(groups, lr=0.01)"])
+def test_moments_of_any_shape_and_none_are_restored(
+    tiny: Tiny, tmp_path: Path, install: Callable[..., None], made: str
+) -> None:
+    code = PLAIN.replace("import SGD", "import SGD, Adafactor").replace('("plain"', '("other"')
+    install("other", "other", code.replace("SGD(groups, lr=self.config.rate, momentum=0.9)", made))
+    tree = {**tiny("tokengs").tree, "plugins": ["rooms", "other"]}
+    tree["optimizer"] = {"type": "other/sgd"}
+    through = run(resolve(tree), tmp_path / "through")
+    run(resolve(tree, ["training.steps=2"]), tmp_path / "run")
+    again = run(resolve(tree), tmp_path / "run", resume=True)
+    assert again.resumed_at == 2
+    assert same(weights(again), weights(through))
+
+
+def test_an_optimiser_may_keep_any_json_values(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tiny("tokengs", "training.steps=3"), tmp_path / "run")
+    saved = read_state(tmp_path / "run" / "state.safetensors")
+    told = {"best": math.inf, "last_epoch": -1, "seen": 0.5}
+    write_state(
+        tmp_path / "run" / "state.safetensors",
+        saved.recipe.tree,
+        {**saved.parts, "schedule": told},
+    )
+    restored: list[Any] = []
+    monkeypatch.setattr(OneCycleAdamW, "state", lambda self: {"best": 0.0, "seen": 0})
+    monkeypatch.setattr(OneCycleAdamW, "load_state", lambda self, state: restored.append(state))
+    assert run(tiny("tokengs"), tmp_path / "run", resume=True).resumed_at == 3
+    assert restored == [told]
+
+
+def test_parameters_that_no_gradient_reaches_do_not_hinder_going_on(
+    tiny: Tiny, tmp_path: Path
+) -> None:
+    fixed = (
+        "model.decoder.cross_attention.bandwidth=fixed",
+        "model.centers.type=locus/anchor_offset",
+    )
+    run(tiny("locus", *fixed, "training.steps=3"), tmp_path / "run")
+    idle = read_state(tmp_path / "run" / "state.safetensors").parts["moments"]["idle"]
+    assert "model.queries.raw_radius" in idle
+    assert run(tiny("locus", *fixed), tmp_path / "run", resume=True).resumed_at == 3
 
 
 class Small(nn.Module):

@@ -291,18 +291,29 @@ def test_a_state_with_damaged_metadata_is_refused_by_its_name(tiny: Tiny, tmp_pa
     damage("`qgs.state_version` ", state_version="one")
     damage("`qgs.state_version` .*KeyError", state_version=None)
     damage("not the tensors that were written: foo", {"foo": torch.zeros(2)})
-    damage("the tensor `foo` belongs to no part", {"foo": torch.zeros(2)}, tensors=None)
-    damage("the tensor `foo/bar` belongs to no part", {"foo/bar": torch.zeros(2)}, tensors=None)
+    damage("`qgs.tensors` .*KeyError", tensors=None)
+    for name in ("foo", "foo/bar"):
+        listed = {**json.loads(metadata["qgs.tensors"]), name: ["float32", 2]}
+        message = f"the tensor `{name}` belongs to no part"
+        damage(message, {name: torch.zeros(2)}, tensors=json.dumps(listed))
     for part, key, value, message in (
         ("counters", "step", None, r"`counters` .*step is 'None'"),
         ("counters", "step", -1, "step is '-1'"),
         ("counters", "seconds", float("nan"), "seconds is 'nan'"),
         ("counters", "samples", {}, "samples is"),
         ("random", "0/python", [3, [1], None], "`random` cannot be restored"),
-        ("random", "0/numpy", 3, "0/numpy is no mapping"),
+        ("random", "0/numpy", 3, "`random` cannot be restored"),
+        ("guard", "skipped", "inf", "skipped is 'inf'"),
+        ("guard", "detector", {"dead": -1, "symptom": "", "has_drawn": False}, "dead is '-1'"),
+        ("guard", "detector", [], "`guard` cannot be restored"),
+        ("good", "steps", [0.5], "steps is '0.5'"),
+        ("schedule", "descent_starts", 1e999, "descent_starts is inf"),
+        ("domain", "samples", "many", "samples is"),
+        ("domain", "values", {"fov": [float("nan")]}, "fov is"),
     ):
         damaged = {**parts, part: {**parts[part], key: value}}
         damage(message, state=json.dumps(damaged))
+    damage("`guard` cannot be restored", state=json.dumps({**parts, "guard": []}))
     del parts["counters"]["step"]
     damage("`counters` cannot be restored .*'step'", state=json.dumps(parts))
 

@@ -1,10 +1,21 @@
 """Files and folders that appear whole or not at all."""
 
+import errno
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors import SafetensorError
 
-from qgs.io.files import is_leftover, replacing, replacing_entries, write_text
+from qgs.io.checkpoint import write_tensors
+from qgs.io.files import (
+    DiskFullError,
+    is_leftover,
+    read_records,
+    replacing,
+    replacing_entries,
+    write_text,
+)
 
 
 def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:
@@ -44,6 +55,48 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
         fail()
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("words", "number", "full"),
+    [
+        ("I/O error: No space left on device (os error 28)", errno.ENOSPC, True),
+        ("I/O error: Disk quota exceeded (os error 122)", errno.EDQUOT, True),
+        ("I/O error: File too large (os error 27)", errno.EFBIG, False),
+        ("I/O error: Permission denied (os error 13)", errno.EACCES, False),
+        ("invalid header", errno.EIO, False),
+    ],
+)
+def test_a_disk_is_called_full_only_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, number: int, full: bool
+) -> None:
+    def fail(*_: object) -> None:
+        raise SafetensorError(words)
+
+    monkeypatch.setattr("qgs.io.checkpoint.save_file", fail)
+    with pytest.raises(OSError, match=r"a\.safetensors") as caught:
+        write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
+    assert isinstance(caught.value, DiskFullError) == full
+    assert full or caught.value.errno == number
+    assert words in str(caught.value)
+    assert ("It takes 0.0 MB beside" in str(caught.value)) == full
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_error_that_names_no_file_is_told_with_it(tmp_path: Path) -> None:
+    def fail() -> None:
+        with replacing(tmp_path / "a.txt"):
+            raise OSError(errno.EFBIG, "File too large")
+
+    with pytest.raises(OSError, match="too large") as caught:
+        fail()
+    assert caught.value.__notes__ == [f"while {tmp_path / 'a.txt'} was written"]
+
+
+def test_records_nested_too_deeply_are_left_out(tmp_path: Path) -> None:
+    file = tmp_path / "history.jsonl"
+    file.write_text('{"step": 1}\n{"step": 2, "x": ' + "[" * 100_000 + '\n{"step": 3}\n')
+    assert [record["step"] for record in read_records(file)] == [1, 3]
 
 
 def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path: Path) -> None:

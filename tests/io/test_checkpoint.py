@@ -154,24 +154,6 @@ def test_only_plugins_that_are_used_are_needed(
         qgs.compose(RECIPES / "photos.yaml", SMALL)
 
 
-def test_a_recipe_of_before_the_optimiser_was_a_slot_is_translated(saved: Path) -> None:
-    now = json.loads(metadata_of(saved)["qgs.recipe"])
-    rates = {key: value for key, value in now["optimizer"].items() if key not in ("type", "parts")}
-    judged = {"metrics": ["lpips"], "ssim_covariance": "sample", "lpips_weights": "vgg"}
-    old = {k: v for k, v in now.items() if k not in ("optimizer", "metrics")} | {
-        "training": now["training"] | rates,
-        "evaluation": now["evaluation"] | judged,
-        "data": now["data"] | {"type": "qgs/rooms"},
-        "plugins": [name for name in now["plugins"] if name != "rooms"],
-    }
-    rewrite(saved, **{"qgs.recipe": json.dumps(old), "qgs.format_version": "1"})
-    found = load_recipe(saved).tree
-    assert found["metrics"].pop("lpips") == {"type": "qgs/lpips", "weights": "vgg"}
-    assert found["metrics"]["ssim"].pop("covariance") == "sample"
-    now["metrics"]["ssim"].pop("covariance")
-    assert found == now
-
-
 def test_another_release_of_a_plugin_is_told(old_locus: Path) -> None:
     recipe = json.loads(metadata_of(old_locus)["qgs.recipe"])
     recipe["model"]["decoder"]["refinement"]["type"] = "locus/gone_since"

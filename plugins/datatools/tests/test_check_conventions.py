@@ -1,11 +1,13 @@
 """Poses written in another convention than the format's are named, in every format."""
 
+import json
+
 import numpy as np
 import photo_formats
 import pytest
 from planted import FLIP, photo_set
 from qgs_datatools.check import Options, check
-from qgs_datatools.conventions import LLFF, OPENCV, OPENGL
+from qgs_datatools.conventions import LLFF, OPENCV, OPENCV_C2W, OPENGL
 from textured_room import walk
 from upath import UPath
 
@@ -16,6 +18,9 @@ WRITTEN_AND_READ = [
     (OPENCV, "flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
     (OPENCV, "inverted", lambda c2w: c2w),
     (OPENCV, "inverted and flipped", lambda c2w: c2w @ FLIP),
+    (OPENCV_C2W, "flipped", lambda c2w: c2w @ FLIP),
+    (OPENCV_C2W, "inverted", np.linalg.inv),
+    (OPENCV_C2W, "inverted and flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
     (LLFF, "OpenGL axes", lambda c2w: c2w @ FLIP),
     (LLFF, "OpenCV axes", lambda c2w: c2w),
     (LLFF, "flipped", lambda c2w: c2w[:, [1, 0, 2, 3]] * [-1, 1, 1, 1]),
@@ -30,6 +35,8 @@ def read(convention, stored: np.ndarray) -> np.ndarray:
         return stored @ FLIP
     if convention is OPENCV:
         return np.linalg.inv(stored)
+    if convention is OPENCV_C2W:
+        return stored
     down, right, back, centre = stored.T
     return np.stack([right, down, -back, centre], 1)
 
@@ -64,9 +71,20 @@ def write_colmap(folder, photos):
     return photo_formats.write_colmap(folder, photos, "binary")
 
 
+def write_cameras(folder, photos):
+    photo_formats.copied(photos, folder)
+    listed = [
+        {"image": file.name, "c2w": pose.tolist(), "K": list(photos.intrinsics)}
+        for file, pose in zip(photos.files, photos.c2w, strict=True)
+    ]
+    (folder / "cameras.json").write_text(json.dumps(listed))
+    return folder
+
+
 @pytest.mark.parametrize(
     ("write", "reason"),
     [
+        (write_cameras, "these look like OpenGL poses read as OpenCV"),
         (write_blender, "these look like OpenCV poses read as OpenGL"),
         (write_colmap, "these look like OpenGL poses read as OpenCV"),
         (write_llff, "the axes look like (up, right, forward), OpenGL and OpenCV mixed"),
@@ -77,3 +95,4 @@ def test_the_convention_is_named(photos, tmp_path, write, reason):
     (finding,) = check(UPath(path), Options(threads=2)).findings
     assert finding.frames == (0, 1, 2)
     assert reason in finding.reason
+    assert write != write_cameras or finding.fix.endswith("of every camera-to-world matrix")

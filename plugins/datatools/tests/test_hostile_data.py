@@ -2,6 +2,7 @@
 
 import json
 import os
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from qgs_datatools.check import Options, check
 from upath import UPath
 
 from qgs.data import ChunksSource
+from qgs.data.paths import ArchivePath
 
 HUGE = 10**400
 
@@ -82,7 +84,46 @@ def llff(folder: Path) -> str:
     return "poses_bounds.npy"
 
 
+def with_hole(file: Path, start: bytes, size: int = 3_000_000_000) -> None:
+    """A file that takes no space beyond `start`."""
+    file.write_bytes(start)
+    os.truncate(file, size)
+
+
+def json_with_hole(folder: Path) -> str:
+    name = changed(lambda data: None)(folder)
+    with_hole(folder / name, (folder / name).read_bytes())
+    return name
+
+
+def colmap_with_hole(suffix: str, name: str):
+    def write(folder: Path) -> str:
+        kind = "binary" if suffix == "bin" else "text"
+        write_colmap(folder, synthetic(folder / "photos"), kind)
+        start = (2**40).to_bytes(8, "little") if suffix == "bin" else b""
+        with_hole(folder / "sparse" / "0" / f"{name}.{suffix}", start)
+        return "sparse/0"
+
+    return write
+
+
+def depth_with_hole(folder: Path) -> str:
+    changed(lambda data: [f.update(depth_file_path="d.npy") for f in data["frames"]] and None)(
+        folder
+    )
+    header = {"descr": "|u1", "fortran_order": False, "shape": (60_000, 60_000)}
+    with (folder / "d.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+    os.truncate(folder / "d.npy", (folder / "d.npy").stat().st_size + 60_000**2)
+    return "d.npy"
+
+
 FOLDERS = {
+    "a listing with a hole": json_with_hole,
+    "COLMAP images with a hole": colmap_with_hole("bin", "images"),
+    "COLMAP cameras with a hole": colmap_with_hole("bin", "cameras"),
+    "COLMAP text with a hole": colmap_with_hole("txt", "images"),
+    "a depth map of 3.6 gigapixels": depth_with_hole,
     "a pose of 400 digits": changed(pose),
     "a focal length of 400 digits": changed(lambda data: data.update(fl_x=HUGE)),
     "a principal point of 400 digits": changed(lambda data: data.update(cx=-HUGE)),
@@ -98,6 +139,21 @@ FOLDERS = {
     "a COLMAP focal length of 400 digits": colmap_of(" 50.0 ", f" {HUGE} "),
     "poses of 6 TiB": llff,
 }
+
+
+def test_a_photo_with_a_hole_is_not_read_as_a_whole(tmp_path):
+    changed(lambda data: None)(tmp_path)
+    image = next((tmp_path / "images").iterdir())
+    with_hole(image, image.read_bytes())
+    assert any("larger than 1 GB" in line and image.name in line for line in told(tmp_path))
+
+
+def test_a_member_of_an_archive_that_is_too_large_is_not_unpacked(tmp_path, monkeypatch):
+    monkeypatch.setattr("qgs.data.paths.LARGEST", 1000)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("large", bytes(1001))
+    with pytest.raises(OSError, match="large is larger than 1 kB"):
+        ArchivePath(UPath(tmp_path / "a.zip"), "large").read_bytes()
 
 
 @pytest.mark.parametrize("kind", FOLDERS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from upath import UPath
@@ -62,21 +63,26 @@ def _listings() -> str:
     return ", ".join(f"{reader.listing} ({reader.name})" for reader in READERS)
 
 
+def _image_counts(folder: UPath, name: str = "", depth: int = 4) -> Iterator[tuple[str, int]]:
+    """Names below `folder`, "" for itself, of folders with images, and how many these are."""
+    if count := len(image_files(folder)):
+        yield name, count
+    for item in sorted(folder.iterdir(), key=lambda item: item.name) if depth else ():
+        if item.is_dir():
+            yield from _image_counts(item, f"{name}{item.name}/", depth - 1)
+
+
 def _nothing(folder: UPath, format: Format, held: list[type[PhotoReader]]) -> str:
     if format != "auto":
         listing = next(reader.listing for reader in READERS if reader.name == format)
         names = ", ".join(reader.name for reader in held)
         other = f"; it can be read as {names}" if held else ""
         return f"{folder} has no {listing}, which {format} needs{other}"
-    inside = sorted(folder.iterdir(), key=lambda item: item.name)
-    counts = {f"{item.name}/": len(image_files(item)) for item in inside if item.is_dir()}
-    counts = {
-        name: count for name, count in {"it": len(image_files(folder)), **counts}.items() if count
-    }
-    images = listed(f"{count} in {name}" for name, count in counts.items()) or "none"
+    inside = sorted(item.name for item in folder.iterdir())
+    images = listed(f"{count} in {name or 'it'}" for name, count in _image_counts(folder))
     return (
         f"{folder} has no transforms.json nor another listing of cameras; it holds "
-        f"{listed(item.name for item in inside) or 'nothing'} (images: {images}). Camera poses are "
+        f"{listed(inside) or 'nothing'} (images: {images or 'none'}). Camera poses are "
         "needed: make them with COLMAP or with nerfstudio's `ns-process-data`, or give the folder "
         f"that holds one of {_listings()}. The smallest transforms.json that would do: {_SMALLEST}"
     )

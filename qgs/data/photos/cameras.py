@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from upath import UPath
 
-from qgs.data.paths import read_file, read_json
+from qgs.data.paths import open_file, read_json
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
     Listing,
@@ -20,6 +20,7 @@ from qgs.data.photos.reader import (
 
 _LISTS = ("frames", "cameras", "views")
 _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")
+_START = 4_000_000  # bytes of a file that are looked at; a thousand cameras have a tenth of that
 _FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
 
 
@@ -33,20 +34,23 @@ class CamerasJson(PhotoReader):
 
     name = "cameras"
     listing = "cameras.json"
-    poses = "opencv"
+    poses = "opencv c2w"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
         """See `PhotoReader`: other programs give other files this name."""
         file = folder / cls.listing
-        content = read_file(file) if file.is_file() else b""
-        return all(key in content for key in (b'"c2w"', b'"K"'))
+        if not file.is_file():
+            return False
+        with open_file(file) as opened:
+            start = opened.read(_START)
+        return all(key in start for key in (b'"c2w"', b'"K"'))
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """See `PhotoReader`. Raises ValueError for unnamed images of another number."""
         file = folder / cls.listing
-        cameras = _cameras(read_json(file, f"write {_FORM}"))
+        cameras = _cameras(file, read_json(file, f"write {_FORM}"))
         names = [next((n for k in _NAMES if isinstance(n := c.get(k), str)), "") for c in cameras]
         if not cameras:
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
@@ -67,19 +71,22 @@ class CamerasJson(PhotoReader):
         return Listing(file, [_frame(folder, place, *camera) for camera in named])
 
 
-def _cameras(data: Any) -> list[Mapping[str, Any]]:
-    """What is said of each camera, with what is said of all."""
+def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
+    """What is said of each camera, with what is said of all. ValueError."""
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
     if not isinstance(given, list):
         columns: Any = [top.get(key) for key in ("c2w", "K", "images")]
         poses, matrices, names = columns
-        poses = poses if isinstance(poses, list) else []
-        shared = np.ndim(numbers(matrices)) < 3
+        if not isinstance(poses, list):
+            return []
+        one = numbers(matrices)  # (4, 4) may be fx, fy, cx, cy of four cameras
+        shared = one.shape in ((3, 3), (4,)) or (one.shape == (4, 4) and not one[3, :3].any())
         matrices = [matrices] * len(poses) if shared else matrices
         names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
-        if len(matrices) != len(poses):
-            return []
+        matrices = matrices if isinstance(matrices, list) else []
+        if (count := len(matrices)) != len(poses):
+            raise ValueError(f"{file} has {len(poses)} matrices c2w and {count} K: write {_FORM}")
         rows = zip(poses, matrices, names, strict=True)
         given = [{"c2w": c2w, "K": K, "image": name or None} for c2w, K, name in rows]
     return [{**top, **camera} if isinstance(camera, Mapping) else {} for camera in given]

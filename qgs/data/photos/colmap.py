@@ -8,6 +8,7 @@ import io
 import math
 import struct
 from collections.abc import Iterator, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
@@ -33,6 +34,7 @@ _LENSES: dict[str, type[Lens] | None] = {
     "RADIAL_FISHEYE": Fisheye,
 }
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
+_LONGEST_LINE = 2**25  # characters; that of a million points has fewer
 
 
 class Colmap(PhotoReader):
@@ -113,11 +115,12 @@ def _text_images(model: UPath) -> Iterator[Image]:
 def _lines(file: UPath, after: int = 0) -> Iterator[str]:
     """The lines of a file less comments, empty ones, and so many `after` each of the others."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8") as opened:
-        for line in map(str.strip, opened):
+        lines = iter(partial(opened.readline, _LONGEST_LINE), "")
+        for line in map(str.strip, lines):
             if line and not line.startswith("#"):
                 yield line
                 for _ in range(after):
-                    next(opened, None)
+                    next(lines, None)
 
 
 def _binary_cameras(model: UPath) -> Iterator[Camera]:
@@ -128,6 +131,8 @@ def _binary_cameras(model: UPath) -> Iterator[Camera]:
             number, kind, width, height = _unpacked("<IiQQ", file)
             name = pycolmap.CameraModelId(kind).name
             parameters = _unpacked(f"<{len(_parameters(name))}d", file)
+            if not width:  # as in a file with holes, which may be endless
+                raise ValueError("cameras.bin has a camera of no pixels")
             yield number, (name, width, height, parameters)
 
 
@@ -138,6 +143,8 @@ def _binary_images(model: UPath) -> Iterator[Image]:
         for _ in range(_unpacked("<Q", file)[0]):
             _, *pose, camera = _unpacked("<I7dI", file)
             name = b"".join(iter(lambda: _unpacked("<c", file)[0], b"\0")).decode("utf-8")
+            if not name:
+                raise ValueError("images.bin has an image without a name")
             points = _BYTES_OF_A_POINT * _unpacked("<Q", file)[0]
             if file.tell() + points > end:
                 raise ValueError("images.bin is cut off")

@@ -74,8 +74,8 @@ class PhotoReader(ABC):
     listing: ClassVar[str]
     """The file that lists the photos, below the folder, for messages."""
 
-    poses: ClassVar[Literal["opengl", "opencv", "llff"]]
-    """How the files hold poses: as OpenGL or LLFF camera-to-world, or OpenCV world-to-camera.
+    poses: ClassVar[Literal["opengl", "opencv", "opencv c2w", "llff"]]
+    """How the files hold poses: camera-to-world, but for "opencv", which is world-to-camera.
     `qgs data check` says by it what wrong poses may have been meant as."""
 
     @classmethod

@@ -68,6 +68,26 @@ OPENCV: Convention = {
 }
 """OpenCV world-to-camera: chunks and COLMAP models."""
 
+OPENCV_C2W: Convention = {
+    "flipped": Misreading(
+        "these look like OpenGL poses read as OpenCV",
+        "negate columns 1 and 2 (the camera's y and z axes) of every camera-to-world matrix",
+        _FLIP,
+    ),
+    "inverted": Misreading(
+        "these look like world-to-camera matrices read as camera-to-world",
+        "invert every matrix",
+        inverted=True,
+    ),
+    "inverted and flipped": Misreading(
+        "these look like OpenGL world-to-camera matrices read as OpenCV camera-to-world",
+        "invert every matrix, then negate its columns 1 and 2",
+        _FLIP,
+        inverted=True,
+    ),
+}
+"""OpenCV camera-to-world: cameras.json."""
+
 LLFF: Convention = {
     "OpenGL axes": Misreading(
         "these look like OpenGL poses (axes right, up, back), not LLFF's (down, right, back)",

@@ -11,11 +11,11 @@ from qgs.data.photos import READERS, Format, formats_of, read_listing
 from qgs.data.photos.reader import existing
 from qgs.data.photos.source import folder_name
 from qgs_datatools.candidates import Candidate, Photo
-from qgs_datatools.conventions import LLFF, OPENCV, OPENGL
+from qgs_datatools.conventions import LLFF, OPENCV, OPENCV_C2W, OPENGL
 from qgs_datatools.findings import Finding
 from qgs_datatools.sources import kind_of
 
-_POSES = {"opengl": OPENGL, "opencv": OPENCV, "llff": LLFF}
+_POSES = {"opengl": OPENGL, "opencv": OPENCV, "opencv c2w": OPENCV_C2W, "llff": LLFF}
 _CONVENTIONS = {reader.name: _POSES[reader.poses] for reader in READERS}
 
 
