@@ -38,6 +38,7 @@ def train(
     from qgs.engine.guard import TrainingError
     from qgs.engine.protocol import index_of
     from qgs.engine.training import train as train_model
+    from qgs.io.checkpoint import load_domain
 
     use_threads(threads)
     console = Console()
@@ -63,7 +64,10 @@ def train(
         elif finished and run.evaluation.exists():
             console.print(f"evaluated before, see {run.evaluation}")
         else:
-            evaluate_into(result.model, resolved, result.steps, run.evaluation, console)
+            trained_on = load_domain(run.checkpoint)
+            evaluate_into(
+                result.model, resolved, result.steps, run.evaluation, console, trained_on=trained_on
+            )
     if result.stopped_by:
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 
