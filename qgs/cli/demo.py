@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -58,34 +57,43 @@ def demo(
         raise ValueError("--seconds and --seed are for training: add --train")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
+    if not train and (
+        recipes := [name for name in given or () if name.endswith((".yaml", ".yml"))]
+    ):
+        raise ValueError(f"{recipes[0]} is a recipe, no folder of photos: add --train to train it")
     target, console = new_folder(out), Console()
     if train:
         _contest(given or RECIPES, 120 if seconds is None else seconds, seed or 0, target, device)
     else:
-        _show_trained(models or MODELS, given[0] if given else None, target, console, device)
+        _show_trained(models, given[0] if given else None, target, console, device)
 
 
 def _show_trained(
-    models: Sequence[str], photos: str | None, target: Path, console: Console, device: str
+    models: Sequence[str] | None, photos: str | None, target: Path, console: Console, device: str
 ) -> None:
     from qgs.cli import contest, trained
 
-    console.print("Reconstructing scenes that no model has seen", style="dim")
     try:
-        files = trained.checkpoints(models)
-        entries = trained.judge(files, photos, device)
+        files = trained.checkpoints(models or MODELS)
     except FileNotFoundError as error:
-        error.add_note("without trained models: qgs demo --train, which takes some minutes")
+        if models is None:
+            error.add_note("without trained models: qgs demo --train, which takes some minutes")
         raise
+    scenes = "Unseen scenes" if photos is None else "Your photos"
+    console.print(f"Reconstructing: {scenes.lower()}", style="dim")
+    entries = trained.judge(files, photos, device)
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
-    report = contest.report_of(entries, " on your photos" if photos else "", lede, {})
-    console.print(contest.table_of(entries))
-    if photos is not None:
-        told = trained.likeness(files, report.samples)
-        report = replace(report, facts={**report.facts, "Likeness": "; ".join(told)})
-        console.print("\n".join(told), soft_wrap=True, highlight=False, markup=False)
+    elif models is not None:
+        lede = "Trained models, judged on the test split of their recipe."
+    told = trained.likeness(files, entries[0].recipe) if photos is not None else []
+    facts = {"Training": trained.progress(files)}
+    report = contest.report_of(entries, lede, facts, scenes, told)
+    for sentence in told:
+        console.print(sentence, soft_wrap=True, highlight=False, markup=False)
+    console.print(contest.table_of(entries, scenes))
+    console.print(f"Training: {facts['Training']}", soft_wrap=True, highlight=False, style="dim")
     _write(report, entries, target, console)
 
 
@@ -109,7 +117,7 @@ def _contest(recipes: Sequence[str], seconds: float, seed: int, target: Path, de
         "Every model below was trained by the same command on the same scenes and is judged on "
         "scenes that it never saw."
     )
-    report = contest.report_of(entries, f", {seconds:g} seconds each", lede, facts)
+    report = contest.report_of(entries, lede, facts)
     _write(report, entries, target, console)
 
 
@@ -127,9 +135,12 @@ def _write(report: Report, entries: Sequence[Entry], target: Path, console: Cons
     for entry in entries:
         run = target / entry.contender.name
         files = [f"{run}/example.ply"]
-        if entry.contender.seconds is not None:
+        if entry.contender.curves is not None:
             files.insert(0, f"{run}/checkpoint.safetensors")
-        console.print(f"{run.name}: {', '.join(files)}")
+        console.print(f"{entry.contender.name}: {', '.join(files)}", soft_wrap=True)
+    console.print("Next:")
+    for command, what in report.commands.items():
+        console.print(f"  {command}  {what}", soft_wrap=True, highlight=False)
 
 
 def new_folder(out: Path | None) -> Path:

@@ -190,18 +190,15 @@ def chosen_scene(
     PLUGIN/NAME. Raises ValueError when there are several scenes and none is named, when none has
     the name, and for a recipe without data, which has no image size, when none is given.
     """
-    from qgs.contracts import SceneSourceConfig
     from qgs.data.recognition import open_for
     from qgs.data.sampling import training_frames
 
-    data = recipe.parts["data",].config if ("data",) in recipe.parts else None
-    trained = data if isinstance(data, SceneSourceConfig) else None
-    if trained is None and size is None:
+    if recipe.data_config is None and size is None:
         raise ValueError(
             "the checkpoint's recipe has no data, so its image size is not known; give it, "
             "such as --size 256x256"
         )
-    source, is_training_data = open_for(path, size, trained, sources)
+    source, is_training_data = open_for(path, size, recipe.data_config, sources)
     splits: tuple[Split, ...] = ("train", "test")
     places: dict[str, tuple[Split, int]] = {
         known: (split, place) for split in splits for place, known in enumerate(source.names(split))

@@ -14,9 +14,8 @@ OPACITY_USED = 1 / 255
 
 
 class Dispersion(Metric):
-    """Mean and median over Gaussians of the distance to the centroid of their token's (LocusGS).
-
-    The published figure is the mean; the median is not ruled by a few far ones.
+    """Dispersion, distance of Gaussians to the centroid of their query's: small where a query stands
+    for one place. A few far ones rule its mean, the published figure (LocusGS), not its median.
     """
 
     name: ClassVar[str] = "dispersion"

@@ -159,7 +159,9 @@ def test_every_difference_is_told_with_the_options_that_fit(learned: Tiny) -> No
         "model.head.norm: true (here false)",
     ):
         assert words in str(caught.value)
-    assert "queries" not in str(caught.value).split("to a multiple, the size of patches may differ")[1]
+    assert (
+        "queries" not in str(caught.value).split("to a multiple, the size of patches may differ")[1]
+    )
     assert same(model.state_dict(), before)
 
 
