@@ -46,7 +46,9 @@ def demo(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Trained models on rooms that none has seen, or on photos of yours; writes report.html.
+    """Trained models on rooms that none has seen, or on your photos; writes report.html.
+
+    Photos need camera poses, as Nerfstudio, COLMAP, Blender or LLFF write them.
 
     With --train: the tiny TokenGS and LocusGS, or the recipes that are named, trained on the same
     rooms and compared.
