@@ -118,11 +118,8 @@ def report_html(report: Report) -> str:
         for sample, depth in zip(report.samples, report.depths, strict=True)
     ]
     environment = page_environment(uri=data_uri, hex=hex_color)
-    return environment.get_template("report.html").render(
-        report=report,
-        scenes=scenes,
-        sections=sections,
-    )
+    template = environment.get_template("report.html")
+    return template.render(report=report, scenes=scenes, sections=sections)
 
 
 def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:

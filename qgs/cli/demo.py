@@ -115,10 +115,7 @@ def _contest(recipes: Sequence[str], seconds: float, seed: int, target: Path, de
             raise typer.Exit(1) from None
     console.print(contest.table_of(entries))
     facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}
-    lede = (
-        "Every model below was trained by the same command on the same scenes and is judged on "
-        "scenes that it never saw."
-    )
+    lede = "Trained by one command on the same scenes, judged on scenes that none of them saw."
     report = contest.report_of(entries, lede, facts)
     _write(report, entries, target, console)
 

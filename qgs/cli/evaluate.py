@@ -76,7 +76,6 @@ def evaluate(
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
-    from qgs.engine.guard import refuse_broken
     from qgs.io.checkpoint import load, load_recipe, load_step
     from qgs.io.models import is_own_path
 
@@ -92,7 +91,6 @@ def evaluate(
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
-    refuse_broken(model, checkpoint)
     folder = out or evaluation_folder(checkpoint, bool(settings), is_own_path(runs[0]))
     step = load_step(checkpoint)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch)

@@ -65,10 +65,7 @@ def diff(
     from qgs.composer import resolve
 
     resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
-    names = short_names([first, second])
-    if first == second:
-        names = [f"{names[0]} {letter}" for letter in "AB"]
-    for table in difference_tables(*resolved, *names):
+    for table in difference_tables(*resolved, *short_names([first, second])):
         Console().print(table)
 
 

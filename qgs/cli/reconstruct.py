@@ -98,7 +98,6 @@ def reconstruct(
     from qgs.data.domain import KEY, Domain, verdict
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
-    from qgs.engine.guard import refuse_broken
     from qgs.engine.tuning import tune as fit
     from qgs.engine.tuning import tuning_loss
     from qgs.io.checkpoint import load, load_extra, load_recipe
@@ -106,7 +105,6 @@ def reconstruct(
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
     model, recipe = load(file, device), load_recipe(file)
-    refuse_broken(model, file)
     if overrides:
         recipe = resolve(recipe.tree, overrides)
     registry, broken = load_sound_plugins()

@@ -22,10 +22,7 @@ WINDOWS = 6
 """Scenes, and windows of a scene, that are judged of a user's photos."""
 HOLDOUT = 8
 """Every n-th of a user's photos is held out; of fewer photos the middle one."""
-AUTO_SCALE = (
-    "Photos come in any unit of length, so each scene is scaled until what its cameras look at is "
-    "1 away (views.scale: auto)."
-)
+AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
@@ -66,21 +63,15 @@ def likeness(files: Mapping[str, Path], recipe: Recipe) -> list[str]:
 
     A sentence for all models alike, and one on the unit of length.
     """
-    found = domain_of(recipe)
+    found = Domain()
+    for sample in EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation).samples():
+        if isinstance(sample, Sample):  # a scene that failed is told with the figures
+            found.see(sample.inputs.cameras, sample.targets.cameras)
     told: dict[str, list[str]] = {}
     for name, file in files.items():
         told.setdefault(verdict(load_extra(file).get(KEY), found), []).append(name)
     sentences = [f"{', '.join(models)}: {sentence}." for sentence, models in told.items()]
     return [*sentences, AUTO_SCALE] if recipe.views.scale == "auto" else sentences
-
-
-def domain_of(recipe: Recipe) -> Domain:
-    """The domain of all views that `recipe` judges."""
-    found = Domain()
-    for sample in EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation).samples():
-        if isinstance(sample, Sample):  # a scene that failed is told with the figures
-            found.see(sample.inputs.cameras, sample.targets.cameras)
-    return found
 
 
 def _on_photos(recipe: Recipe, photos: str) -> Recipe:

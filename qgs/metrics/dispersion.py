@@ -14,8 +14,8 @@ OPACITY_USED = 1 / 255
 
 
 class Dispersion(Metric):
-    """Dispersion, distance of Gaussians to the centroid of their query's: small where a query stands
-    for one place. A few far ones rule its mean, the published figure (LocusGS), not its median.
+    """Dispersion, distance of Gaussians to the centroid of their query's: small where a query is
+    one place. A few far ones rule its mean, which LocusGS publishes, not its median.
     """
 
     name: ClassVar[str] = "dispersion"

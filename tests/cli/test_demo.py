@@ -12,7 +12,7 @@ from plyfile import PlyData
 import qgs
 from qgs.cli.contest import resolve_fairly
 from qgs.cli.demo import new_folder
-from qgs.cli.trained import WINDOWS, checkpoints, domain_of, judge
+from qgs.cli.trained import WINDOWS, checkpoints, judge, likeness
 from qgs.composer import resolve
 from qgs.data.domain import KEY, trained_domain
 from qgs.engine.guard import CollapseError
@@ -143,15 +143,12 @@ def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
     assert figures[0] == pytest.approx(figures[1], abs=1e-3)
 
 
-def test_the_sentence_on_photos_is_of_all_views_that_are_judged(models, tmp_path):
+def test_the_sentence_on_photos_is_of_all_views_that_are_judged(models, tmp_path, monkeypatch):
     files = checkpoints(models[1:2])
     (entry,) = judge(files, str(photos_in(tmp_path / "mine", 80, step=0.1)), "cpu")
-    seen = []
-    for score in entry.evaluation.scores:
-        seen += [inputs for inputs, _ in score.views]
-    assert len(seen) == WINDOWS
-    domain = domain_of(entry.recipe)
-    assert domain.samples == WINDOWS
+    assert sum(len(score.views) for score in entry.evaluation.scores) == WINDOWS
+    monkeypatch.setattr("qgs.cli.trained.verdict", lambda _, found: f"{found.samples} windows")
+    assert likeness(files, entry.recipe)[0] == f"few: {WINDOWS} windows."
 
 
 def test_models_of_one_file_name_are_all_shown(models, tmp_path):
