@@ -57,12 +57,10 @@ def demo(
         raise ValueError("--model names trained models; leave out --train, or name recipes")
     if not train and (seconds is not None or seed is not None):
         raise ValueError("--seconds and --seed are for training: add --train")
+    if not train and given and given[0].endswith((".yaml", ".yml")):
+        raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
-    if not train and (
-        recipes := [name for name in given or () if name.endswith((".yaml", ".yml"))]
-    ):
-        raise ValueError(f"{recipes[0]} is a recipe, no folder of photos: add --train to train it")
     target, console = new_folder(out), Console()
     if train:
         _contest(given or RECIPES, 120 if seconds is None else seconds, seed or 0, target, device)
@@ -78,7 +76,7 @@ def _show_trained(
     try:
         files = trained.checkpoints(models or MODELS)
     except FileNotFoundError as error:
-        if models is None:
+        if not models:
             error.add_note("without trained models: qgs demo --train, which takes some minutes")
         raise
     scenes = "Unseen scenes" if photos is None else "Your photos"
@@ -87,7 +85,7 @@ def _show_trained(
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
-    elif models is not None:
+    elif models:
         lede = "Trained models, judged on the test split of their recipe."
     told = trained.likeness(files, entries[0].recipe) if photos is not None else []
     facts = {"Training": trained.progress(files)}

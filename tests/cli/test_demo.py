@@ -178,7 +178,10 @@ def test_an_own_folder_of_recipes_comes_first(tmp_path, monkeypatch):
         (["--train", "--model", "rooms/locus-64"], "--model names trained models"),
         (["one", "two"], "one folder of photos is shown at a time, got one, two"),
         (["--model", "none.safetensors"], "no checkpoint at none.safetensors"),
-        (["recipes/tiny/locus.yaml"], "locus.yaml is a recipe, no folder of photos: add --train"),
+        (
+            ["recipes/tiny/locus.yaml", "b.yaml"],
+            "locus.yaml is a recipe, no folder of photos: add --train",
+        ),
     ],
 )
 def test_words_without_meaning_are_refused(words, told, tmp_path, monkeypatch):
