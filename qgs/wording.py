@@ -1,6 +1,8 @@
-"""Words that messages share."""
+"""Words that messages and tables share."""
 
-from collections.abc import Iterable
+import os
+import re
+from collections.abc import Iterable, Sequence
 
 
 def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
@@ -13,3 +15,16 @@ def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
 def numbered(frame: int, name: str) -> str:
     """A frame's number and its photo's name, such as "3 (images/0004.png)"; "3" without a name."""
     return f"{frame} ({name})" if name not in ("", str(frame)) else str(frame)
+
+
+def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Names of models or recipes, each another: what their folders share and suffixes left out.
+
+    One that comes again is numbered: `a/x.yaml`, `b/x.yaml` and that again are a/x, b/x, b/x (2).
+    """
+    files = [os.path.abspath(path) for path in paths]
+    shared = os.path.commonpath([os.path.dirname(file) for file in files])
+    suffix = r"\.(ya?ml|safetensors)$"
+    names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
+    before = [names[:index].count(name) for index, name in enumerate(names)]
+    return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]

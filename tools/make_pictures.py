@@ -20,7 +20,7 @@ from qgs.composer import resolve
 from qgs.data.evaluation import evaluation_samples
 from qgs.drawing.figures import INK
 from qgs.drawing.images import Picture, enlarged, rgb_picture, write_png
-from qgs.drawing.queries import notable_tokens, support_picture
+from qgs.drawing.queries import notable_queries, support_picture
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Prediction, Views
@@ -66,8 +66,8 @@ def anchors_on(
     views: Views,
 ) -> list[Picture]:
     """`pictures` washed out, with the anchors and the supports of OUTLINED queries upon them."""
-    tokens = notable_tokens(model, prediction.gaussians, views.cameras, OUTLINED)
-    colors = {token.query: token.color for token in tokens}
+    chosen = notable_queries(model, prediction.gaussians, views.cameras, OUTLINED)
+    colors = {query.index: query.color for query in chosen}
     support = model.queries.support(prediction.state)
     assert support is not None
     return [
@@ -117,8 +117,8 @@ def layers_picture(model: QueryGaussianModel, views: Views) -> Picture:
     with qgs.trace(model) as trace:
         model(views)
     states = [trace.layers[1].before, *(layer.after for layer in trace.layers.values())]
-    tokens = notable_tokens(model, prediction.gaussians, views.cameras, OUTLINED)
-    colors = {token.query: token.color for token in tokens}
+    chosen = notable_queries(model, prediction.gaussians, views.cameras, OUTLINED)
+    colors = {query.index: query.color for query in chosen}
     photo = enlarged(rgb_picture(views.images[0, 0]), SIDE)
     pictures = []
     for state in states:

@@ -1,7 +1,7 @@
 """report.html: what was trained and how it compares, in one self-contained page."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -24,12 +24,12 @@ from qgs.drawing.images import (
     side_by_side,
 )
 from qgs.drawing.queries import (
-    Token,
+    DrawnQuery,
     attention_pictures,
-    notable_tokens,
+    notable_queries,
     patch_maps,
+    query_picture,
     support_picture,
-    token_picture,
 )
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
@@ -40,7 +40,7 @@ from qgs.types import Prediction
 class Contender:
     """A trained model. scores: means of `Report.columns`. recipe: YAML.
 
-    seconds, curves: of its training; None for a model that was trained before.
+    about: what kind of model it is, in a sentence or two. curves: of a training for this report.
     """
 
     name: str
@@ -48,18 +48,19 @@ class Contender:
     scores: Mapping[str, float | None]
     gaussians: int
     parameters: int
-    seconds: float | None
-    curves: Curves | None
     recipe: str
+    about: str = ""
+    curves: Curves | None = None
 
 
 @dataclass(frozen=True)
 class Report:
     """A comparison of `contenders`, in order, by `columns`: each score and how it is shown.
 
-    baselines: by name, their scores on the same views. samples: the unseen scenes to picture.
-    depths: for each the true depth (T, 1, H, W) of its targets in the model's units, where known.
-    facts: what was run where. lede: what it shows, in a sentence or two.
+    baselines: by name, their scores on the same views. samples: the scenes to picture, `scenes` in
+    a heading. depths: for each the true depth (T, 1, H, W) of its targets in the model's units,
+    where known. facts: what was run where. lede: what it shows, in a sentence or two. notes: what
+    to know before the figures. meanings: of the columns. commands: what each does, to go on with.
     """
 
     columns: Mapping[str, Column]
@@ -70,10 +71,14 @@ class Report:
     depths: Sequence[Tensor | None]
     facts: Mapping[str, str]
     lede: str = ""
+    scenes: str = "Unseen scenes"
+    notes: Sequence[str] = ()
+    meanings: Sequence[str] = ()
+    commands: Mapping[str, str] = field(default_factory=dict)
 
 
 SIDE = 256  # pixels on the longer side of pictures that models render for show
-TOKENS = 5
+QUERIES = 5
 ANCHORS = 12
 ORBIT_FRAMES = 32
 TARGETS = 2  # target views of each scene that are shown
@@ -83,11 +88,11 @@ Shown = Sequence[tuple[Contender, Prediction]]
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture, or the frames of an animation. legend: tokens in it, in their colours."""
+    """A picture, or the frames of an animation. legend: queries in it, in their colours."""
 
     image: Picture | list[Picture]
     caption: str = ""
-    legend: Sequence[Token] = ()
+    legend: Sequence[DrawnQuery] = ()
 
 
 @dataclass(frozen=True)
@@ -106,18 +111,15 @@ def report_html(report: Report) -> str:
     first = report.samples[0]
     shown = [(c, c.model(first.inputs)) for c in report.contenders]
     # A new section of figures is a function that returns a ReportSection, and its name here.
-    sections = [make(shown, first) for make in (orbit, tokens, anchors, attention, training_curves)]
+    makers = (orbit, queries, anchors, attention, training_curves)
+    sections = [section for make in makers if (section := make(shown, first)).figures]
     scenes = [
         scene_columns(report.contenders, sample, depth)
         for sample, depth in zip(report.samples, report.depths, strict=True)
     ]
     environment = page_environment(uri=data_uri, hex=hex_color)
-    return environment.get_template("report.html").render(
-        report=report,
-        scenes=scenes,
-        sections=sections,
-        timed=all(contender.seconds is not None for contender in report.contenders),
-    )
+    template = environment.get_template("report.html")
+    return template.render(report=report, scenes=scenes, sections=sections)
 
 
 def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:
@@ -177,19 +179,19 @@ def orbit(shown: Shown, sample: Sample) -> ReportSection:
     )
 
 
-def tokens(shown: Shown, sample: Sample) -> ReportSection:
-    """The most notable tokens of each model, seen from the first target view."""
+def queries(shown: Shown, sample: Sample) -> ReportSection:
+    """The most notable queries of each model, seen from the first target view."""
     figures = []
     cameras = finer(sample.targets.cameras[:, :1], SIDE)
     for contender, prediction in shown:
-        chosen = notable_tokens(contender.model, prediction.gaussians, cameras, TOKENS)
-        picture = token_picture(contender.model, prediction.gaussians, chosen, cameras)
+        chosen = notable_queries(contender.model, prediction.gaussians, cameras, QUERIES)
+        picture = query_picture(contender.model, prediction.gaussians, chosen, cameras)
         figures.append(Tile(picture, contender.name, chosen))
     return ReportSection(
-        "What single tokens stand for",
-        "All Gaussians of five tokens in colour, over the scene in grey. Lines lead from each "
-        "Gaussian to the centroid of its token. The tokens are the heaviest in this view that also "
-        "stand apart from each other.",
+        "What single queries stand for",
+        "All Gaussians of five queries in colour, over the scene in grey. Lines lead from each "
+        "Gaussian to the centroid of those of its query. The queries are the heaviest well inside "
+        "this view that also stand apart from each other.",
         {"": figures},
     )
 
@@ -202,8 +204,8 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
     for contender, _ in shown:
         model = contender.model
         prediction = model(sample.inputs, layers=range(1, model.depth + 1))
-        chosen = notable_tokens(model, prediction.gaussians, camera, ANCHORS)
-        colors = {token.query: token.color for token in chosen}
+        chosen = notable_queries(model, prediction.gaussians, camera, ANCHORS)
+        colors = {query.index: query.color for query in chosen}
         states = {"learned start": model.queries(1)} | {
             f"after layer {number}": layer.state for number, layer in prediction.layers.items()
         }
@@ -223,14 +225,14 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
 
 
 def attention(shown: Shown, sample: Sample) -> ReportSection:
-    """Where the heaviest token looks in the input views: content, geometry, both; mean of heads."""
+    """Where the heaviest query looks in the input views: content, geometry, both; mean of heads."""
     figures: dict[str, list[Tile]] = {}
     photos = [enlarged(rgb_picture(i), SIDE // 2) for i in sample.inputs.images[0]]
     view = sample.targets.cameras[:, :1]
     for contender, prediction in shown:
         model = contender.model
-        (token,) = notable_tokens(model, prediction.gaussians, view, 1)
-        with trace(model, layers=[model.depth], queries=[token.query]) as record:
+        (drawn,) = notable_queries(model, prediction.gaussians, view, 1)
+        with trace(model, layers=[model.depth], queries=[drawn.index]) as record:
             model(sample.inputs)
         weights = record.layers[model.depth].cross_attention
         if weights is None or record.grid is None:
@@ -247,9 +249,9 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
                 figures.setdefault(contender.name, []).append(Tile(picture, caption))
     return ReportSection(
         "What one query reads",
-        "Cross-attention of the heaviest token over the patches of both input views in the last "
-        "layer, averaged over heads, dark to bright within each picture. A geometry bias, where "
-        "there is one, is added to the content logits before the softmax; what it hides is pale.",
+        "Cross-attention of the heaviest query over the patches of both input views in the last "
+        "layer, averaged over heads: strong colour is much. A geometry bias, where there is one, "
+        "is added to the content logits before the softmax; what it hides is pale.",
         figures,
         width=240,
     )
@@ -258,7 +260,5 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
 def training_curves(shown: Shown, sample: Sample) -> ReportSection:
     """Loss and PSNR against seconds for every model that was trained for this."""
     curves = {contender.name: contender.curves for contender, _ in shown if contender.curves}
-    if not curves:
-        return ReportSection("Training", "", {})
-    picture = figure_picture(curves_figure(curves), dpi=144)
-    return ReportSection("Training", "", {"": [Tile(picture)]}, width=600)
+    tiles = [Tile(figure_picture(curves_figure(curves), dpi=144))] if curves else []
+    return ReportSection("Training", "", {"": tiles} if tiles else {}, width=600)

@@ -1,6 +1,5 @@
 """`qgs bench`: size, latency and memory of models, as tables and as a JSON report."""
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
+from qgs.wording import short_names
 
 MEBIBYTE = 2**20
 TITLES = {
@@ -119,15 +119,6 @@ def _show(report: dict[str, Any], console: Console) -> None:
         sizes = [[f"{p[k] / MEBIBYTE:,.1f}" for k in ("peak_bytes", "idle_bytes")] for p in peaks]
         rows = [(*size, f"{p['ratio']:.3f}") for size, p in zip(sizes, peaks, strict=True)]
         table(f"memory: {TITLES[operation]}", ("peak, MiB", "before the model", "ratio"), rows)
-
-
-def short_names(paths: Sequence[str]) -> list[str]:
-    """Paths without shared folders and suffix; one that comes again is numbered."""
-    files = [Path(os.path.abspath(path)) for path in paths]
-    shared = os.path.commonpath([file.parent for file in files])
-    names = [file.relative_to(shared).with_suffix("").as_posix() for file in files]
-    before = [names[:index].count(name) for index, name in enumerate(names)]
-    return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
 def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from qgs.analysis.report import Contender, Report
 from qgs.composer import Recipe, resolve
+from qgs.composer.schema import summary_of
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
 from qgs.engine.evaluation import Evaluation, evaluate
@@ -23,8 +24,15 @@ from qgs.engine.training import train
 from qgs.io.ply import write_ply
 from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
+from qgs.wording import short_names
 
 PICTURED_SCENES = 3
+NEXT = {
+    "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
+    "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "makes a sharp scene of them",
+    "qgs recipes": "lists recipes, each a model to train or to change",
+}
+"""Commands that a reader of a report may want, and what they do."""
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 """Parts of recipes that must be equal, so that only the models differ."""
@@ -40,14 +48,13 @@ class Entry:
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
-    """Recipes by file name, under one time budget and seed.
+    """Recipes by short name, under one time budget and seed.
 
-    Raises ValueError when two files share a name, or differ in anything but the model and losses.
+    Raises ValueError when two files differ in anything but the model and losses.
     """
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
-    recipes = {file.stem: resolve(file, overrides) for file in files}
-    if len(recipes) < len(files):
-        raise ValueError(f"recipes are told apart by file name, got {[f.name for f in files]}")
+    names = short_names(files)
+    recipes = {name: resolve(f, overrides) for name, f in zip(names, files, strict=True)}
     first = next(iter(recipes))
     for name, recipe in recipes.items():
         refuse_unequal(name, recipe, first, recipes[first], (*JUDGED, *TRAINED))
@@ -73,8 +80,7 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
-    curves = curves_of(result.folder)
-    return entry_of(name, recipe, evaluation, result.model, result.seconds, curves)
+    return entry_of(name, recipe, evaluation, result.model, curves=curves_of(result.folder))
 
 
 def entry_of(
@@ -82,21 +88,28 @@ def entry_of(
     recipe: Recipe,
     evaluation: Evaluation,
     model: QueryGaussianModel,
-    seconds: float | None = None,
+    about: str = "",
     curves: Curves | None = None,
 ) -> Entry:
-    """A judged model, which moves to the CPU. seconds, curves: see `Contender`."""
+    """A judged model, which moves to the CPU. about, curves: see `Contender`."""
     contender = Contender(
         name=name,
         model=model.cpu(),
         scores=evaluation.means(),
         gaussians=evaluation.gaussians,
         parameters=sum(p.numel() for p in model.parameters()),
-        seconds=seconds,
-        curves=curves,
         recipe=yaml.safe_dump(dict(recipe.tree), sort_keys=False, allow_unicode=True),
+        about=about or _about(recipe),
+        curves=curves,
     )
     return Entry(recipe, contender, evaluation)
+
+
+def _about(recipe: Recipe) -> str:
+    """What the queries are and how they read the photos, in the words of these components."""
+    places = ("queries",), ("decoder", "layers", "0", "cross_attention")
+    chosen = [recipe.parts["model", *place] for place in places]
+    return " ".join(f"{part.type}: {summary_of(part.component)}" for part in chosen)
 
 
 def curves_of(folder: RunFolder) -> Curves:
@@ -111,16 +124,15 @@ def baselines(entry: Entry) -> dict[str, dict[str, float | None]]:
     return {n.replace("_", " ").capitalize(): entry.evaluation.means(n) for n in BASELINES}
 
 
-def table_of(entries: Sequence[Entry]) -> Table:
+def table_of(entries: Sequence[Entry], title: str = "Unseen scenes") -> Table:
     """The comparison as a table for the terminal."""
     rows = [entry.contender for entry in entries]
     columns = entries[0].evaluation.columns
-    table = Table(title="Unseen scenes", caption="best in green", box=box.SIMPLE_HEAD)
+    table = Table(title=title, caption="best in green", box=box.SIMPLE_HEAD)
     table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
     headings = [column.title for column in columns.values()]
-    timed = all(c.seconds is not None for c in rows)
-    for heading in (*headings, "Gaussians", "parameters", *["seconds"] * timed):
+    for heading in (*headings, "Gaussians", "parameters"):
         table.add_column(heading, justify="right")
     best = {name: column.best(c.scores[name] for c in rows) for name, column in columns.items()}
     for c in rows:
@@ -129,18 +141,22 @@ def table_of(entries: Sequence[Entry]) -> Table:
             score, cell = c.scores[name], column.shown(c.scores[name])
             is_best = score is not None and score == best[name]
             cells.append(f"[green]{cell}[/green]" if is_best else cell)
-        sizes = [f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M"]
-        sizes += [] if c.seconds is None else [f"{c.seconds:.0f}"]
-        table.add_row(c.name, *cells, *sizes)
+        table.add_row(c.name, *cells, f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M")
     table.add_section()
     for baseline, scores in baselines(entries[0]).items():
         cells = [column.shown(scores[name]) for name, column in columns.items()]
-        table.add_row(baseline, *cells, *["–"] * (2 + timed), style="dim")
+        table.add_row(baseline, *cells, "–", "–", style="dim")
     return table
 
 
-def report_of(entries: Sequence[Entry], title: str, lede: str, facts: Mapping[str, str]) -> Report:
-    """The comparison, pictured on the first PICTURED_SCENES test scenes; facts: more of them."""
+def report_of(
+    entries: Sequence[Entry],
+    lede: str,
+    facts: Mapping[str, str],
+    scenes: str = "Unseen scenes",
+    notes: Sequence[str] = (),
+) -> Report:
+    """The comparison, pictured on PICTURED_SCENES test scenes; the rest as in `Report`."""
     recipe = entries[0].recipe
     few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
     source = recipe.build_data()
@@ -153,8 +169,12 @@ def report_of(entries: Sequence[Entry], title: str, lede: str, facts: Mapping[st
         device = torch.cuda.get_device_name()
     return Report(
         columns=entries[0].evaluation.columns,
-        title=f"{' and '.join(entry.contender.name for entry in entries)}{title}",
+        title=f"{' and '.join(entry.contender.name for entry in entries)}: {scenes.lower()}",
         lede=lede,
+        scenes=scenes,
+        notes=notes,
+        meanings=[summary_of(p.component) for at, p in recipe.parts.items() if at[0] == "metrics"],
+        commands=NEXT,
         contenders=[entry.contender for entry in entries],
         baselines=baselines(entries[0]),
         samples=samples,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -47,7 +46,9 @@ def demo(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Trained models on rooms that none has seen, or on photos of yours; writes report.html.
+    """Trained models on rooms that none has seen, or on your photos; writes report.html.
+
+    Photos need camera poses, as Nerfstudio, COLMAP, Blender or LLFF write them.
 
     With --train: the tiny TokenGS and LocusGS, or the recipes that are named, trained on the same
     rooms and compared.
@@ -56,36 +57,43 @@ def demo(
         raise ValueError("--model names trained models; leave out --train, or name recipes")
     if not train and (seconds is not None or seed is not None):
         raise ValueError("--seconds and --seed are for training: add --train")
+    if not train and given and given[0].endswith((".yaml", ".yml")):
+        raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
     target, console = new_folder(out), Console()
     if train:
         _contest(given or RECIPES, 120 if seconds is None else seconds, seed or 0, target, device)
     else:
-        _show_trained(models or MODELS, given[0] if given else None, target, console, device)
+        _show_trained(models, given[0] if given else None, target, console, device)
 
 
 def _show_trained(
-    models: Sequence[str], photos: str | None, target: Path, console: Console, device: str
+    models: Sequence[str] | None, photos: str | None, target: Path, console: Console, device: str
 ) -> None:
     from qgs.cli import contest, trained
 
-    console.print("Reconstructing scenes that no model has seen", style="dim")
     try:
-        files = trained.checkpoints(models)
-        entries = trained.judge(files, photos, device)
+        files = trained.checkpoints(models or MODELS)
     except FileNotFoundError as error:
-        error.add_note("without trained models: qgs demo --train, which takes some minutes")
+        if not models:
+            error.add_note("without trained models: qgs demo --train, which takes some minutes")
         raise
+    scenes = "Unseen scenes" if photos is None else "Your photos"
+    console.print(f"Reconstructing: {scenes.lower()}", style="dim")
+    entries = trained.judge(files, photos, device)
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
-    report = contest.report_of(entries, " on your photos" if photos else "", lede, {})
-    console.print(contest.table_of(entries))
-    if photos is not None:
-        told = trained.remarks(entries)
-        report = replace(report, facts={**report.facts, "Remarks": "; ".join(told)})
-        console.print("\n".join(told), soft_wrap=True, highlight=False, markup=False)
+    elif models:
+        lede = "Trained models, judged on the test split of their recipe."
+    told = trained.remarks(entries) if photos is not None else []
+    facts = {"Training": trained.progress(files)}
+    report = contest.report_of(entries, lede, facts, scenes, told)
+    for sentence in told:
+        console.print(sentence, soft_wrap=True, highlight=False, markup=False)
+    console.print(contest.table_of(entries, scenes))
+    console.print(f"Training: {facts['Training']}", soft_wrap=True, highlight=False, style="dim")
     _write(report, entries, target, console)
 
 
@@ -105,11 +113,8 @@ def _contest(recipes: Sequence[str], seconds: float, seed: int, target: Path, de
             raise typer.Exit(1) from None
     console.print(contest.table_of(entries))
     facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}
-    lede = (
-        "Every model below was trained by the same command on the same scenes and is judged on "
-        "scenes that it never saw."
-    )
-    report = contest.report_of(entries, f", {seconds:g} seconds each", lede, facts)
+    lede = "Trained by one command on the same scenes, judged on scenes that none of them saw."
+    report = contest.report_of(entries, lede, facts)
     _write(report, entries, target, console)
 
 
@@ -127,9 +132,12 @@ def _write(report: Report, entries: Sequence[Entry], target: Path, console: Cons
     for entry in entries:
         run = target / entry.contender.name
         files = [f"{run}/example.ply"]
-        if entry.contender.seconds is not None:
+        if entry.contender.curves is not None:
             files.insert(0, f"{run}/checkpoint.safetensors")
-        console.print(f"{run.name}: {', '.join(files)}")
+        console.print(f"{entry.contender.name}: {', '.join(files)}", soft_wrap=True)
+    console.print("Next:")
+    for command, what in report.commands.items():
+        console.print(f"  {command}  {what}", soft_wrap=True, highlight=False)
 
 
 def new_folder(out: Path | None) -> Path:

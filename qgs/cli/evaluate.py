@@ -77,7 +77,6 @@ def evaluate(
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
-    from qgs.engine.guard import refuse_broken
     from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
 
     use_threads(threads)
@@ -92,7 +91,6 @@ def evaluate(
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
-    refuse_broken(model, checkpoint)
     own = Path(runs[0]).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     step = load_step(checkpoint)

@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from qgs.cli.options import Overrides
+from qgs.wording import short_names
 
 
 def list_components(
@@ -27,12 +28,6 @@ def list_components(
         Console().print(part, highlight=False)
     for message in broken:
         Console(stderr=True).print(f"plugin left out: {message}", markup=False)
-    for installed in registry.plugins.values():
-        for model, file in installed.models.items():
-            if not file.is_file():
-                fix = f"install {installed.released_as} again"
-                message = f"the file of the model {model} is missing: {file}; {fix}"
-                Console(stderr=True).print(message, markup=False, soft_wrap=True)
 
 
 def compose(
@@ -70,10 +65,7 @@ def diff(
     from qgs.composer import resolve
 
     resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
-    names = [path.name if first.name != second.name else str(path) for path in (first, second)]
-    if first == second:
-        names = [f"{first.name} {letter}" for letter in "AB"]
-    for table in difference_tables(*resolved, *names):
+    for table in difference_tables(*resolved, *short_names([first, second])):
         Console().print(table)
 
 

@@ -14,7 +14,8 @@ from qgs.composer.registry import Registry, default_config
 from qgs.composer.schema import recipe_schema
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
 from qgs.composer.yaml_text import inline
-from qgs.contracts import Component, ShippedModel
+from qgs.contracts import Component
+from qgs.io.models import about, card_of, checkpoint_path
 
 Schema = Mapping[str, Any]
 
@@ -35,26 +36,21 @@ def overview(registry: Registry) -> Iterator[Table]:
         yield table
     table = Table("name", "meaning", "origin", title="trained models", title_justify="left")
     table.columns[1].overflow = "fold"
-    for name, (model, file, release) in _models(registry).items():
-        gone = "" if file.is_file() else " (its file is missing)"
-        table.add_row(*map(escape, (name, model.summary + gone, release)))
-    if table.row_count:
+    for name, file in (models := _models(registry)).items():
+        table.add_row(*map(escape, (name, about(file), _release(name, registry))))
+    if models:
         yield table
 
 
-def _models(registry: Registry) -> dict[str, tuple[ShippedModel, Path, str]]:
-    """By PLUGIN/NAME: every shipped model, its file, and what it came with."""
-    return {
-        f"{plugin}/{name}": (model, installed.models[f"{plugin}/{name}"], installed.released_as)
-        for plugin, installed in registry.plugins.items()
-        for name, model in installed.plugin.models.items()
-    }
+def _models(registry: Registry) -> dict[str, Path]:
+    """The file of every shipped model by PLUGIN/NAME."""
+    return {k: file for known in registry.plugins.values() for k, file in known.models.items()}
 
 
 def details(name: str, registry: Registry) -> Iterator[Group]:
     """The options of a component (`qgs/latent`), of all in a slot, or of a section of settings.
 
-    Of a trained model what it is and its file.
+    Of a trained model its file and its card.
 
     `recipe` stands for the settings at the top of a recipe. Raises ValueError for other names.
     """
@@ -68,10 +64,10 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
         yield Group(f"[bold]{name}[/bold]", escape(about), _options(options))
         return
     if name in (models := _models(registry)):
-        model, file, release = models[name]
-        there = f"{file.stat().st_size / 1e6:.1f} MB" if file.is_file() else "MISSING"
-        yield Group(f"[bold]{name}[/bold], {escape(release)}", escape(model.summary))
-        yield Group(escape(f"{file}: {there}"))
+        file = checkpoint_path(name)
+        size = f"{file}: {file.stat().st_size / 1e6:.1f} MB"
+        heading = f"[bold]{escape(name)}[/bold], {escape(_release(name, registry))}"
+        yield Group(heading, escape(size), "", escape(card_of(file)))
         return
     slot = name.removeprefix("model.").removeprefix("decoder.")
     shown = [

@@ -47,61 +47,40 @@ def distribution_of(name: str) -> str:
 
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
+    for refused, reason in _refusals(name):
+        if refused:
+            raise ValueError(f"`{name}` {reason}")
+
+
+def _refusals(name: str) -> Iterator[tuple[object, str]]:
+    """Whether something speaks against `name`, and what; each asked where nothing before does."""
     from qgs.composer.errors import Problems
     from qgs.composer.yaml_text import load_mapping
 
-    if not NAME.fullmatch(name):
-        letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-        near = re.sub(r"[^a-z0-9]+", "-", letters.lower()).lstrip("-0123456789").rstrip("-")
-        meant = f"; did you mean `{near}`?" if NAME.fullmatch(near) else ""
-        raise ValueError(
-            f"`{name}` is no name of a plugin: lower-case letters and digits, beginning with a "
-            f"letter, words joined by single hyphens or underscores{meant}"
-        )
-    if len(name) > LONGEST_NAME:
-        raise ValueError(
-            f"`{name}` has {len(name)} characters; a plugin's name has {LONGEST_NAME} at most"
-        )
-    if name == "qgs" or name.startswith(("qgs-", "qgs_")):
-        raise ValueError(
-            f"`{name}` begins like the framework's own name; the distribution is called "
-            "qgs-NAME anyway, so leave `qgs` out"
-        )
-    if name in WINDOWS_DEVICES:
-        raise ValueError(
-            f"`{name}` is the name of a device on Windows, where no file can have it; choose "
-            f"another, such as `{name}-things`"
-        )
-    module = name.replace("-", "_")
-    if keyword.iskeyword(module):
-        raise ValueError(
-            f"`{name}` is a word of Python's own, which no module or variable can be called; "
-            f"choose another, such as `{name}-things`"
-        )
-    if module in sys.stdlib_module_names or module in packages_distributions():
-        of = ", ".join(dict.fromkeys(packages_distributions().get(module, ["Python itself"])))
-        raise ValueError(
-            f"`{name}` is the name of a package that is installed here ({of}), so nobody could "
-            f"tell the two apart; choose another, such as `{name}-things`"
-        )
+    letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    near = re.sub(r"[^a-z0-9]+", "-", letters.lower()).lstrip("-0123456789").rstrip("-")
+    meant = f"; did you mean `{near}`?" if NAME.fullmatch(near) else ""
+    form = "lower-case letters and digits, a letter first, words joined by single hyphens or _"
+    yield not NAME.fullmatch(name), f"is no name of a plugin: {form}{meant}"
+    yield len(name) > LONGEST_NAME, f"has {len(name)} characters; {LONGEST_NAME} are the most"
+    own = "begins like the framework's own name; its distribution is qgs-NAME, leave `qgs` out"
+    yield re.match(r"qgs([-_]|$)", name), own
+    other = f"choose another, such as `{name}-things`"
+    yield name in WINDOWS_DEVICES, f"is the name of a device on Windows, and no file's; {other}"
+    module, packages = name.replace("-", "_"), packages_distributions()
+    yield keyword.iskeyword(module), f"is a word of Python's own, and no module's; {other}"
+    of = ", ".join(dict.fromkeys(packages.get(module, ["Python itself"])))
+    taken = module in sys.stdlib_module_names or module in packages
+    yield taken, f"is the name of a package that is installed here ({of}); {other}"
     (value,) = load_mapping(f"name: {name}", name, Problems()).values()
-    if value != name:
-        raise ValueError(
-            f"`{name}` in a recipe's `plugins: [{name}]` would be read as {value!r} and not as a "
-            f"name; choose another, such as `{name}-things`"
-        )
+    yield value != name, f"would be read as {value!r} in a recipe's `plugins: [{name}]`; {other}"
     for entry in entry_points(group="qgs.plugins", name=name):
-        raise ValueError(
-            f"the name `{name}` is taken by {entry.dist.name if entry.dist else 'a plugin'}, which "
-            "is installed; of two plugins with one name qgs uses neither, so choose another"
-        )
+        owner = entry.dist.name if entry.dist else "a plugin"
+        yield True, f"is taken by {owner}, and of two plugins qgs would use neither; {other}"
     with suppress(PackageNotFoundError):
-        installed = distribution(distribution_of(name))
-        raise ValueError(
-            f"a plugin `{name}` would be the distribution {distribution_of(name)}, and "
-            f"{installed.name} {installed.version} is installed, which it would replace; choose "
-            "another name"
-        )
+        there = distribution(distribution_of(name))
+        replaced = f"{there.name} {there.version} is installed, which it would replace"
+        yield True, f"would be the distribution {distribution_of(name)}; {replaced}; {other}"
 
 
 def write_plugin(name: str, folder: Path) -> None:

@@ -1,6 +1,5 @@
 """`qgs recipes`: the recipes that come with qgs, and copies of them to change."""
 
-from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
@@ -22,9 +21,9 @@ def recipes(
     A file of that name in the working directory comes first.
     """
     from qgs.composer.errors import did_you_mean
-    from qgs.composer.files import recipe_folder
+    from qgs.composer.files import files_of, recipe_folder
 
-    home = recipe_folder()
+    home = recipe_folder().resolve()
     known = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
     if name is None and out is None:
         width = max(map(len, known), default=0)
@@ -37,8 +36,7 @@ def recipes(
     if out is None:
         typer.echo(known[name].read_text(encoding="utf-8"), nl=False)
         return
-    copies = {out / path.relative_to(home): path for path in _with_bases(known[name])}
-    _copy(copies)
+    _copy({out / path.relative_to(home): path for path in files_of(known[name])})
 
 
 def _first_comment(path: Path) -> str:
@@ -46,24 +44,6 @@ def _first_comment(path: Path) -> str:
     lines = path.read_text(encoding="utf-8").splitlines()
     comment = takewhile(lambda line: line.startswith("#"), lines)
     return " ".join(line.lstrip("# ") for line in comment).partition(". ")[0].rstrip(".")
-
-
-def _with_bases(path: Path) -> Iterator[Path]:
-    """A recipe and the files that it extends, each once."""
-    import yaml
-
-    from qgs.composer.files import found_recipe
-
-    seen, waiting = set[Path](), [path]
-    while waiting:
-        file = waiting.pop()
-        if file in seen:
-            continue
-        seen.add(file)
-        yield file
-        bases = yaml.safe_load(file.read_text(encoding="utf-8")).get("extends") or []
-        names = [bases] if isinstance(bases, str) else bases
-        waiting += [found_recipe((file.parent / name).resolve(), name).resolve() for name in names]
 
 
 def _copy(copies: dict[Path, Path]) -> None:

@@ -99,7 +99,6 @@ def reconstruct(
     from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
-    from qgs.engine.guard import refuse_broken
     from qgs.engine.tuning import tune as fit
     from qgs.engine.tuning import tuning_loss
     from qgs.io.checkpoint import load, load_domain, load_recipe
@@ -107,7 +106,6 @@ def reconstruct(
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
     model, recipe, trained = load(file, device), load_recipe(file), load_domain(file)
-    refuse_broken(model, file)
     if overrides:
         recipe = resolve(recipe.tree, overrides)
     registry, broken = load_sound_plugins()
@@ -194,18 +192,15 @@ def chosen_scene(
     PLUGIN/NAME. Raises ValueError when there are several scenes and none is named, when none has
     the name, and for a recipe without data, which has no image size, when none is given.
     """
-    from qgs.contracts import SceneSourceConfig
     from qgs.data.recognition import open_for
     from qgs.data.sampling import training_frames
 
-    data = recipe.parts["data",].config if ("data",) in recipe.parts else None
-    trained = data if isinstance(data, SceneSourceConfig) else None
-    if trained is None and size is None:
+    if recipe.data_config is None and size is None:
         raise ValueError(
             "the checkpoint's recipe has no data, so its image size is not known; give it, "
             "such as --size 256x256"
         )
-    source, is_training_data = open_for(path, size, trained, sources)
+    source, is_training_data = open_for(path, size, recipe.data_config, sources)
     splits: tuple[Split, ...] = ("train", "test")
     places: dict[str, tuple[Split, int]] = {
         known: (split, place) for split in splits for place, known in enumerate(source.names(split))

@@ -1,27 +1,30 @@
 """Judging trained models, side by side, on the data of their recipe or on a user's photos."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from qgs.cli import contest
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_sound_plugins
-from qgs.contracts import SceneSource, SceneSourceConfig
+from qgs.contracts import SceneSource
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import checkpoint_of
-from qgs.io.checkpoint import load, load_domain, load_recipe
+from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
+from qgs.io.models import about
+from qgs.wording import short_names
 
 WINDOWS = 6
 """Scenes, and windows of a scene, that are judged of a user's photos."""
 HOLDOUT = 8
 """Every n-th of a user's photos is held out; of fewer photos the middle one."""
+AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
     """The files of the models `names` (see `checkpoint_of`), by short name."""
-    return {_label(name): checkpoint_of(name) for name in names}
+    return dict(zip(short_names(names), map(checkpoint_of, names), strict=True))
 
 
 def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[contest.Entry]:
@@ -39,31 +42,39 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
     for name, recipe in recipes.items():
         model = load(files[name], choose_device(device))
         evaluation = evaluate(model, recipe, trained_on=trained[name])
-        entries.append(contest.entry_of(name, recipe, evaluation, model))
+        entries.append(contest.entry_of(name, recipe, evaluation, model, about(files[name])))
     return entries
 
 
 def remarks(entries: Sequence[contest.Entry]) -> list[str]:
-    """What is to be said of the models' results, each sentence once."""
+    """What is to be said of results on photos, each sentence once."""
     told: dict[str, list[str]] = {}
     for entry in entries:
         for sentence in entry.evaluation.remarks:
             told.setdefault(sentence, []).append(entry.contender.name)
-    return [f"{', '.join(models)}: {sentence}" for sentence, models in told.items()]
+    sentences = [f"{', '.join(models)}: {sentence}." for sentence, models in told.items()]
+    return [*sentences, AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else sentences
 
 
-def _label(name: str) -> str:
-    """`locus-64` of rooms/locus-64 and of models/locus-64.safetensors; a run's own name."""
-    return PurePosixPath(name).name.removesuffix(".safetensors")
+def progress(files: Mapping[str, Path]) -> str:
+    """How far the training of each model in `files` has come, of the steps of its recipe."""
+    told = []
+    for name, file in files.items():
+        step, training = load_step(file), load_recipe(file).training
+        of = "" if training.seconds else f" of {training.steps:,}"
+        told.append(f"{name}: " + ("not known" if step is None else f"step {step:,}{of}"))
+    return "; ".join(told)
 
 
 def _on_photos(recipe: Recipe, photos: str) -> Recipe:
-    """`recipe` with the data at `photos`, some of them held out, in place of its own."""
+    """`recipe` with the data at `photos`, some of them held out, in place of its own.
+
+    Data that it was not trained on has a unit of its own, so a constant `views.scale` becomes auto.
+    """
     registry, _ = load_sound_plugins()
     sources = registry.components("data")
-    trained = recipe.parts["data",].config if ("data",) in recipe.parts else None
-    known = trained if isinstance(trained, SceneSourceConfig) else None
-    source, _ = open_for(photos, None, known, sources)
+    source, own = open_for(photos, None, recipe.data_config, sources)
+    views = {} if own or recipe.views.scale != "constant" else {"scale": "auto"}
     kind = next(name for name, component in sources.items() if component is type(source))
     options = source.config.model_dump(mode="json")
     if options.get("holdout") == 0:
@@ -73,6 +84,7 @@ def _on_photos(recipe: Recipe, photos: str) -> Recipe:
         "data": {"type": kind, **options},
         "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{kind.split("/")[0]} - {"qgs"}])],
         "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
+        "views": {**recipe.tree["views"], **views},
     }
     return resolve(tree)
 

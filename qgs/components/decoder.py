@@ -21,7 +21,7 @@ from qgs.types import ImageMemory, QueryState
 
 
 class ContentCrossAttention(CrossAttention):
-    """softmax(q k / sqrt(d)) v over all image tokens."""
+    """By content alone: softmax(q k / sqrt(d)) v over all image tokens."""
 
     name: ClassVar[str] = "content"
 

@@ -122,6 +122,8 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
     except MissingExtraError:
         raise
     except Exception as error:
+        if is_out_of_memory(error):  # no fault of the component
+            raise
         users_mistake = isinstance(error, ValueError | OSError) and issubclass(
             component, SceneSource | Optimizer
         )
@@ -149,7 +151,8 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
 def _too_large(error: Exception) -> bool:
     """Whether torch or Python refused the size of a tensor; torch has no type for that."""
-    return is_out_of_memory(error) or "overflow" in str(error).lower()
+    words = "Storage size calculation overflowed", "Overflow when unpacking"
+    return isinstance(error, OverflowError) or any(word in str(error) for word in words)
 
 
 def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:

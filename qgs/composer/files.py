@@ -112,12 +112,20 @@ def read_recipe(
     return MapNode(origin)
 
 
+def files_of(recipe: Path) -> list[Path]:
+    """A recipe file and all that it extends, each once, links resolved; raises RecipeError."""
+    files = _Files(problems := Problems(), Count())
+    files.read(recipe, (), None)
+    problems.raise_any()
+    return [Path(place) for place in files.trees]
+
+
 class _Files:
-    """Reads the files of one recipe, each once, whatever extends it."""
+    """Reads the files of one recipe, each once, whatever extends it. trees: by resolved path."""
 
     def __init__(self, problems: Problems, count: Count) -> None:
         self._problems, self._count = problems, count
-        self._trees: dict[str, MapNode] = {}
+        self.trees: dict[str, MapNode] = {}
         self._bytes = self._followed = 0
 
     def read(self, file: Path, chain: tuple[Path, ...], extended_at: Origin | None) -> MapNode:
@@ -128,8 +136,8 @@ class _Files:
         origin = Origin(str(file))
         try:
             place = os.path.realpath(file)
-            if place in self._trees:
-                return self._trees[place]
+            if place in self.trees:
+                return self.trees[place]
             text = self._text(file)
         except UnicodeDecodeError:
             self._problems.stop(origin, "", "the file is no UTF-8 text", "save it as UTF-8")
@@ -143,13 +151,17 @@ class _Files:
             self._problems.stop(extended_at or origin, option, reason, fix)
             return MapNode(origin)
         node = load_mapping(text, str(file), self._problems, self._count)
-        self._trees[place] = self.with_bases(node, file.parent, (*chain, file))
-        return self._trees[place]
+        self.trees[place] = self.with_bases(node, file.parent, (*chain, file))
+        return self.trees[place]
 
     def _text(self, file: Path) -> str:
         """Raises OSError, ValueError; nothing but a regular file is opened."""
-        if not stat.S_ISREG(file.stat().st_mode):
-            raise OSError(errno.EINVAL, "it is a folder or a device, no regular file")
+        mode = file.stat().st_mode
+        if stat.S_ISDIR(mode):
+            what = "it is a folder; a recipe is a .yaml file, of a run its recipe.yaml"
+            raise OSError(errno.EISDIR, what)
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "it is a device or a pipe, no regular file")
         with file.open("rb") as stream:
             written = stream.read(MAX_BYTES + 1 - self._bytes)
         self._bytes += len(written)

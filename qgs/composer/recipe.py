@@ -50,6 +50,12 @@ class Recipe:
     plugin_versions: Mapping[str, str]
 
     @property
+    def data_config(self) -> contracts.SceneSourceConfig | None:
+        """The options of its data source; None without one, or where that has other options."""
+        config = self.parts["data",].config if ("data",) in self.parts else None
+        return config if isinstance(config, contracts.SceneSourceConfig) else None
+
+    @property
     def warnings(self) -> list[str]:
         """What works and is probably not what was meant, a sentence each."""
         return list(idle_fields(self.parts))

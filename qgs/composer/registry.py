@@ -23,7 +23,7 @@ from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
 from qgs.composer.slots import SLOTS
 from qgs.contracts import Component, ComponentConfig, Metric, OptionError, Renderer, WeightLayout
-from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin, ShippedModel
+from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 
 BUILTIN = Plugin(
     name="qgs",
@@ -73,7 +73,7 @@ class InstalledPlugin:
     def models(self) -> dict[str, Path]:
         """`PLUGIN/NAME` of every model that it ships to its file, which may be missing."""
         models = self.plugin.models.items()
-        return {f"{self.plugin.name}/{name}": self.folder / model.file for name, model in models}
+        return {f"{self.plugin.name}/{name}": self.folder / file for name, file in models}
 
     def repair(self, place: str) -> str:
         """What its user can do about a fault. place: FILE:LINE of it."""
@@ -238,9 +238,9 @@ def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
             return
     if not plugin.components and not plugin.layouts and not plugin.models:
         yield "is empty: it lists no `components`, `layouts` or `models`"
-    for name, model in plugin.models.items():
-        if not isinstance(model, ShippedModel) or not re.fullmatch(r"[^\s/]+", str(name)):
-            yield f"ships {name!r}: {model!r}; models are ShippedModel by names without / and blank"
+    for model, file in plugin.models.items():
+        if not isinstance(file, str) or not re.fullmatch(r"[^\s/]+", str(model)):
+            yield f"ships {model!r}: {file!r}; models are file names by names without / and blank"
     taken: set[tuple[str, str]] = set()
     for component in plugin.components:
         fault = component_fault(component)

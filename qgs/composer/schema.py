@@ -44,7 +44,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
         "model": _section(("model",), parts | {"decoder": decoder}),
     }
     for name, section in SECTIONS.items():
-        description, component = _summary(SLOTS[name].contract), {"anyOf": [_ref(name), _NULL]}
+        description, component = summary_of(SLOTS[name].contract), {"anyOf": [_ref(name), _NULL]}
         if section.named:
             description = f"By name: {description}"
             component = {"type": "object", "additionalProperties": component}
@@ -60,7 +60,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
     """The options of `component`, and the `type` that chooses it."""
-    description, schema = _summary(component), _settings(component.Config)
+    description, schema = summary_of(component), _settings(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
     return schema | {"description": description, "properties": properties}
 
@@ -92,13 +92,13 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
 
 
 def _component(slot: str) -> dict[str, Any]:
-    return _ref(slot) | {"description": _summary(SLOTS[slot].contract)}
+    return _ref(slot) | {"description": summary_of(SLOTS[slot].contract)}
 
 
 def _ref(slot: str) -> dict[str, Any]:
     return {"$ref": f"#/$defs/{slot}"}
 
 
-def _summary(described: type) -> str:
+def summary_of(described: type) -> str:
     """The first paragraph of a docstring, on one line."""
     return " ".join((inspect.getdoc(described) or "").split("\n\n")[0].split())

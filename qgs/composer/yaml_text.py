@@ -40,12 +40,12 @@ class Yaml12Loader(yaml.SafeLoader):
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
-        self._nesting, self._count = 0, Count()
+        self._nesting = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """PyYAML's, refusing what would overflow the stack of whoever walks the tree."""
         with sized(self.peek_event().start_mark):
-            self._count.one(self._nesting)
+            Count().one(self._nesting)  # its depth alone: values are counted by _Reader
         self._nesting += 1
         node = super().compose_node(parent, index)
         self._nesting -= 1

@@ -27,7 +27,7 @@ from qgs.contracts.head import Centers, Head
 from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
 from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
-from qgs.contracts.plugin import CONTRACT_VERSION, Expected, ExpectedError, Plugin, ShippedModel
+from qgs.contracts.plugin import CONTRACT_VERSION, Expected, ExpectedError, Plugin
 from qgs.contracts.queries import Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
@@ -73,7 +73,6 @@ __all__ = [
     "SceneSource",
     "SceneSourceConfig",
     "SelfAttention",
-    "ShippedModel",
     "Split",
     "Supervision",
     "TrainingConfig",

@@ -30,18 +30,6 @@ Expected: TypeAlias = str | ExpectedError
 
 
 @dataclass(frozen=True)
-class ShippedModel:
-    """A trained model that travels with a plugin.
-
-    file: the checkpoint, relative to the folder of the module that the entry point names, such as
-    models/mine.safetensors. summary: what it was trained on and for, in a sentence.
-    """
-
-    file: str
-    summary: str
-
-
-@dataclass(frozen=True)
 class Plugin:
     """Components under one name. Importing it has no side effect.
 
@@ -50,7 +38,9 @@ class Plugin:
     components: component classes; a `name` is unique within its slot.
     layouts: weights that other codebases publish and these components can load.
     examples: options that `qgs check-plugin` tries besides the defaults of every component.
-    models: trained models by name; PLUGIN/NAME stands for the checkpoint's path in every command.
+    models: files of trained models by name, relative to the folder of the module that the entry
+        point names; PLUGIN/NAME stands for the path in every command. A card beside the file tells
+        what the model is: models/mine.md for models/mine.safetensors.
     exemptions: checks of `qgs.testing` that a component is known to fail, and why; by class, or by
         options where it passes with others.
     """
@@ -60,7 +50,7 @@ class Plugin:
     components: Sequence[type[Component]]
     layouts: Sequence[WeightLayout] = ()
     examples: Sequence[ComponentConfig] = ()
-    models: Mapping[str, ShippedModel] = field(default_factory=dict)
+    models: Mapping[str, str] = field(default_factory=dict)
     exemptions: Mapping[type[Component] | ComponentConfig, Mapping[str, Expected]] = field(
         default_factory=dict
     )

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from einops import rearrange
-from matplotlib import colormaps
 from PIL import Image, ImageDraw
 from torch import Tensor
 
@@ -17,8 +16,9 @@ from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, SpatialSupport
 
-ATTENTION_MAP = "magma"
+ATTENTION_COLOR = categorical(0)
 OVERSAMPLING = 3
+MARGIN = 0.15  # of a picture along its border, where no query is chosen to be shown
 OUTLINE_POINTS = 96
 
 
@@ -93,8 +93,8 @@ def support_picture(
             draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
         if ellipses.depths[index] > 0:
             center = (ellipses.points[index] * scale).clamp(-1e5, 1e5).tolist()
-            radius = (3.0 if color else 1.5) * OVERSAMPLING
-            draw.circle(center, radius, fill=(*(color or INK), 190))
+            size, rim = (4.0, (255, 255, 255, 255)) if color else (1.4, None)
+            draw.circle(center, size * OVERSAMPLING, (*(color or INK), 220), rim, OVERSAMPLING)
     return _reduced(image)
 
 
@@ -108,7 +108,7 @@ def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
 
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
-    """Each photo in pale grey with its map on top; the views share one colour scale.
+    """Each photo in pale grey, coloured by its map; the views share one scale.
 
     Tokens without a score (NaN) have the colour of nothing.
     """
@@ -120,19 +120,19 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
     for photo, shade, unseen in zip(photos, shades, hidden, strict=True):
         size = photo.shape[1::-1]
         patches = Image.fromarray((shade * 255).round().astype(np.uint8))
-        cells = np.asarray(patches.resize(size, Image.Resampling.NEAREST)) / 255
-        color = colormaps[ATTENTION_MAP](cells)[..., :3] * 255
-        color[np.asarray(Image.fromarray(unseen).resize(size, Image.Resampling.NEAREST))] = NOTHING
-        mixed = 0.72 * color + 0.28 * washed(photo, 0.2)
+        cells = np.asarray(patches.resize(size, Image.Resampling.NEAREST))[..., None]
+        opaque = 0.9 * cells / 255
+        mixed = opaque * np.array(ATTENTION_COLOR) + (1 - opaque) * washed(photo, 0.4)
+        mixed[np.asarray(Image.fromarray(unseen).resize(size, Image.Resampling.NEAREST))] = NOTHING
         pictures.append(mixed.round().astype(np.uint8))
     return pictures
 
 
 @dataclass(frozen=True)
-class Token:
-    """A query. weight: sum of blending, pixels. spread: mean distance to centroid, world units."""
+class DrawnQuery:
+    """A query by its index. weight: sum of blending, pixels. spread: mean distance to centroid."""
 
-    query: int
+    index: int
     color: Color
     weight: float
     spread: float
@@ -147,39 +147,47 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
     return gradient.mean(-1)
 
 
-def notable_tokens(
+def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
-) -> list[Token]:
-    """`count` of the heaviest eighth of tokens that stand apart in cameras (1, V), in order."""
+) -> list[DrawnQuery]:
+    """`count` queries to show in cameras (1, V): heavy, well inside the first view, and apart."""
     queries = model.queries.count
-    weights_G = rendered_weights(model, gaussians, cameras)[0]
+    weights_G = rendered_weights(model, gaussians, cameras)[0].cpu()
     weights_NK = rearrange(weights_G, "(n k) -> n k", n=queries)
-    means_NK3 = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries)
-    weights = weights_NK.sum(1)
-    candidates = weights.topk(min(max(queries // 8, 2 * count), queries)).indices
-    share_CK = weights_NK[candidates] / weights[candidates, None].clamp_min(1e-12)
-    centres = _pixels((means_NK3[candidates] * share_CK[..., None]).sum(1), cameras[:, :1])
-    chosen, distance = [0], (centres - centres[0]).norm(dim=-1)
-    while len(chosen) < min(count, len(centres)):
-        chosen.append(int(distance.argmax()))
-        distance = torch.minimum(distance, (centres - centres[chosen[-1]]).norm(dim=-1))
-    tokens = []
-    for rank, query in enumerate(candidates[chosen].tolist()):
-        spread = (means_NK3[query] - means_NK3[query].mean(0)).norm(dim=-1).mean()
-        tokens.append(Token(query, categorical(rank), float(weights[query]), float(spread)))
-    return tokens
+    means_NK3 = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries).cpu()
+    weights_N = weights_NK.sum(1)
+    seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
+    places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
+    chosen = _apart(weights_N.argsort(descending=True).tolist(), places_N2, count)
+    spreads_N = (means_NK3 - means_NK3.mean(1, keepdim=True)).norm(dim=-1).mean(1)
+    return [
+        DrawnQuery(query, categorical(rank), float(weights_N[query]), float(spreads_N[query]))
+        for rank, query in enumerate(chosen)
+    ]
 
 
-def token_picture(
-    model: QueryGaussianModel, gaussians: Gaussians, tokens: Sequence[Token], cameras: Cameras
+def _apart(order: Sequence[int], places_N2: Tensor, count: int) -> list[int]:
+    """`count` of `order`, the first of it that lie inside [0, 1]^2 and apart; the rest fills up."""
+    inside = [i for i in order if ((places_N2[i] - 0.5).abs() < 0.5 - MARGIN).all()]
+    apart, chosen = 0.6 / count**0.5, list[int]()
+    for candidates, least in ((inside, apart), (inside, apart / 2), (order, 0.0)):
+        for i in candidates:
+            far = all((places_N2[i] - places_N2[j]).norm() >= least for j in chosen)
+            if far and i not in chosen and len(chosen) < count:
+                chosen.append(i)
+    return chosen
+
+
+def query_picture(
+    model: QueryGaussianModel, gaussians: Gaussians, chosen: Sequence[DrawnQuery], cameras: Cameras
 ) -> Picture:
-    """The Gaussians of `tokens` in colour with lines to centroids, over a grey scene; (1, 1)."""
+    """The Gaussians of `chosen` in colour with lines to centroids, over a grey scene; (1, 1)."""
     scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = gaussians.count // model.queries.count
-    members = [range(t.query * per_query, (t.query + 1) * per_query) for t in tokens]
+    members = [range(q.index * per_query, (q.index + 1) * per_query) for q in chosen]
     index = [i for member in members for i in member]
     shown = gaussians[:, torch.tensor(index, dtype=torch.long, device=gaussians.means.device)]
-    paint = torch.tensor([t.color for t in tokens]).view(-1, 3).to(shown.colors) / 255
+    paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
     visible = replace(shown, colors=colors, opacities=shown.opacities.clamp_min(0.5))
     painted = model.render(visible, cameras, torch.zeros(3))
@@ -188,16 +196,16 @@ def token_picture(
     picture = (scene * (1 - alpha) + color).clip(0, 255).round().astype(np.uint8)
     image = _oversampled(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    for member, token in zip(members, tokens, strict=True):
+    for member, query in zip(members, chosen, strict=True):
         means = gaussians.means[0, list(member)]
         front = to_camera(means[None], cameras)[0, 0, :, 2] > 1e-3
         points = torch.cat([means.mean(0, keepdim=True), means[front]])
         pixels = _pixels(points, cameras).clamp(-1e4, 1e4) * OVERSAMPLING
         hub, *rays = [tuple(point) for point in pixels.tolist()]
         for end in rays:
-            draw.line([hub, end], fill=(*token.color, 200), width=OVERSAMPLING)
+            draw.line([hub, end], fill=(*query.color, 200), width=OVERSAMPLING)
         for end in rays:
-            draw.circle(end, 1.6 * OVERSAMPLING, fill=(*token.color, 255), outline=(*INK, 160))
+            draw.circle(end, 1.6 * OVERSAMPLING, fill=(*query.color, 255), outline=(*INK, 160))
     return _reduced(image)
 
 

@@ -7,7 +7,6 @@ import torch
 from accelerate import Accelerator
 
 from qgs.composer import Recipe
-from qgs.contracts import SceneSourceConfig
 from qgs.data.evaluation import one_line
 from qgs.data.sampling import image_bytes
 from qgs.engine.distributed import wants_shards
@@ -51,9 +50,8 @@ def refuse_unfit(recipe: Recipe, accelerator: Accelerator) -> None:
         "layers, and their gradients": 2 * 4 * _GAUSSIAN * gaussians,
     }
     in_host = {"copies of good weights": 2 * weights}
-    data = recipe.parts.get(("data",))
-    if data is not None and isinstance(data.config, SceneSourceConfig):
-        size = height, width = data.config.image_size
+    if data := recipe.data_config:
+        size = height, width = data.image_size
         images, batches = config.batch_size * (views.inputs + views.targets), config.accumulate + 1
         rendered = config.batch_size * min(views.targets, config.render_views or views.targets)
         on_device["renderings and their gradients"] = 2 * 4 * _RENDERED * rendered * height * width

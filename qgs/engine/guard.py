@@ -357,12 +357,6 @@ def broken_tensors(model: nn.Module) -> str:
     return f"weights are not finite: {listed(names)}" if names else ""
 
 
-def refuse_broken(model: nn.Module, file: object) -> None:
-    """Raise ValueError when weights of `model`, read from `file`, are NaN or infinite."""
-    if problem := broken_tensors(model):
-        raise ValueError(f"{file}: {problem}; take another checkpoint of the run")
-
-
 def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
     """What is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is."""
     terms = {name: n for name, n in numbers.items() if name not in ("gradient", "psnr")}

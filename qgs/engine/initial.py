@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.engine.checkpoint import broken
 from qgs.engine.folder import checkpoint_of
 from qgs.io.checkpoint import (
     CheckpointError,
@@ -15,7 +14,7 @@ from qgs.io.checkpoint import (
     read_tensors,
     unique_tensors,
 )
-from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
+from qgs.io.differences import differing_tensors, options_beside_weights, refuse_broken, shapes_of
 from qgs.model import QueryGaussianModel
 
 _QUERIES, _ENCODER = "queries.", "encoder."
@@ -38,8 +37,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     learned_by = load_recipe(path)
     stored = read_tensors(path)
     learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
-    if fault := broken(learned, "weights"):
-        raise CheckpointError(f"init_from: {path} has weights that are {fault}: take another file")
+    refuse_broken(learned, f"init_from: {path}")
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()

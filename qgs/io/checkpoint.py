@@ -19,7 +19,7 @@ from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
 from qgs.data.domain import KEY, Domain
-from qgs.io.differences import differing_tensors, differing_types, shapes_of
+from qgs.io.differences import differing_tensors, differing_types, refuse_broken, shapes_of
 from qgs.io.files import replacing
 from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
 from qgs.io.models import checkpoint_path
@@ -139,8 +139,9 @@ def load(
 
     path: also PLUGIN/NAME of a shipped model, or a URL, see `checkpoint_path`. Weights of half
     precision become float32.
-    Raises FileNotFoundError, or CheckpointError, which names the releases that wrote the file
-    where a plugin is missing or another release of it cannot stand for it.
+    Raises FileNotFoundError, ValueError for weights that are NaN or infinite, or CheckpointError,
+    which names the releases that wrote the file where a plugin is missing or another release of it
+    cannot stand for it.
     """
     path = checkpoint_path(path)
     recipe, tensors = load_recipe(path), read_tensors(path)
@@ -152,6 +153,7 @@ def load(
             f"{path}: the model of its recipe cannot be built: {error}"
         ) from error
     load_weights(model, tensors, str(path))
+    refuse_broken(tensors, path)
     return (model if device is None else model.to(device)).eval()
 
 

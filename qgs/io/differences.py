@@ -10,6 +10,7 @@ from torch import Tensor
 from qgs.composer.recipe import flat
 from qgs.composer.yaml_text import inline
 from qgs.contracts.weights import Shapes
+from qgs.wording import listed
 
 _WITHOUT_EFFECT_ON_TRAINED = re.compile(
     r"(\b|_)(init|std|layer_scale)(\b|_)|^model\.(supervision|renderer)\."
@@ -20,6 +21,13 @@ _WITHOUT_EFFECT_ON_TRAINED = re.compile(
 def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     """Names to shapes."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+
+
+def refuse_broken(tensors: Mapping[str, Tensor], origin: object) -> None:
+    """Raise ValueError when `tensors`, weights read from `origin`, hold NaN or infinity."""
+    if broken := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        fix = "its training had diverged, or the file is damaged: take another"
+        raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
 
 
 def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()) -> list[str]:

@@ -33,7 +33,7 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
         return _downloaded(text)
     plugin, slash, model = text.partition("/")
     known = available_plugins().keys() | DISTRIBUTIONS[ENTRY_POINT_GROUP].keys()
-    if plugin not in known or not slash or "/" in model or path.suffix:
+    if plugin not in known or not slash or "/" in model or path.suffix == ".safetensors":
         return path
     installed = load_plugin(plugin)
     if text not in installed.models:
@@ -49,6 +49,18 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
             f"install {installed.released_as} again"
         )
     return file
+
+
+def card_of(file: Path) -> str:
+    """The card of a model, NAME.md beside the checkpoint NAME.safetensors; "" without one."""
+    card = file.with_suffix(".md")
+    return card.read_text(encoding="utf-8") if card.is_file() else ""
+
+
+def about(file: Path) -> str:
+    """What the model in `file` is: the first paragraph of its card; "" without one."""
+    paragraphs = [part for part in card_of(file).split("\n\n") if not part.startswith("#")]
+    return " ".join(paragraphs[0].split()) if paragraphs else ""
 
 
 def cache_folder() -> Path:

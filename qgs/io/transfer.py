@@ -19,7 +19,7 @@ from qgs.io.checkpoint import (
     read_tensors,
     write_checkpoint,
 )
-from qgs.io.differences import options_beside_weights, shapes_of
+from qgs.io.differences import options_beside_weights, refuse_broken, shapes_of
 from qgs.io.files import refuse_existing, replacing, write_text
 from qgs.io.published import (
     Names,
@@ -196,12 +196,7 @@ def _as_float32(
         # A torch file may store several names once; a checkpoint holds each on its own.
         tensors[name] = tensor.clone() if tensor.data_ptr() in stored else tensor
         stored.add(tensor.data_ptr())
-    broken = [names.published[name] for name, t in tensors.items() if not t.isfinite().all()]
-    if broken:
-        raise PublishedError(
-            f"{file.path} holds NaN or infinite values in {len(broken)} tensors: {listed(broken)}; "
-            "the training that wrote it had diverged, or the file is damaged"
-        )
+    refuse_broken({names.published[name]: t for name, t in tensors.items()}, file.path)
     return tensors, [f"converted to float32: {report}"] if others else []
 
 

@@ -1,4 +1,4 @@
-"""What is measured on Gaussians alone: how far those of one token scatter."""
+"""What is measured on Gaussians alone: how far those of one query scatter."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -14,9 +14,8 @@ OPACITY_USED = 1 / 255
 
 
 class Dispersion(Metric):
-    """Mean and median over Gaussians of the distance to the centroid of their token's (LocusGS).
-
-    The published figure is the mean; the median is not ruled by a few far ones.
+    """Dispersion, distance of Gaussians to the centroid of their query's: small where a query is
+    one place. A few far ones rule its mean, which LocusGS publishes, not its median.
     """
 
     name: ClassVar[str] = "dispersion"
@@ -37,14 +36,14 @@ class Dispersion(Metric):
 
 @full_precision
 def token_dispersion(means: Tensor, gaussians_per_query: int) -> Tensor:
-    """Distance of each Gaussian to the centroid of its token's, world units.
+    """Distance of each Gaussian to the centroid of its query's, world units.
 
     means: (B, N * K, 3) ordered query by query -> (B, N * K).
     Raises ValueError when K does not divide the number of Gaussians.
     """
     if means.shape[-2] % gaussians_per_query:
         raise ValueError(
-            f"{means.shape[-2]} Gaussians cannot be shared out to tokens of {gaussians_per_query}"
+            f"{means.shape[-2]} Gaussians cannot be shared out to queries of {gaussians_per_query}"
         )
     tokens = means.unflatten(-2, (-1, gaussians_per_query))
     return (tokens - tokens.mean(-2, keepdim=True)).norm(dim=-1).flatten(-2)

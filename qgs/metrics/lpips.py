@@ -28,7 +28,7 @@ _SMALLEST = 2 ** (len(_BLOCKS) - 1)
 
 
 class Lpips(Metric):
-    """Distance of each view to the truth in features of VGG-16; nothing is downloaded."""
+    """LPIPS, distance of each view to the truth in features of VGG-16; nothing is downloaded."""
 
     name: ClassVar[str] = "lpips"
     definition: ClassVar[str] = "VGG-16, version 0.1, images in [-1, 1]"

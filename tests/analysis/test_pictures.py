@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,12 +16,12 @@ from qgs.drawing.images import (
 )
 from qgs.drawing.queries import (
     attention_pictures,
-    notable_tokens,
+    notable_queries,
     patch_maps,
     project_support,
+    query_picture,
     rendered_weights,
     support_picture,
-    token_picture,
 )
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import SpatialSupport
@@ -91,24 +93,40 @@ def test_rendered_weights_add_up_to_the_coverage(model, gaussians, cameras):
     torch.testing.assert_close(weights.sum(), alpha.sum(), rtol=1e-4, atol=1e-3)
 
 
-def test_notable_tokens_are_distinct_and_start_with_the_heaviest(model, gaussians, cameras):
-    tokens = notable_tokens(model, gaussians, cameras, 4)
-    weights = rendered_weights(model, gaussians, cameras).view(model.queries.count, -1).sum(1)
-    assert len({token.query for token in tokens}) == 4
-    assert tokens[0].query == int(weights.argmax())
-    means = gaussians.means.view(model.queries.count, -1, 3)[tokens[1].query]
-    spread = (means - means.mean(0)).norm(dim=-1).mean()
-    assert tokens[1].spread == pytest.approx(float(spread))
+def test_notable_queries_are_heavy_well_inside_the_picture_and_apart(model, gaussians, cameras):
+    queries = model.queries.count
+    places = torch.zeros(queries, 2)
+    inside = [[0.2, 0.2], [0.21, 0.2], [0.8, 0.2], [0.2, 0.8], [0.8, 0.8]]
+    places[:6] = torch.tensor([*inside, [0.1, 0.5]])  # the last one is the heaviest
+    sizes, faint = torch.ones(queries), torch.ones(queries)
+    sizes[5], faint[6:] = 4.0, 0.01
+    means = torch.cat([(places - 0.5) * 1.5, torch.full((queries, 1), 1.5)], -1)
+    placed = replace(
+        gaussians,
+        means=(means.repeat_interleave(4, 0) + 0.01 * torch.randn(queries * 4, 3))[None],
+        scales=gaussians.scales * sizes.repeat_interleave(4)[None, :, None],
+        opacities=gaussians.opacities * faint.repeat_interleave(4),
+    )
+    drawn = notable_queries(model, placed, cameras, 4)
+    weights = rendered_weights(model, placed, cameras).view(queries, -1).sum(1)
+    assert int(weights.argmax()) == 5
+    indices = [query.index for query in drawn]
+    assert sorted(indices)[1:] == [2, 3, 4]
+    assert min(indices) in (0, 1)
+    assert indices[0] == int(weights[:5].argmax())
+    means = placed.means.view(queries, -1, 3)[indices[1]]
+    assert drawn[1].spread == pytest.approx(float((means - means.mean(0)).norm(dim=-1).mean()))
+    assert len({query.index for query in notable_queries(model, placed, cameras, 12)}) == 12
 
 
-def test_a_token_picture_is_grey_but_for_its_tokens(model, gaussians, cameras):
+def test_a_query_picture_is_grey_but_for_its_queries(model, gaussians, cameras):
     camera = finer(cameras[:, :1], 64)
-    tokens = notable_tokens(model, gaussians, camera, 1)
-    picture = token_picture(model, gaussians, tokens, camera).astype(int)
+    chosen = notable_queries(model, gaussians, camera, 1)
+    picture = query_picture(model, gaussians, chosen, camera).astype(int)
     colored = np.ptp(picture, axis=-1) > 60
     assert picture.shape == (64, 64, 3)
     assert 0 < colored.mean() < 0.6
-    none = token_picture(model, gaussians, [], camera)
+    none = query_picture(model, gaussians, [], camera)
     assert np.ptp(none.astype(int), axis=-1).max() == 0
 
 
@@ -146,7 +164,9 @@ def test_attention_maps_share_one_scale_over_the_views():
     white = [np.full((16, 16, 3), 255, np.uint8)] * 2
     first, second = attention_pictures(white, maps)
     assert np.ptp(first.reshape(-1, 3), axis=0).max() == 0
-    assert (second[:8, 8:].astype(int) > second[8:, :8]).all()
+    color = np.ptp(second.astype(int), axis=-1)
+    assert color[:8, 8:].min() > 100
+    assert color[8:].max() == color[:8, :8].max() == 0
 
 
 def test_what_a_mask_hides_has_the_colour_of_nothing_and_no_part_in_the_scale():

@@ -1,3 +1,5 @@
+import re
+
 import pytest
 from commands import MODEL
 
@@ -46,9 +48,9 @@ def page_of(tree: dict, name: str) -> str:
         scores={"psnr": 12.34, "mine": 0.5, "none": None},
         gaussians=64,
         parameters=1000,
-        seconds=1.0,
-        curves=Curves([0.0, 1.0], [1.0, 0.5], [8.0, 9.0]),
         recipe="recipe: 1",
+        about="Small, see https://example.org/small for more.",
+        curves=Curves([0.0, 1.0], [1.0, 0.5], [8.0, 9.0]),
     )
     report = Report(
         columns={
@@ -62,6 +64,9 @@ def page_of(tree: dict, name: str) -> str:
         samples=samples,
         depths=[true_depth(source, sample) for sample in samples],
         facts={"Budget": "none"},
+        notes=["The photos lie outside."],
+        meanings=["What my metric means."],
+        commands={"qgs list": "lists"},
     )
     return report_html(report)
 
@@ -85,6 +90,11 @@ def test_queries_without_a_place_have_no_anchor_section():
     assert '<td class="best">0.500</td>' in page
     assert "<th>my metric ↓<small>" in page
     assert "<td>11.11</td>" in page
+    assert 'Small, see <a href="https://example.org/small"' in page
+    assert page.index("The photos lie outside.") < page.index("<table>")
+    assert "<br>What my metric means." in page
+    assert "Next: <code>qgs list</code> lists." in page
+    assert "token" not in re.sub(r"data:[^\"]+|[a-z]*TokenGS", "", page)
 
 
 def test_names_cannot_break_the_page():

@@ -8,8 +8,6 @@ import pytest
 from commands import SMALL, run_qgs, sets
 from typer.testing import Result
 
-from qgs.cli.bench import short_names
-
 RECIPES = Path(__file__).parents[2] / "recipes"
 TOKENGS, LOCUS = RECIPES / "tiny/tokengs.yaml", RECIPES / "tiny/locus.yaml"
 
@@ -70,9 +68,3 @@ def test_mistakes_are_told(words: list[str], message: str) -> None:
     result = run_qgs("bench", TOKENGS, *words, "--device", "cpu")
     assert isinstance(result.exception, ValueError)
     assert message in str(result.exception)
-
-
-def test_short_names(tmp_path: Path) -> None:
-    assert short_names(["a/tiny/x.yaml", "a/tiny/y.yaml"]) == ["x", "y"]
-    assert short_names(["a/tiny/x.yaml", "a/big/x.yaml"]) == ["tiny/x", "big/x"]
-    assert short_names([str(tmp_path / "x.yaml")] * 3) == ["x", "x (2)", "x (3)"]

@@ -12,6 +12,7 @@ from plyfile import PlyData
 import qgs
 from qgs.cli.contest import resolve_fairly
 from qgs.cli.demo import new_folder
+from qgs.cli.trained import WINDOWS, checkpoints, judge, remarks
 from qgs.composer import resolve
 from qgs.data.domain import KEY, trained_domain
 from qgs.engine.guard import CollapseError
@@ -52,9 +53,8 @@ def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
     assert "count: 12" in page
 
 
-def test_recipes_with_other_data_or_of_one_name_are_not_compared(recipes):
-    with pytest.raises(ValueError, match="told apart by file name"):
-        resolve_fairly([recipes[0], recipes[0]], seconds=1, seed=0)
+def test_recipes_with_other_data_are_not_compared(recipes):
+    assert [*resolve_fairly([recipes[0]] * 2, seconds=1, seed=0)] == ["few", "few (2)"]
     overlay = {"recipe": 1, "extends": "few.yaml", "views": {"gap": [2, 5]}}
     recipes[1].write_text(yaml.safe_dump(overlay))
     with pytest.raises(ValueError, match="more and few differ in views"):
@@ -76,7 +76,7 @@ def models(tmp_path, monkeypatch):
         recipe = resolve(RECIPE, [f"model.queries.count={queries}"])
         domain = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
         file = tmp_path / "models" / f"{name}.safetensors"
-        qgs.save(recipe.build_model(), file, extra={KEY: domain.text})
+        qgs.save(recipe.build_model(), file, extra={KEY: domain.text, "step": "7000"})
         files += ["--model", f"models/{name}.safetensors"]
     return files
 
@@ -107,7 +107,12 @@ def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
     assert "seconds" not in result.output
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "test/000001" in page
-    assert "These trained models come with qgs" in page
+    assert "These trained models come with qgs" not in page
+    assert "judged on the test split of their recipe" in page
+    assert "qgs/latent: N learned vectors" in page
+    for text in (page, result.output):
+        assert "few: step 7,000 of 150,000; more: step 7,000 of 150,000" in text
+        assert "qgs demo PHOTOS" in text
     assert "<h2>Training</h2>" not in page
     assert "<small>seconds</small>" not in page
 
@@ -117,9 +122,45 @@ def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
     result = run_qgs("demo", photos_in(tmp_path / "mine", count, step=5.0), *models)
     assert result.exit_code == 0, result.output
     assert result.output.count("few, more: the photos lie outside what this model was trained") == 1
-    assert re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: 0\.", result.output)
+    assert result.output.count("(views.scale: auto)") == 1
+    assert "Unseen" not in result.output
+    apart = re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: ", result.output)
+    assert bool(apart) == (count == 3), "of many photos in a row, neighbours stand close enough"
     assert "their axes meet at no point before them (trained: " in result.output
-    assert "lie outside what this model" in (tmp_path / "demo" / "report.html").read_text()
+    page = (tmp_path / "demo" / "report.html").read_text()
+    assert page.index("lie outside what this model") < page.index("<table>")
+    assert "<h2>Your photos</h2>" in page
+    assert "Unseen" not in page
+
+
+def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
+    figures = []
+    for name, unit in (("a", 0.01), ("b", 7.0)):
+        photos = photos_in(tmp_path / name, 12, step=unit)
+        entry = judge(checkpoints(models[1:2]), str(photos), "cpu")[0]
+        figures.append(entry.evaluation.means()["psnr"])
+        assert entry.recipe.views.scale == "auto"
+    assert figures[0] == pytest.approx(figures[1], abs=1e-3)
+
+
+def test_the_sentence_on_photos_is_of_all_views_that_are_judged(models, tmp_path, monkeypatch):
+    files = checkpoints(models[1:2])
+    told = "qgs.engine.evaluation.verdict"
+    monkeypatch.setattr(told, lambda _, found: f"{found.samples} windows")
+    (entry,) = judge(files, str(photos_in(tmp_path / "mine", 80, step=0.1)), "cpu")
+    assert sum(len(score.views) for score in entry.evaluation.scores) == WINDOWS
+    assert remarks([entry])[0] == f"few: {WINDOWS} windows."
+
+
+def test_models_of_one_file_name_are_all_shown(models, tmp_path):
+    other = tmp_path / "aa" / "few.safetensors"
+    other.parent.mkdir()
+    other.write_bytes((tmp_path / "models" / "few.safetensors").read_bytes())
+    result = run_qgs("demo", *models[:2], "--model", other)
+    assert result.exit_code == 0, result.output
+    for name in ("models/few", "aa/few"):
+        assert (tmp_path / "demo" / name / "example.ply").is_file()
+        assert name in result.output
 
 
 def test_an_own_folder_of_recipes_comes_first(tmp_path, monkeypatch):
@@ -138,12 +179,24 @@ def test_an_own_folder_of_recipes_comes_first(tmp_path, monkeypatch):
         (["--train", "--model", "rooms/locus-64"], "--model names trained models"),
         (["one", "two"], "one folder of photos is shown at a time, got one, two"),
         (["--model", "none.safetensors"], "no checkpoint at none.safetensors"),
+        (
+            ["recipes/tiny/locus.yaml", "b.yaml"],
+            "locus.yaml is a recipe, no folder of photos: add --train",
+        ),
     ],
 )
 def test_words_without_meaning_are_refused(words, told, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert told in str(run_qgs("demo", *words).exception)
+    error = run_qgs("demo", *words).exception
+    assert told in str(error)
+    assert not hasattr(error, "__notes__")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_the_models_that_come_with_qgs_training_is_pointed_to(tmp_path, monkeypatch):
+    monkeypatch.setattr("qgs.cli.demo.MODELS", ("rooms/gone-64",))
+    error = run_qgs("demo", "--out", tmp_path / "demo").exception
+    assert "qgs demo --train" in error.__notes__[0]
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from refusals import refused
 
+from qgs.components import LatentQueries
 from qgs.composer import RecipeError, RecipeProblem, places, resolve
 from qgs.composer.errors import MAX_PROBLEMS
 from qgs.composer.files import MAX_BYTES, MAX_EXTENDS
@@ -29,13 +30,18 @@ def extending(name: str, write: Write) -> RecipeProblem:
     return problem
 
 
-@pytest.mark.parametrize("name", ["/dev/zero", "fifo", "."])
-def test_nothing_but_a_regular_file_is_opened(name: str, write: Write) -> None:
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("/dev/zero", "a device or a pipe, no regular file"),
+        ("fifo", "a device or a pipe, no regular file"),
+        (".", "a folder; a recipe is a .yaml file, of a run its recipe.yaml"),
+    ],
+)
+def test_nothing_but_a_regular_file_is_opened(name: str, what: str, write: Write) -> None:
     write("", "empty.yaml")
     os.mkfifo("fifo")
-    assert extending(name, write).reason == (
-        f"{name} cannot be read: it is a folder or a device, no regular file"
-    )
+    assert extending(name, write).reason == f"{name} cannot be read: it is {what}"
 
 
 def test_links_in_a_circle(write: Write) -> None:
@@ -165,6 +171,27 @@ def test_what_resolves_is_read_again_as_a_run_has_it(losses: int, write: Write) 
     recipe = resolve(tree)
     assert resolve(write(annotated(recipe))).tree == recipe.tree
     assert resolve(json.loads(json.dumps(recipe.tree))).tree == recipe.tree
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("no room"), MemoryError),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), RuntimeError),
+        (ValueError("stack overflow in a component"), ValueError),
+    ],
+)
+def test_what_is_no_size_is_not_told_as_one(
+    error: Exception, told: type, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise error
+
+    recipe = resolve(write("recipe: 1\n"))
+    monkeypatch.setattr(LatentQueries, "__init__", fails)
+    with pytest.raises(told) as caught:
+        recipe.build_model("meta")
+    assert caught.value is error
 
 
 @pytest.mark.parametrize("option", ["encoder.mlp_ratio", "queries.count"])

@@ -26,7 +26,6 @@ from qgs.contracts import (
     Scene,
 )
 from qgs.data.evaluation import evaluation_samples, true_depth
-from qgs.drawing.figures import Curves
 from qgs.engine.comparison import compare
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.evaluation import Evaluation, Measures, evaluate
@@ -161,13 +160,12 @@ def test_training_records_and_tracks_it(judged: Judged, tmp_path: Path) -> None:
 def test_contests_and_their_report_show_it(judged: Judged) -> None:
     recipe, evaluation = judged
     scores = evaluation.means()
-    model, curves = recipe.build_model(), Curves([], [], [])
-    contender = Contender("one", model, scores, 96, 1000, 1.0, curves, "recipe: 1")
+    contender = Contender("one", recipe.build_model(), scores, 96, 1000, "recipe: 1")
     entry = Entry(recipe, contender, evaluation)
     table = shown(table_of([entry]))
     assert "MAE ↓" in table
     assert table.count(f"{scores['error']:.5f}") == 1
-    report = report_of([entry], "title", "lede", {})
+    report = report_of([entry], "lede", {})
     assert report.columns["error"].heading == "MAE"
     assert report.contenders[0].scores["error"] == scores["error"]
 

@@ -52,6 +52,18 @@ def saved(model: QueryGaussianModel, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_refused(saved: Path, value: float) -> None:
+    model = qgs.load(saved)
+    with torch.no_grad():
+        model.queries.features[0, 0] = value
+    qgs.save(model, saved)
+    with pytest.raises(
+        ValueError, match=r"weights are not finite: queries\.features; its training"
+    ):
+        qgs.load(saved)
+
+
 def metadata_of(path: Path) -> dict[str, str]:
     with safe_open(path, "pt") as file:
         return file.metadata()

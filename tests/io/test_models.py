@@ -27,10 +27,11 @@ RECIPE = {
     "views": {"inputs": 2, "targets": 2, "gap": [2, 4]},
 }
 PLUGIN = """
-from qgs.contracts import Plugin, ShippedModel
+from qgs.contracts import Plugin
 plugin = Plugin("box", 1, (), models={
-    "small": ShippedModel("models/small.safetensors", "Tiny rooms."),
-    "gone": ShippedModel("models/gone.safetensors", "Lost on the way."),
+    "small": "models/small.safetensors",
+    "small-1.5": "models/small.safetensors",
+    "gone": "models/gone.safetensors",
 })
 """
 
@@ -41,19 +42,21 @@ def shipped(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     install("qgs-box", "box", PLUGIN)
     file = Path(sys.path[0]) / "models" / "small.safetensors"
     save(qgs.compose(RECIPE), file, extra={"step": "7"})
+    file.with_suffix(".md").write_text("# Small\n\nTiny [rooms],\nin a box.\n\n- Seed: 0\n")
     monkeypatch.chdir(tmp_path)
     return file
 
 
 def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped: Path) -> None:
-    assert checkpoint_path("box/small") == shipped
+    assert checkpoint_path("box/small") == checkpoint_path("box/small-1.5") == shipped
     assert qgs.load("box/small").recipe == qgs.load(shipped).recipe
     result = run_qgs("eval", "box/small")
     assert result.exit_code == 0, result.output
     assert Path("evaluation_small/summary.json").is_file()
     run_qgs("eval", "box/small")
     assert Path("evaluation_small-2/summary.json").is_file()
-    assert sorted(path.name for path in shipped.parent.iterdir()) == ["small.safetensors"]
+    names = sorted(path.name for path in shipped.parent.iterdir())
+    assert names == ["small.md", "small.safetensors"]
     started = resolve({**RECIPE, "init_from": "box/small"})
     assert "weights start from" in initialise(started.build_model(), started)[0]
 
@@ -78,17 +81,20 @@ def test_what_is_not_there_is_told(shipped: Path) -> None:
 def test_models_are_listed_and_checked(shipped: Path) -> None:
     result = run_qgs("list")
     assert "box/small" in result.stdout
-    assert "the file of the model box/gone is missing:" in result.stderr
-    assert f"{shipped}: 0.1 MB" in run_qgs("list", "box/small").output.replace("\n", "")
+    assert "Tiny [rooms], in a box." in " ".join(result.stdout.split())
+    told = run_qgs("list", "box/small").output
+    assert f"{shipped}: 0.1 MB" in told.replace("\n", "")
+    assert "- Seed: 0" in told
+    assert "should ship the model box/gone" in str(run_qgs("list", "box/gone").exception)
     checked = run_qgs("check-plugin", "box", "--core")
     assert checked.exit_code == 1
     assert "ok     model box/small" in checked.output
     assert "FAILED model box/gone: no checkpoint at" in checked.output
 
 
-@pytest.mark.parametrize("models", ["['a']", "{'a/b': ShippedModel('f', '')}", "{'a': 'file'}"])
+@pytest.mark.parametrize("models", ["['a']", "{'a/b': 'f'}", "{'a': 1}"])
 def test_models_of_another_form_are_refused(install, models: str) -> None:
-    source = "from qgs.contracts import Plugin, ShippedModel\n"
+    source = "from qgs.contracts import Plugin\n"
     install("qgs-bad", "bad", f"{source}plugin = Plugin('bad', 1, (), models={models})")
     assert any("models" in message for message in load_sound_plugins()[1])
 

@@ -9,7 +9,6 @@ import torch
 from torch import nn
 
 from qgs.composer import Recipe
-from qgs.contracts import SceneSourceConfig
 from qgs.engine.objective import Objective
 from qgs.engine.parameters import make_optimizer
 from qgs.model import QueryGaussianModel
@@ -42,9 +41,8 @@ def workload_of(
 
     more: further fields. Raises ValueError when nothing says how large the images are.
     """
-    data = recipe.parts.get(("data",))
-    if size is None and data is not None and isinstance(data.config, SceneSourceConfig):
-        size = data.config.image_size
+    if size is None and recipe.data_config:
+        size = recipe.data_config.image_size
     if size is None:
         raise ValueError(
             "the recipe has no data.image_size, so the size of the photos is not known; "

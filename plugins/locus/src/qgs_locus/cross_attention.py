@@ -32,7 +32,8 @@ from qgs_locus.ray_bias import ray_bias, ray_features
 
 
 class RayBiasedCrossAttention(CrossAttention):
-    """softmax(q k / sqrt(d) + gamma b) v, b = -1/2 (D / sigma)^2 (LocusGS).
+    """By content, and by the distance D of a patch's ray to the anchor (LocusGS):
+    softmax(q k / sqrt(d) + gamma b) v, b = -1/2 (D / sigma)^2.
 
     sigma = sigma0 r ("radius") or sigma0 ("fixed"); the bias is the same for all heads.
     """
