@@ -1,7 +1,7 @@
 """Growth of optimised Gaussians: live ones split, dead ones move to where they are of use.
 
 Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), without its
-noise: copies of a Gaussian are drawn from it instead of lying where it lies.
+noise: copies of a Gaussian lie a part of its size beside it, so that they can part.
 """
 
 from collections.abc import Mapping
@@ -13,8 +13,10 @@ from torch import Tensor
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Gaussians
 
-DEAD = 0.05
-"""Opacity below which a Gaussian moves; the paper's 0.005 is for hours, in seconds more must."""
+DEAD = 0.005
+"""Opacity below which a Gaussian moves, as in the paper. More would take away what is seen: of
+fog that stands before an object every single one is faint."""
+_BESIDE = 0.2  # of a parent's scales: how far a copy lies from it
 _MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
 
@@ -91,12 +93,12 @@ class Leaves:
         self.values["log_scales"][chosen] += shrink.log()[:, None]
 
     def _places_in(self, parents: Tensor, generator: torch.Generator) -> Tensor:
-        """A point (n, 3) drawn from each of `parents`."""
+        """A point (n, 3) drawn about the centre of each of `parents`."""
         values = self.values
         turns = quat_to_matrix(F.normalize(values["quats"][parents], dim=-1))
         drawn = torch.randn(len(parents), 3, 1, generator=generator).to(turns)
         steps = turns @ (values["log_scales"][parents].exp()[..., None] * drawn)
-        return values["means"][parents] + steps[..., 0]
+        return values["means"][parents] + _BESIDE * steps[..., 0]
 
 
 def shared(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:

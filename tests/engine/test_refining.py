@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import qgs
-from qgs.engine.growth import Leaves
+from qgs.engine.growth import DEAD, Leaves
 from qgs.engine.refining import mean_psnr, resized
 from qgs.geometry.poses import look_at
 from qgs.renderers import AutoRenderer
@@ -140,7 +140,7 @@ def test_moments_follow_their_gaussians() -> None:
     """After growth every Gaussian that was not touched learns on as before."""
     start = cloud(40)
     opacities = start.opacities.clone()
-    opacities[0, :5] = 0.01  # dead
+    opacities[0, :5] = DEAD / 5
     opacities[0, 5:] = 0.1
     opacities[0, 7] = 0.99  # drawn more often
     leaves = Leaves(
@@ -154,7 +154,7 @@ def test_moments_follow_their_gaussians() -> None:
     assert leaves.count == 44
     moved = [i for i in range(40) if not torch.equal(leaves.values["means"][i], before["means"][i])]
     assert moved == [0, 1, 2, 3, 4]
-    assert (leaves.values["opacity_logits"].sigmoid() >= 0.05 - 1e-6).all()
+    assert (leaves.values["opacity_logits"].sigmoid() >= DEAD - 1e-6).all()
     (group,) = (g for g in leaves.optimizer.param_groups if g["name"] == "means")
     assert group["params"][0] is leaves.values["means"]
     moments = leaves.optimizer.state[group["params"][0]]["exp_avg"]
@@ -173,3 +173,15 @@ def test_where_none_is_alive_none_is_moved() -> None:
     leaves.grow(9, torch.Generator())
     assert leaves.count == 9
     assert torch.equal(leaves.values["means"][:6], before)
+
+
+def test_growth_leaves_the_rendering_as_it_is(scene: tuple[Views, Views]) -> None:
+    """Also of fog, Gaussians that are all faint, of which many copies are made at once."""
+    photos, _ = scene
+    start = cloud(200)
+    fog = 0.01 + 0.05 * torch.rand(1, 200, generator=torch.Generator().manual_seed(1))
+    leaves = Leaves(Gaussians(start.means, start.scales, start.quats, fog, start.colors), RATES)
+    before = RENDERER(leaves.gaussians(), photos.cameras).rgb.detach()
+    leaves.grow(400, torch.Generator().manual_seed(0))
+    after = Views(before, photos.cameras)
+    assert mean_psnr(leaves.gaussians(), after, RENDERER) > 35
