@@ -221,14 +221,16 @@ def reconstruct(
     return Reconstruction(sample, gaussians, rendering, scores, world, tuning, refinement)
 
 
-def remarks_on(result: Reconstruction, scene: Scene, head: Head, trained_on: Domain) -> list[str]:
+def remarks_on(
+    result: Reconstruction, scene: Scene, head: Head, views: ViewsConfig, trained_on: Domain
+) -> list[str]:
     """What is to be said of a prediction for photos of `scene`. trained_on: see `verdict`."""
     sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
     said = (
         verdict(trained_on, found),
         framing(scene, sample.input_frames[0]),
-        too_many_capped(head, capped_share(head, result.gaussians)),
+        too_many_capped(head, capped_share(head, result.gaussians), views),
         result.worse_than_nearest,
     )
     return [*filter(None, said)]

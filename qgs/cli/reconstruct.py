@@ -125,7 +125,7 @@ def reconstruct(
         losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, tuned, record)
-    remarks = remarks_on(result, scene, model.head, trained)
+    remarks = remarks_on(result, scene, model.head, recipe.views, trained)
     result = replace(result, remarks=remarks)
     console.print(score_table(result, "feed-forward" if refine else ""))
     console.print("\n".join(remarks), soft_wrap=True, highlight=False, markup=False)
@@ -229,10 +229,10 @@ def frame_list(text: str | None, option: str, scene: Scene) -> list[int] | None:
         found = [f for f, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
         found = [int(part)] if part.removeprefix("-").isdecimal() else found
         if len(found) != 1:
+            fits = f"fits {listed(map(scene.label, found))}" if found else "is no photo"
             raise ValueError(
-                f"{option} takes numbers or file names of photos with commas between, such as "
-                f"0,8,16; {part!r} of {text!r} is {listed(map(scene.label, found)) or 'none'}. "
-                f"The photos are {scene.label(0)} to {scene.label(len(names) - 1)}"
+                f"{option}: {part!r} {fits}. Give numbers or file names of photos with commas "
+                f"between, such as 0,8,16, of {scene.label(0)} to {scene.label(len(names) - 1)}"
             )
         frames += found
     return frames

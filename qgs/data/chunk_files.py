@@ -27,7 +27,7 @@ from upath import UPath
 
 from qgs.data.images import decode_mask, encoded_size
 from qgs.data.lenses import Intrinsics, Size
-from qgs.data.paths import StoreError, is_local, open_file, read_json, stays_inside
+from qgs.data.paths import StoreError, is_local, listing, open_file, read_json, stays_inside
 from qgs.data.photos.checks import (
     LARGEST_SIDE,
     FrameProblem,
@@ -348,7 +348,7 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
     if not (folder / INDEX).is_file():
         return _scanned(folder)
     index = read_chunk_index(folder / INDEX)
-    present = {item.name for item in folder.iterdir()}
+    present = {item.name for item in listing(folder)}
     chunks = {name: folder / name for name in set(index.values())}
     there = {name for name in chunks if name in present or chunks[name].is_file()}
     here = {key: chunks[name] for key, name in index.items() if name in there}
@@ -367,7 +367,7 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
 
 
 def _scanned(folder: UPath) -> dict[str, UPath]:
-    paths = sorted((item for item in folder.iterdir() if item.suffix == SUFFIX), key=str)
+    paths = sorted((item for item in listing(folder) if item.suffix == SUFFIX), key=str)
     if not paths:
         raise FileNotFoundError(
             f"{folder} holds neither {INDEX} nor chunks ({SUFFIX} files): give the folder that "

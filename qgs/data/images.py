@@ -14,7 +14,7 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene
-from qgs.data.paths import StoreError, open_file
+from qgs.data.paths import LARGEST, StoreError, open_file
 from qgs.data.scenes import warn_once
 from qgs.memory import is_out_of_memory
 
@@ -167,7 +167,7 @@ def load_array(file: IO[bytes]) -> np.ndarray:
     shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
     count = math.prod(shape)
     held, promised = -file.tell() + file.seek(0, 2), count * dtype.itemsize
-    if max(count, promised // 8) > _MOST_PIXELS:
+    if max(count / _MOST_PIXELS, promised / LARGEST) > 1:
         raise ValueError(f"it has {count} numbers of {dtype}: scale it down")
     if held < promised or min(shape, default=0) < 0:
         raise ValueError(f"its header promises {promised} bytes, and {held} follow")

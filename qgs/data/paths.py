@@ -21,7 +21,7 @@ from qgs.memory import in_words
 PAUSES = (1.0, 4.0)
 """Seconds before a remote store that failed is asked again."""
 
-LARGEST = 10**9
+LARGEST = 500_000_000
 """Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels; a
 small archive may promise any number."""
 
@@ -29,6 +29,10 @@ _LARGEST_JSON = 50_000_000  # which may take forty times as much once parsed
 
 Answer = TypeVar("Answer")
 _log = logging.getLogger(__name__)
+_NO_FAULT_OF_A_STORE = (
+    FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, zipfile.BadZipFile,
+    zlib.error, EOFError, MemoryError, ImportError, ValueError, TypeError, RuntimeError,
+)  # fmt: skip
 
 _PROTOCOLS = {  # the packages that file systems of fsspec need: the protocols that they serve
     "requests aiohttp": ("http", "https"),
@@ -71,14 +75,15 @@ class StoreError(OSError):
 def asked_again(path: Path | UPath, action: Callable[[], Answer]) -> Answer:
     """What `action` gives, which reads `path`; of a remote store, asked again after PAUSES.
 
-    Raises as `action`, what is absent or forbidden at once; StoreError after the last pause.
+    Raises as `action`, what is absent, forbidden or damaged at once; StoreError after the last
+    pause.
     """
     if is_local(path) or isinstance(path, ArchivePath):
         return action()
     for pause in (*PAUSES, None):
         try:
             return action()
-        except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError):
+        except _NO_FAULT_OF_A_STORE:
             raise
         except Exception as error:  # each file system raises its own
             said = str(error) or type(error).__name__
@@ -92,13 +97,25 @@ def asked_again(path: Path | UPath, action: Callable[[], Answer]) -> Answer:
     raise AssertionError
 
 
-def open_file(path: Path | UPath) -> IO[bytes]:
+def listing(folder: UPath) -> list[UPath]:
+    """What `folder` holds; nothing where it is no folder. Raises as `asked_again`."""
+    try:
+        return asked_again(folder, lambda: list(folder.iterdir()))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def open_file(path: Path | UPath, most: int = LARGEST) -> IO[bytes]:
     """`path`, open for reading bytes; a remote one is read whole, see `asked_again`.
 
-    Raises OSError, also for a pipe, a device or a folder.
+    Raises OSError, also for a pipe, a device or a folder, and a remote one beyond `most` bytes.
     """
-    if not is_local(path):
-        return io.BytesIO(asked_again(path, path.read_bytes))
+    if isinstance(path, ArchivePath):
+        return io.BytesIO(open_archive(path.archive).read(path.member, most))
+    if not isinstance(path, Path):
+        store: Any = path.fs
+        content: bytes = asked_again(path, lambda: store.cat_file(path.path, 0, most + 1))
+        return io.BytesIO(_no_more(content, path, most))
     if path.exists() and not path.is_file():
         raise OSError("it is no regular file, but a folder, a pipe or a device")
     return path.open("rb")
@@ -106,16 +123,20 @@ def open_file(path: Path | UPath) -> IO[bytes]:
 
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     """The bytes of `path`. Raises as `open_file`, and OSError for more than `most`."""
-    with open_file(path) as file:
-        held = path.stat().st_size if is_local(path) else 0
-        content = file.read(most + 1) if held <= most else b""
-    _refuse_larger(max(held, len(content)), most)
+    with open_file(path, most) as file:
+        if is_local(path):
+            _refuse_larger(path, path.stat().st_size, most)
+        return _no_more(file.read(most + 1), path, most)
+
+
+def _no_more(content: bytes, path: object, most: int) -> bytes:
+    _refuse_larger(path, len(content), most)
     return content
 
 
-def _refuse_larger(size: int, most: int = LARGEST) -> None:
+def _refuse_larger(path: object, size: int, most: int) -> None:
     if size > most:
-        raise OSError(f"it is larger than {in_words(most)}")
+        raise OSError(f"{path} is larger than {in_words(most)}")
 
 
 def read_json(path: UPath, fix: str, **options: Any) -> Any:
@@ -133,7 +154,7 @@ def read_json(path: UPath, fix: str, **options: Any) -> Any:
     except RecursionError:
         reason = "its brackets are nested too deeply"
     except (ValueError, OSError) as error:
-        reason = str(error)
+        reason = str(error).replace(f"{path} is", "it is")
     raise ValueError(f"{path} is not valid JSON ({reason}): {fix}")
 
 
@@ -169,11 +190,11 @@ class Archive:
             elif parts:
                 self.files["/".join(parts)] = name
 
-    def read(self, member: str) -> bytes:
-        """The bytes of a file. Raises OSError for one that is absent or damaged."""
+    def read(self, member: str, most: int = LARGEST) -> bytes:
+        """The bytes of a file. Raises OSError for one that is absent, damaged or beyond `most`."""
         try:
             info = self._zip.getinfo(self.files[member])
-            _refuse_larger(info.file_size)
+            _refuse_larger(f"{self._path}/{member}", info.file_size, most)
             return asked_again(self._path, lambda: self._zip.read(info))
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error
@@ -234,7 +255,7 @@ class ArchivePath:
         return (self / name for name in sorted(names))
 
     def read_bytes(self) -> bytes:
-        """The file's bytes. Raises OSError for one that is absent or damaged."""
+        """The file's bytes. Raises OSError for one that is absent, damaged or beyond LARGEST."""
         return open_archive(self.archive).read(self.member)
 
     def open(self, mode: Literal["rb"]) -> IO[bytes]:

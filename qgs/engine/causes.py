@@ -28,7 +28,7 @@ def blamed(
 
 
 STANDS_OUT = 1.0
-"""How much must speak against an option, such as ten times its default, to blame it alone."""
+"""What must be passed, as by more than ten times the default, to blame an option alone."""
 
 
 def _from_the_start(recipe: Recipe) -> Iterator[tuple[float, str]]:

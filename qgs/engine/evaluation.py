@@ -91,7 +91,8 @@ def _remarks(
         if evaluation.held_out:
             why = "{} of {} held-out frames are judged, each once".format(*evaluation.held_out)
         yield f"evaluation.samples={samples} changed nothing, since no views were drawn: {why}"
-    yield too_many_capped(model.head, mean(s.values["scales_at_cap"] for s in scores))
+    capped = mean(s.values["scales_at_cap"] for s in scores)
+    yield too_many_capped(model.head, capped, recipe.views)
     if evaluation.columns and not any(score.given for score in scores):
         name, column = next(iter(evaluation.columns.items()))
         nearest = evaluation.mean(name, "nearest_input")

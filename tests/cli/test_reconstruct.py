@@ -139,8 +139,8 @@ def test_photos_that_are_not_there_are_refused(photos, tmp_path):
     scene = opened(photos).scenes("train")[0]
     assert frame_list("0,8", "--frames", scene) == [0, 8]
     assert frame_list(None, "--frames", scene) is None
-    ends = r"The photos are 0 \(images/0\.png\) to 6 \(images/6\.png\)"
-    with pytest.raises(ValueError, match=rf"'0-8' of '0-8' is none\. {ends}"):
+    ends = r"of 0 \(images/0\.png\) to 6 \(images/6\.png\)"
+    with pytest.raises(ValueError, match=rf"--frames: '0-8' is no photo\. .*{ends}"):
         frame_list("0-8", "--frames", scene)
     for folder in "ab":
         shutil.copytree(photos / "images", tmp_path / folder)
@@ -150,7 +150,7 @@ def test_photos_that_are_not_there_are_refused(photos, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(frames))
     twins = opened(tmp_path).scenes("train")[0]
     assert frame_list("b/1.png", "--frames", twins) == [1]
-    with pytest.raises(ValueError, match=r"'1\.png' is 0 \(a/1\.png\), 1 \(b/1\.png\)"):
+    with pytest.raises(ValueError, match=r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)"):
         frame_list("1.png", "--frames", twins)
 
 

@@ -20,6 +20,7 @@ from qgs.data.paths import (
     read_json,
     stays_inside,
 )
+from qgs.data.photos.reader import existing
 from qgs.data.stream import SampleError, SampleStream
 
 
@@ -66,13 +67,13 @@ class Store:
 @pytest.fixture
 def flaky(tmp_path, monkeypatch) -> str:
     """The URL of a scene in it."""
-    whole = MemoryFileSystem._open
+    whole = {name: getattr(MemoryFileSystem, name) for name in ("_open", "cat_file")}
 
-    def failing(store, path, mode="rb", **options):
-        if Store.left and mode == "rb":
+    def failing(name, store, path, *mode, **options):
+        if Store.left and mode[:1] != ("wb",):
             Store.left -= 1
             raise ConnectionResetError("the peer hung up")
-        return whole(store, path, mode, **options)
+        return whole[name](store, path, *mode, **options)
 
     monkeypatch.setattr(Store, "left", 0)
     folder, url = tmp_path / "scene", f"memory://{tmp_path.name}"
@@ -81,7 +82,12 @@ def flaky(tmp_path, monkeypatch) -> str:
         place = UPath(url) / file.relative_to(folder).as_posix()
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(file.read_bytes())
-    monkeypatch.setattr(MemoryFileSystem, "_open", failing)
+    for name in whole:
+        monkeypatch.setattr(
+            MemoryFileSystem,
+            name,
+            lambda *given, name=name, **options: failing(name, *given, **options),
+        )
     return url
 
 
@@ -128,6 +134,36 @@ def test_a_store_that_fails_for_good_is_one_error_with_the_url(flaky, pauses):
         SampleStream(source, views, 0).batch([0])
 
 
+def test_a_listing_that_fails_hides_no_photos(flaky, pauses, monkeypatch):
+    names = [UPath(flaky) / "images" / name for name in ("view_002.png", "nothing.png")]
+    whole = MemoryFileSystem.ls
+
+    def failing(store, path, detail=True, **options):
+        if Store.left:
+            Store.left -= 1
+            raise TimeoutError("no answer")
+        return whole(store, path, detail, **options)
+
+    monkeypatch.setattr(MemoryFileSystem, "ls", failing)
+    Store.left = 2
+    assert existing(names) == set(names[:1])
+    assert pauses == [1.0, 4.0]
+    assert existing([UPath(flaky) / "no" / "folder.png"]) == set()
+    Store.left = 3
+    with pytest.raises(StoreError, match="no answer"):
+        existing(names)
+
+
+def test_what_is_damaged_is_not_blamed_on_the_store(flaky, pauses):
+    file = UPath(flaky) / "a.zip"
+    file.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="is no zip archive"):
+        Archive(file)
+    with pytest.raises(OSError, match=r"a\.zip is larger than 5 bytes"):
+        read_file(file, 5)
+    assert pauses == []
+
+
 def test_a_remote_archive_and_a_remote_chunk_are_asked_again(flaky, tmp_path, pauses):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as opened_zip:
         opened_zip.writestr("a.txt", "x" * 100)
@@ -153,5 +189,5 @@ def test_a_file_that_is_read_whole_has_a_limit(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr(member := zipfile.ZipInfo("bomb"), zlib.compress(b"")[2:-4])
         member.compress_type, member.file_size = zipfile.ZIP_DEFLATED, 4 * 10**9
-    with pytest.raises(OSError, match="it is larger than 1 GB"):
+    with pytest.raises(OSError, match="bomb is larger than 500 MB"):
         Archive(UPath(tmp_path / "a.zip")).read("bomb")

@@ -12,6 +12,7 @@ from upath import UPath
 
 from qgs.contracts import Problem
 from qgs.data.lenses import Intrinsics, Lens, Size
+from qgs.data.paths import listing
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _COPY = re.compile(r"images(_\d+)?")
@@ -108,15 +109,14 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
         by_folder.setdefault(str(path.parent), []).append(path)
     held: set[UPath] = set()
     for inside in by_folder.values():
-        folder = inside[0].parent
-        names = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
+        names = {item.name for item in listing(inside[0].parent)}
         held.update(path for path in inside if path.name in names)
     return held
 
 
 def image_files(folder: UPath) -> list[UPath]:
     """The photos in a folder, by name."""
-    files = [item for item in folder.iterdir() if not item.name.startswith(".")]
+    files = [item for item in listing(folder) if not item.name.startswith(".")]
     photos = [item for item in files if item.name.lower().endswith(IMAGE_SUFFIXES)]
     return sorted(photos, key=lambda item: item.name)
 
