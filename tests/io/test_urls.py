@@ -1,6 +1,7 @@
 import sys
 import zipfile
 import zlib
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -69,7 +70,7 @@ def flaky(tmp_path, monkeypatch) -> str:
     """The URL of a scene in it."""
     whole = {name: getattr(MemoryFileSystem, name) for name in ("_open", "cat_file")}
 
-    def failing(name, store, path, *mode, **options):
+    def failing(store, name, path, *mode, **options):
         if Store.left and mode[:1] != ("wb",):
             Store.left -= 1
             raise ConnectionResetError("the peer hung up")
@@ -83,11 +84,7 @@ def flaky(tmp_path, monkeypatch) -> str:
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(file.read_bytes())
     for name in whole:
-        monkeypatch.setattr(
-            MemoryFileSystem,
-            name,
-            lambda *given, name=name, **options: failing(name, *given, **options),
-        )
+        monkeypatch.setattr(MemoryFileSystem, name, partialmethod(failing, name))
     return url
 
 
