@@ -263,11 +263,10 @@ def damage(path: Path, dice: random.Random) -> str:
         return "raw"
     names = []
     for change in dice.choices(CHANGES, k=dice.choice((1, 1, 1, 2))):
-        file = File.read(path)
         try:
-            change(file, dice)
-        except (TypeError, KeyError, ValueError, IndexError):  # on top of another change
-            continue
+            change(file := File.read(path), dice)
+        except (TypeError, KeyError, ValueError, IndexError, RecursionError):
+            continue  # on top of another change
         path.write_bytes(file.bytes())
         names.append(change.__name__)
     return "+".join(names)

@@ -144,6 +144,10 @@ RECORDS = {
     "sizes of NaN": (record(sizes=torch.full((4, 2), torch.nan)), "'sizes' must be whole pixels"),
     "sizes of 0": (record(sizes=torch.zeros(4, 2).long()), "'sizes' must be whole pixels"),
     "held_out of a number": (record(held_out=7), "'held_out' must list frames from 0 to 3, got 7"),
+    "held_out that is nowhere": (
+        record(held_out=torch.zeros(2).to("meta")),
+        "got a sparse, quantised or expanded tensor",
+    ),
     "a list in itself": (record(names=[[]] * 3), "3 names for 4 images"),
     "a mask of another shape": (record(masks=[WRONG_MASK] * 4), "another aspect ratio"),
     "a mask that is none": (record(masks=[torch.zeros(9).byte()] * 4), "is unusable"),
@@ -196,12 +200,24 @@ def test_a_chunk_with_a_scene_of_one_photo(tmp_path):
     assert any("1 photos are there, and a scene needs 2" in line for line in lines)
 
 
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"s0": ' + "9" * 5000 + "}"])
+def test_keys_that_no_terminal_prints(tmp_path):
+    folder = saved(tmp_path, record(key="\x1b[2J" + "k" * 10_000))
+    with pytest.raises(ValueError, match="does not hold the scene 's0'") as caught:
+        everything(folder, ChunksSource)
+    assert "holds '\\x1b[2Jkkk" in str(caught.value)
+    assert len(str(caught.value)) < 2000
+
+
+INDICES = ["[" * 100_000, '{"s0": ' + "9" * 5000 + "}", json.dumps({"s0": "x" * 100_000})]
+
+
+@pytest.mark.parametrize("content", INDICES, ids=["deep", "number", "name"])
 def test_an_index_of_chunks(tmp_path, content):
     folder = saved(tmp_path, record())
     (folder / "train" / "index.json").write_text(content)
-    with pytest.raises(ValueError, match=r"index\.json"):
+    with pytest.raises(ValueError, match=r"index\.json") as caught:
         opened(folder, source=ChunksSource)
+    assert len(str(caught.value)) < 2000
     assert told(folder)
 
 
