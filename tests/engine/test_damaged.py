@@ -22,7 +22,7 @@ from qgs.engine import training
 from qgs.engine.checkpoint import read_state
 from qgs.engine.fit import OutOfMemoryError
 from qgs.engine.folder import FolderGoneError, RunFolder
-from qgs.io.checkpoint import CheckpointError
+from qgs.io.checkpoint import CheckpointError, load_domain
 from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -62,6 +62,7 @@ def with_nan(name: str) -> Callable[[dict[str, torch.Tensor]], Any]:
 
 
 WEIGHT = "queries.features"
+EMA = "training.ema=0.9"
 MOMENT = "moments/model.queries.features/exp_avg"
 
 
@@ -95,6 +96,70 @@ def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
         run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
     assert str(state) in str(caught.value)
     assert before == {p.name: p.read_bytes() for p in copied.iterdir() if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    "domain",
+    ['{"samples": 1e999, "ranges": {}}',
+     '{"samples": 3, "ranges": {"fov": [1' + "0" * 400 + ", 2]}}",
+     '{"samples": 3, "ranges": {"fov": 7}}', "[]", '{"samples": 3}', "{", "[" * 9000],
+    ids=lambda text: text[:40],
+)  # fmt: skip
+def test_a_damaged_domain_is_told_with_its_file(copied: Path, tiny: Tiny, domain: str) -> None:
+    file = copied / "checkpoint.safetensors"
+    rewrite(file, lambda tensors: None, **{"qgs.extra.trained_on": domain})
+    for action in (
+        lambda: load_domain(file),
+        lambda: run(tiny("tokengs", EMA), copied, resume=True),
+    ):
+        with pytest.raises(CheckpointError, match=r"trained_on` in its metadata") as caught:
+            action()
+        assert str(file) in str(caught.value)
+
+
+def test_a_run_starts_from_no_weights_that_are_not_finite(
+    copied: Path, tiny: Tiny, tmp_path: Path
+) -> None:
+    file = copied / "checkpoint.safetensors"
+    rewrite(file, with_nan(WEIGHT))
+    with pytest.raises(CheckpointError, match=f"{file} has weights that are not finite: {WEIGHT}"):
+        run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_moments_are_finite_but_squares(copied: Path, tiny: Tiny) -> None:
+    state = copied / "state.safetensors"
+    for name, sound in ((f"{MOMENT}_sq", True), (MOMENT, False)):
+        rewrite(state, lambda t, name=name: t[name].view(-1)[:1].fill_(torch.inf))
+        if sound:
+            run(tiny("tokengs", "training.steps=4", EMA), copied, resume=True)
+            continue
+        with pytest.raises(CheckpointError, match=r"`moments` cannot be restored .not finite") as e:
+            run(tiny("tokengs", "training.steps=5", EMA), copied, resume=True)
+        assert str(state) in str(e.value)
+
+
+def test_a_run_that_cannot_go_on_is_told_with_its_file(copied: Path, tiny: Tiny) -> None:
+    state = copied / "state.safetensors"
+    for options in (["seed=5"], ["training.batch_size=7"]):
+        with pytest.raises(ValueError, match=f"^{state} is of a run "):
+            run(tiny("tokengs", EMA, *options), copied, resume=True)
+    state.unlink()
+    state.mkdir()
+    with pytest.raises(FileExistsError, match=f"^{state} is missing or no file"):
+        run(tiny("tokengs", EMA), copied, resume=True)
+
+
+def test_messages_of_damage_stay_short(copied: Path) -> None:
+    file = copied / "checkpoint.safetensors"
+    whole = file.read_bytes()
+    header = whole[8 : 8 + int.from_bytes(whole[:8], "little")].replace(
+        b'"F32"', b'"%s"' % (b"x" * 10**5)
+    )
+    file.write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(CheckpointError, match="is not a whole safetensors file") as caught:
+        qgs.load(file)
+    assert len(str(caught.value)) < 1000
 
 
 def test_moments_of_another_shape_are_refused(copied: Path, tiny: Tiny) -> None:

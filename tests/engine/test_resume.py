@@ -209,7 +209,7 @@ def test_a_step_must_see_as_many_samples(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.batch_size=2", "training.save_every=1")
     run(recipe, tmp_path / "through")
     kill_after(2, recipe, folder)
-    with pytest.raises(OtherRunError, match="sees 2 samples, here it would see 3"):
+    with pytest.raises(OtherRunError, match="see 2 samples, here they would see 3"):
         resumed(tiny("tokengs", "training.batch_size=3"), folder)
     halves = tiny("tokengs", "training.batch_size=1", "training.accumulate=2")
     assert resumed(halves, folder).steps == 4
