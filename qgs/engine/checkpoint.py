@@ -432,7 +432,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         return []
     path = checkpoint_of(recipe.init_from)
     learned_by = load_recipe(path)
-    learned = {name: tensor.float() for name, tensor in read_tensors(path).items()}
+    stored = read_tensors(path)
+    learned = {name: tensor.float() for name, tensor in stored.items()}
     if fault := broken(learned, "weights"):
         raise CheckpointError(f"init_from: {path} has weights that are {fault}: take another file")
     options = [
@@ -441,6 +442,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         if option != "model.queries.count"
     ]
     found = _differences(learned, model, learned_by.build_model("meta").queries.count)
+    found += differing_types(stored, unique_tensors(model), widened=True)
     if found:
         first = (
             f"init_from: {path} does not fit this recipe; only the number of queries may differ:"

@@ -124,6 +124,11 @@ def test_a_run_starts_from_no_weights_that_are_not_finite(
     rewrite(file, with_nan(WEIGHT))
     with pytest.raises(CheckpointError, match=f"{file} has weights that are not finite: {WEIGHT}"):
         run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
+    rewrite(file, as_integers(WEIGHT))
+    with pytest.raises(
+        CheckpointError, match=f"{file} does not fit (.|\\n)*type of {WEIGHT}: torch.int32"
+    ):
+        run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 

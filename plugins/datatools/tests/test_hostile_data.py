@@ -82,7 +82,15 @@ def llff(folder: Path) -> str:
     return "poses_bounds.npy"
 
 
+def endless(folder: Path) -> str:
+    write_colmap(folder, synthetic(folder / "photos"), "text")
+    with (folder / "sparse" / "0" / "images.txt").open("wb") as file:
+        file.truncate(10**12)
+    return "images.txt has a line of 10,000,000 characters or more"
+
+
 FOLDERS = {
+    "images.txt of 1 TB": endless,
     "a pose of 400 digits": changed(pose),
     "a focal length of 400 digits": changed(lambda data: data.update(fl_x=HUGE)),
     "a principal point of 400 digits": changed(lambda data: data.update(cx=-HUGE)),

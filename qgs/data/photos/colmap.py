@@ -32,6 +32,7 @@ _LENSES: dict[str, type[Lens] | None] = {
     "SIMPLE_RADIAL_FISHEYE": Fisheye,
     "RADIAL_FISHEYE": Fisheye,
 }
+_LONGEST = 10_000_000  # characters of a line; the points of a photo take some 100,000
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
@@ -113,11 +114,14 @@ def _text_images(model: UPath) -> Iterator[Image]:
 def _lines(file: UPath, after: int = 0) -> Iterator[str]:
     """The lines of a file less comments, empty ones, and so many `after` each of the others."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8") as opened:
-        for line in map(str.strip, opened):
-            if line and not line.startswith("#"):
+        lines = iter(lambda: opened.readline(_LONGEST), "")
+        for line in lines:
+            if len(line) == _LONGEST:
+                raise ValueError(f"{file.name} has a line of {_LONGEST:,} characters or more")
+            if (line := line.strip()) and not line.startswith("#"):
                 yield line
                 for _ in range(after):
-                    next(opened, None)
+                    next(lines, None)
 
 
 def _binary_cameras(model: UPath) -> Iterator[Camera]:
