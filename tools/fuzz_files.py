@@ -205,7 +205,7 @@ def damage(path: Path, dice: random.Random) -> str:
     for change in dice.choices(CHANGES, k=dice.choice((1, 1, 1, 2))):
         try:
             change(file := File.read(path), dice)
-        except (TypeError, KeyError, ValueError, IndexError, RecursionError):
+        except (TypeError, KeyError, ValueError, IndexError, AttributeError, RecursionError):
             continue  # on top of another change
         path.write_bytes(file.bytes())
         names.append(change.__name__)

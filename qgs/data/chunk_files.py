@@ -330,7 +330,7 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
     index = read_json(path, "copy it again, or remove it to have the chunks read instead")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
-    of_files = {n for n in set(index.values()) if stays_inside(n) and _is_short(n)}
+    of_files = {n for n in set(index.values()) if stays_inside(n) and len(n) < 256}
     for key, name in index.items():
         if name not in of_files:
             raise ValueError(
@@ -338,11 +338,6 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
                 "own folder or no name of a file: such an index is not read"
             )
     return index
-
-
-def _is_short(name: str) -> bool:
-    """Whether a file can have the name."""
-    return len(name.encode(errors="replace")) < 256
 
 
 def list_scenes(folder: UPath) -> dict[str, UPath]:

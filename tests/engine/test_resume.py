@@ -291,8 +291,8 @@ def test_a_state_with_damaged_metadata_is_refused_by_its_name(tiny: Tiny, tmp_pa
     damage("`qgs.state_version` ", state_version="one")
     damage("`qgs.state_version` .*KeyError", state_version=None)
     damage("not the tensors that were written: foo", {"foo": torch.zeros(2)})
-    damage("the tensor `foo` belongs to no part", {"foo": torch.zeros(2)}, tensors=None)
-    damage("the tensor `foo/bar` belongs to no part", {"foo/bar": torch.zeros(2)}, tensors=None)
+    damage("the tensor `foo` belongs to no part", {"foo": torch.zeros(2)}, contents=None)
+    damage("the tensor `foo/bar` belongs to no part", {"foo/bar": torch.zeros(2)}, contents=None)
     for part, key, value, message in (
         ("counters", "step", None, r"`counters` .*step is 'None'"),
         ("counters", "step", -1, "step is '-1'"),
