@@ -105,13 +105,13 @@ def read_file(path: Path | UPath) -> bytes:
     """The bytes of `path`. Raises as `open_file`, and OSError for one beyond LARGEST."""
     with open_file(path) as file:
         if is_local(path):
-            _refuse_huge(path.stat().st_size)
+            _refuse_huge(path, path.stat().st_size)
         return file.read()
 
 
-def _refuse_huge(size: int) -> None:
+def _refuse_huge(file: object, size: int) -> None:
     if size > LARGEST:
-        raise OSError(f"it has {in_words(size)}, more than any photo or list of them")
+        raise OSError(f"{file} has {in_words(size)}, more than any photo or list of them")
 
 
 def read_json(path: UPath, fix: str, **options: Any) -> Any:
@@ -168,7 +168,7 @@ class Archive:
     def read(self, member: str) -> bytes:
         """The bytes of a file. Raises OSError for one that is absent or damaged."""
         try:
-            _refuse_huge(self._zip.getinfo(self.files[member]).file_size)
+            _refuse_huge(member, self._zip.getinfo(self.files[member]).file_size)
             return asked_again(self._path, lambda: self._zip.read(self.files[member]))
         except KeyError as error:
             raise FileNotFoundError(f"the archive has no file {member}") from error

@@ -148,7 +148,9 @@ def test_a_remote_archive_and_a_remote_chunk_are_asked_again(flaky, tmp_path, pa
 def test_a_file_that_is_read_whole_has_a_limit(tmp_path):
     with (tmp_path / "huge.json").open("wb") as file:
         file.truncate(2 * 10**9)
-    with pytest.raises(ValueError, match=r"huge.json .* \(it has 2 GB, more than any photo"):
+    with pytest.raises(
+        ValueError, match=r"huge.json .* \(.*huge.json has 2 GB, more than any photo"
+    ):
         read_json(UPath(tmp_path / "huge.json"), "")
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr(member := zipfile.ZipInfo("bomb"), zlib.compress(b"")[2:-4])

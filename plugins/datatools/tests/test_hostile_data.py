@@ -91,6 +91,7 @@ def endless(folder: Path) -> str:
 
 FOLDERS = {
     "images.txt of 1 TB": endless,
+    "a COLMAP word of 100,000 letters": colmap_of(" 50.0 ", f" {'x' * 100_000} "),
     "a pose of 400 digits": changed(pose),
     "a focal length of 400 digits": changed(lambda data: data.update(fl_x=HUGE)),
     "a principal point of 400 digits": changed(lambda data: data.update(cx=-HUGE)),

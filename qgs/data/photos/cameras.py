@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from upath import UPath
 
-from qgs.data.paths import read_file, read_json
+from qgs.data.paths import open_file, read_json
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
     Listing,
@@ -39,7 +39,10 @@ class CamerasJson(PhotoReader):
     def recognises(cls, folder: UPath) -> bool:
         """See `PhotoReader`: other programs give other files this name."""
         file = folder / cls.listing
-        content = read_file(file) if file.is_file() else b""
+        if not file.is_file():
+            return False
+        with open_file(file) as opened:
+            content = opened.read(2**20)
         return all(key in content for key in (b'"c2w"', b'"K"'))
 
     @classmethod

@@ -20,6 +20,7 @@ from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
 from qgs.data.paths import open_file
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
+from qgs.wording import name_shown
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 _LENSES: dict[str, type[Lens] | None] = {
@@ -67,7 +68,7 @@ class Colmap(PhotoReader):
         except ValueError as error:
             raise ValueError(
                 f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
-                f"{error}; export it again, or copy it again"
+                f"{name_shown(str(error))}; export it again, or copy it again"
             ) from error
         photos = image_folder(folder, images)
         frames = [
