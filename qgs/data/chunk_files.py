@@ -126,11 +126,10 @@ def parse_record(file: str, data: Any) -> Record:
     _expect(len(names) == count, where, f"{len(names)} names for {count} images")
     given = data.get("held_out")
     given = given.flatten().tolist() if _is_plain(given) else () if given is None else given
-    one = given if isinstance(given, int) else _described(given)
-    held_out = tuple(given) if isinstance(given, list | tuple) else (one,)
+    held_out = tuple(given) if isinstance(given, list | tuple) else (given,)
     of_frames = all(isinstance(frame, int) and 0 <= frame < count for frame in held_out)
     wanted = f"'held_out' must list frames from 0 to {count - 1}"
-    _expect(of_frames, where, f"{wanted}, got {listed(held_out)}")
+    _expect(of_frames, where, f"{wanted}, got {listed(map(_said, held_out))}")
     names = [str(name) for name in names]
     return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
 
@@ -145,6 +144,10 @@ def a_type(value: object) -> str:
     """The type of `value` with its article, such as "an int"."""
     name = type(value).__name__
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
+def _said(frame: Any) -> str:
+    return repr(frame) if isinstance(frame, int | str) else _described(frame)
 
 
 def _described(data: Any) -> str:

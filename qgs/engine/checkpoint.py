@@ -119,7 +119,7 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
 
 def contents(tensors: Mapping[str, Tensor]) -> dict[str, str]:
     """What tells tensors on the CPU from others: types, shapes, checksums of their bytes."""
-    sums = {name: crc32(t.reshape(-1).view(torch.uint8).numpy()) for name, t in tensors.items()}
+    sums = {n: crc32(t.reshape(-1).view(torch.uint8).numpy().data) for n, t in tensors.items()}
     return {n: f"{t.dtype} {list(t.shape)} crc32 {sums[n]:08x}" for n, t in tensors.items()}
 
 
