@@ -6,10 +6,13 @@ from collections.abc import Iterable, Sequence
 
 
 def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
-    """The first `most` of `names`, and how many more there are; "" for none."""
+    """The first `most` of `names`, and how many more there are; "" for none.
+
+    Long ones are cut, those that no terminal prints as they are escaped.
+    """
     shown = [*map(str, names)]
     more = f" and {len(shown) - most} more" if len(shown) > most else ""
-    return between.join(shown[:most]) + more
+    return between.join(name_shown(name) for name in shown[:most]) + more
 
 
 def numbered(frame: int, name: str) -> str:
@@ -28,3 +31,9 @@ def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
     before = [names[:index].count(name) for index, name in enumerate(names)]
     return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
+
+
+def name_shown(name: str, most: int = 500) -> str:
+    """`name` as a message shows it, of at most some characters."""
+    name = name if name.replace("\n", "").isprintable() else repr(name)
+    return name if len(name) <= most else f"{name[:most]} ... ({len(name):,} characters)"

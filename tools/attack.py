@@ -5,12 +5,14 @@ in one error of ours that names the file, within SECONDS of processor time and B
 """
 
 import argparse
+import math
 import os
 import random
 import resource
 import select
 import shutil
 import signal
+import struct
 import tempfile
 import time
 import traceback
@@ -18,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -26,6 +29,12 @@ LONGEST = 60.0
 """Seconds by the clock after which a case hangs, on however busy a machine."""
 CHARACTERS = 100_000
 """The longest message that is one."""
+JUNK: tuple[Any, ...] = (
+    10**400, -(10**400), 10**4000, 10**30, 10**18, -1, 0, 1.5, 1e308, -1e308, 1e-320, math.nan,
+    math.inf, None, True, "", "foo", "\0", "\ud800", "\x1b[2J", "x" * 100_000, "../" * 50, "images",
+    "/etc/passwd", "/dev/zero", ".", [], {}, [[]], [None] * 4, [0] * 10_000, {"a": {"b": None}},
+)  # fmt: skip
+"""Values where others belong."""
 _ROOM = 8 * 2**30  # of addresses, beyond those in use
 
 Use = Callable[[], str]
@@ -59,6 +68,74 @@ def refused(error: BaseException, file: str = "") -> str:
     if not text.replace("\n", "").isprintable():
         raise FaultError(f"a message that no terminal prints as it is: {text[:500]!r}")
     return f"refused {type(error).__name__}"
+
+
+def other_leaf(tree: Any, dice: random.Random) -> str:
+    """Put junk in place of a leaf or a branch of JSON, or remove it; its path, and what it is."""
+    holder, path = tree, []
+    while True:
+        key = dice.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
+        path.append(key)
+        inside = holder[key]
+        if not isinstance(inside, dict | list) or not inside or dice.random() < 0.12:
+            break
+        holder = inside
+    holder[key] = value = dice.choice(JUNK)
+    if dice.random() < 0.15:
+        del holder[key]
+    return f"{path} is {str(value)[:30]!r}"
+
+
+def other_bytes(file: Path, dice: random.Random) -> str:
+    """Damage the bytes of a file, or put something else in its place; what was done."""
+    data = bytearray(file.read_bytes())
+    what = dice.choice(("cut", "flip", "zeros", "junk", "random", "count", "place", "NaN", "more"))
+    at = dice.randrange(max(len(data), 1))
+    if what == "cut":
+        del data[at:]
+    elif what in ("flip", "zeros"):
+        for place in range(at, min(at + dice.choice((1, 8, 64)), len(data))):
+            data[place] = 0 if what == "zeros" else data[place] ^ dice.randrange(1, 256)
+    elif what == "count":
+        data[:8] = struct.pack("<Q", dice.choice((0, len(data), 10**8, 2**40, 2**63, 2**64 - 1)))
+    elif what == "NaN":  # of whatever numbers lie there
+        data[at : at + 8] = struct.pack("<d", dice.choice((math.nan, 1e308, -1.0, 0.0)))
+    elif what == "more":
+        data += bytes(dice.randint(1, 100))
+    elif what == "junk":
+        starts = (
+            b"PK\x03\x04",
+            b"\x80\x02.",
+            b"\x1f\x8b\x08",
+            b"<!DOCTYPE html>",
+            b"{}",
+            b"\xff" * 9,
+        )
+        data = dice.choice((b"", *starts)) + dice.choice((b"", data))
+    elif what == "random":
+        data = dice.randbytes(len(data))
+    else:
+        return other_place(file, dice)
+    file.write_bytes(data)
+    return f"{what} at {at}"
+
+
+def other_place(file: Path, dice: random.Random) -> str:
+    """Put something else in place of a file; what."""
+    file.unlink()
+    what = dice.choice(
+        ("pipe", "folder", file.name, "/dev/zero", "/dev/null", "nowhere", "1 TB", "")
+    )
+    if what == "pipe":
+        os.mkfifo(file)
+    elif what == "folder":
+        file.mkdir()
+    elif what == "1 TB":
+        with file.open("wb") as opened:
+            opened.truncate(10**12)
+    elif what:
+        file.symlink_to(what)
+    return f"is {what or 'absent'}"
 
 
 def in_child(work: Callable[[], object]) -> int:

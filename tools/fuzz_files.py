@@ -8,7 +8,6 @@ A checkpoint is loaded and made into Gaussians, a state is trained on; see attac
 """
 
 import json
-import os
 import random
 import shutil
 import sys
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from attack import Use, attack, refused
+from attack import JUNK, Use, attack, other_bytes, other_leaf, refused
 from kill_training import RECIPE
 from rich.console import Console
 
@@ -32,11 +31,6 @@ from qgs.io.checkpoint import load_domain, load_step
 from qgs.io.ply import write_ply
 
 STEPS = 2
-JUNK = (
-    None, True, -1, 0, 1.5, 10**30, 10**400, float("nan"), float("inf"), "", "foo", "\0", "\ud800",
-    "/dev/zero", "/etc/passwd", "../" * 50, "x" * 100_000, [], {}, [[]], {"a": {"b": None}},
-    [0] * 10_000,
-)  # fmt: skip
 LARGE = {
     "model.width": (4096, 65536, 10**9),
     "model.queries.count": (10**5, 10**8, 10**18, 10**30),
@@ -91,18 +85,10 @@ def other_type(file: File, dice: random.Random) -> None:
 def other_shape(file: File, dice: random.Random) -> None:
     _, entry = a_tensor(file, dice)
     shape = entry["shape"]
-    changes: tuple[Callable[[], Any], ...] = (
-        lambda: shape[::-1],
-        lambda: [*shape, 1],
-        lambda: [1, *shape],
-        lambda: [-n for n in shape],
-        lambda: [n * 2**40 for n in shape] or [2**62],
-        lambda: [0, *shape],
-        lambda: [2**33, 2**33, *shape],
-        lambda: dice.choice(JUNK),
-        lambda: [torch.Size(shape).numel()],
-    )
-    entry["shape"] = dice.choice(changes)()
+    large = [n * 2**40 for n in shape] or [2**62]
+    changes = (shape[::-1], [*shape, 1], [1, *shape], [-n for n in shape], large, [0, *shape])
+    more = [2**33, 2**33, *shape], [torch.Size(shape).numel()], dice.choice(JUNK)
+    entry["shape"] = dice.choice((*changes, *more))
 
 
 def cut_rows(file: File, dice: random.Random) -> None:
@@ -165,19 +151,7 @@ def other_value_of_json(file: File, dice: random.Random) -> None:
     """A leaf, or a branch, of the JSON in the metadata."""
     trees = {k: json.loads(v) for k, v in file.metadata.items() if v[:1] in "{["}
     key = dice.choice(list(trees))
-    place: Any = trees[key]
-    while True:
-        keys = list(place) if isinstance(place, dict) else range(len(place))
-        if not keys:
-            break
-        chosen = dice.choice(keys)
-        inner = place[chosen]
-        if not isinstance(inner, dict | list) or not inner or dice.random() < 0.1:
-            place[chosen] = dice.choice(JUNK)
-            if isinstance(place, dict) and dice.random() < 0.2:
-                del place[chosen]
-            break
-        place = inner
+    other_leaf(trees[key], dice)
     file.metadata[key] = json.dumps(trees[key])
 
 
@@ -217,39 +191,6 @@ def other_header(file: File, dice: random.Random) -> None:
     ))  # fmt: skip
 
 
-def raw(path: Path, dice: random.Random) -> None:
-    """The bytes themselves, or something else in place of the file."""
-    whole = bytearray(path.read_bytes())
-    end = 8 + int.from_bytes(whole[:8], "little")
-    kind = dice.randrange(9)
-    if kind == 0:
-        whole = whole[: dice.randrange(len(whole))]
-    elif kind == 1:
-        for _ in range(dice.randint(1, 20)):
-            whole[dice.randrange(end)] = dice.randrange(256)
-    elif kind == 2:
-        whole[:8] = dice.choice((0, end, 2**63, 2**64 - 1, 10**8, len(whole))).to_bytes(8, "little")
-    elif kind == 3:
-        whole += bytes(dice.randint(1, 100))
-    elif kind == 4:
-        starts = b"PK\x03\x04", b"\x80\x02.", b"\x1f\x8b\x08", b"<!DOCTYPE html>"
-        junk = (b"", *starts, b"\0" * 100, b"{}", b"\xff" * 9)
-        whole = bytearray(dice.choice(junk) + dice.choice((b"", whole)))
-    elif kind in (5, 6, 7):
-        path.unlink()
-        what = dice.choice(("folder", "pipe", "/dev/zero", "/dev/null", path.name, "nowhere"))
-        if what == "folder":
-            path.mkdir()
-        elif what == "pipe":
-            os.mkfifo(path)
-        else:
-            path.symlink_to(what)
-        return
-    else:
-        whole = whole[: end + dice.randrange(64)]
-    path.write_bytes(whole)
-
-
 CHANGES = (
     other_type, other_shape, cut_rows, other_offsets, other_name, other_values, other_metadata,
     other_value_of_json, other_value_of_json, larger, other_recipe, other_header,
@@ -259,15 +200,13 @@ CHANGES = (
 def damage(path: Path, dice: random.Random) -> str:
     """Change the file in one way, rarely in two; the names of the ways."""
     if dice.random() < 0.12:
-        raw(path, dice)
-        return "raw"
+        return other_bytes(path, dice)
     names = []
     for change in dice.choices(CHANGES, k=dice.choice((1, 1, 1, 2))):
-        file = File.read(path)
         try:
-            change(file, dice)
-        except (TypeError, KeyError, ValueError, IndexError):  # on top of another change
-            continue
+            change(file := File.read(path), dice)
+        except (TypeError, KeyError, ValueError, IndexError, AttributeError, RecursionError):
+            continue  # on top of another change
         path.write_bytes(file.bytes())
         names.append(change.__name__)
     return "+".join(names)

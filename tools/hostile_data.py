@@ -10,13 +10,14 @@ import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from attack import JUNK, other_bytes, other_leaf, other_place
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 formats: Any = importlib.import_module("photo_formats")
@@ -24,13 +25,6 @@ Image: Any = formats.Image
 
 _SIZE = (30, 40)
 _DEEP = 100_000
-_HOSTILE: Sequence[Any] = (
-    10**400, -(10**400), 10**5000, 10**18, -1, 0, 1e308, -1e308, 1e-320, float("nan"),
-    float("inf"), None, True, "", "\0", "\ud800", "x" * 100_000, "../../../../etc/passwd",
-    "/dev/zero", "images", ".", [], {}, [[]], [None] * 4, {"a": 1}, "NaN", 1.5,
-)  # fmt: skip
-
-
 _PRESS = zlib.compressobj(9, zlib.DEFLATED, -15)
 _BOMB = (_PRESS.compress(bytes(10**6)) + _PRESS.flush(zlib.Z_FULL_FLUSH)) * 4000 + _PRESS.flush()
 """4 GB of zeros."""
@@ -160,7 +154,7 @@ def _record(folder: Path, record: dict[str, Any], chance: random.Random) -> str:
         place = chance.randrange(len(value))
         record[key] = [change(item) if i == place else item for i, item in enumerate(value)]
     else:
-        record[key] = chance.choice([*_HOSTILE, torch.tensor(1), torch.tensor([2**62]), [3] * 5])
+        record[key] = chance.choice([*JUNK, torch.tensor(1), torch.tensor([2**62]), [3] * 5])
     records: Any = [record]
     twist = chance.randrange(12)
     if twist == 0:
@@ -191,22 +185,9 @@ def _json(folder: Path, _: Any, chance: random.Random) -> str:
         file.write_bytes(data)
         return f"{file.name} is {told}"
     data = json.loads(whole)
-    holder, path = data, []
-    while True:
-        key = chance.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
-        path.append(key)
-        inside = holder[key]
-        if not isinstance(inside, dict | list) or not inside or chance.random() < 0.15:
-            break
-        holder = inside
-    value = chance.choice(_HOSTILE)
-    if chance.random() < 0.15:
-        del holder[key]
-    else:
-        holder[key] = value
-    text = json.dumps(data)
-    file.write_text(text)
-    return f"{file.name} {path} is {str(value)[:30]!r}"
+    said = other_leaf(data, chance)
+    file.write_text(json.dumps(data))
+    return f"{file.name} {said}"
 
 
 def _array(folder: Path, _: Any, chance: random.Random) -> str:
@@ -247,48 +228,14 @@ def _text(folder: Path, _: Any, chance: random.Random) -> str:
         return _bytes(chance.choice(sorted(folder.rglob("*.bin"))), chance)
     file = chance.choice(found)
     words = file.read_text().split(" ")
-    place, value = chance.randrange(len(words)), chance.choice(_HOSTILE[:17])
-    words[place] = "9" * 5000 if value == 10**5000 else str(value)
+    place, value = chance.randrange(len(words)), chance.choice(JUNK[:21])
+    words[place] = str(value)
     file.write_text(" ".join(words), errors="replace")
     return f"{file.name}, word {place} is {words[place][:30]!r}"
 
 
 def _bytes(file: Path, chance: random.Random) -> str:
-    """Damage the bytes of a file, or put something else in its place."""
-    data = bytearray(file.read_bytes())
-    what = chance.choice(["cut", "flip", "zeros", "empty", "random", "count", "place", "NaN"])
-    at = chance.randrange(max(len(data), 1))
-    if what == "cut":
-        del data[at:]
-    elif what in ("flip", "zeros"):
-        for place in range(at, min(at + chance.choice([1, 8, 64]), len(data))):
-            data[place] = 0 if what == "zeros" else data[place] ^ chance.randrange(1, 256)
-    elif what == "count":
-        data[:8] = struct.pack("<Q", chance.choice([0, 2**40, 2**63, 2**64 - 1]))
-    elif what == "NaN":  # of whatever numbers lie there
-        data[at : at + 8] = struct.pack("<d", chance.choice([float("nan"), 1e308, -1.0, 0.0]))
-    elif what == "place":
-        return _in_place_of(file, chance)
-    else:
-        data = bytearray() if what == "empty" else bytearray(chance.randbytes(len(data)))
-    file.write_bytes(data)
-    return f"{file.name}: {what} at {at}"
-
-
-def _in_place_of(file: Path, chance: random.Random) -> str:
-    file.unlink()
-    what = chance.choice(["pipe", "folder", "loop", "nothing", "/dev/zero", "no target", "1 TB"])
-    if what == "pipe":
-        os.mkfifo(file)
-    elif what == "folder":
-        file.mkdir()
-    elif what == "1 TB":
-        with file.open("wb") as opened:
-            opened.truncate(10**12)
-    elif what != "nothing":
-        target = {"loop": file.name, "no target": "nowhere"}.get(what, what)
-        file.symlink_to(target)
-    return f"{file.name} is {what}"
+    return f"{file.name}: {other_bytes(file, chance)}"
 
 
 def _image(folder: Path, chance: random.Random) -> str:
@@ -298,50 +245,35 @@ def _image(folder: Path, chance: random.Random) -> str:
     if not found:
         return "no change: its photos are inside of another file"
     file = chance.choice(found)
+    shades, exif = [*map(_grey, range(200))], Image.Exif()
+    exif[0x0112] = 6
     kinds: dict[str, Callable[[], bytes]] = {
         "bomb": lambda: _png(30_000, 30_000),
         "large": lambda: _png(4_000, 3_000),
         "swapped": lambda: _png(30, 40),
         "no pixels": lambda: _png(0, 0),
-        "float": lambda: formats.encoded(_float(), "TIFF"),
+        "float": lambda: formats.encoded(Image.fromarray(np.ones(_SIZE, np.float32)), "TIFF"),
         "PostScript": lambda: formats.encoded(np.zeros((*_SIZE, 3), np.uint8), "EPS"),
         "48 megapixels": _of_48_megapixels,
-        "turned": lambda: formats.encoded(_grey(), "JPEG", exif=_turned()),
+        "turned": lambda: formats.encoded(_grey(), "JPEG", exif=exif),
         "16 bits": lambda: formats.encoded(np.full(_SIZE, 40_000, np.uint16)),
         "text bomb": lambda: _png(40, 30, b"zTXt", b"a\0\0" + zlib.compress(b" " * 10**8)),
         "profile": lambda: _png(40, 30, b"iCCP", b"a\0\0" + zlib.compress(b"\xff" * 10**6)),
-        "many frames": lambda: formats.encoded(
-            _grey(),
-            "GIF",
-            save_all=True,
-            append_images=[Image.new("L", _SIZE[::-1], shade) for shade in range(1, 200)],
-        ),
-        "many pages": lambda: formats.encoded(
-            _grey(), "TIFF", save_all=True, append_images=[Image.new("L", (1, 1))] * 50
-        ),
+        "many frames": lambda: formats.encoded(_grey(), "GIF", save_all=True, append_images=shades),
+        "many pages": lambda: formats.encoded(_grey(), "TIFF", save_all=True, append_images=shades),
         "web page": lambda: b"<!DOCTYPE html><title>404</title>" * 9,
     }
     kind = chance.choice([*kinds, "bytes", "bytes", "place"])
     if kind == "bytes":
         return _bytes(file, chance)
     if kind == "place":
-        return _in_place_of(file, chance)
+        return f"{file.name} {other_place(file, chance)}"
     file.write_bytes(kinds[kind]())
     return f"{file.name} is {kind}"
 
 
-def _float() -> Any:
-    return Image.fromarray(np.ones(_SIZE, np.float32))
-
-
-def _grey() -> Any:
-    return Image.new("L", _SIZE[::-1], 128)
-
-
-def _turned() -> Any:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    return exif
+def _grey(shade: int = 128) -> Any:
+    return Image.new("L", _SIZE[::-1], shade)
 
 
 @cache
@@ -365,26 +297,23 @@ def _png(width: int, height: int, kind: bytes = b"", data: bytes = b"") -> bytes
     return b"\x89PNG\r\n\x1a\n" + header + more + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
-def _colmap(kind: str) -> Callable[[Path, random.Random], Any]:
-    return lambda folder, chance: formats.write_colmap(folder, _photos(folder, chance), kind)
+def _of_format(write: Callable[..., Any], *options: Any) -> Callable[..., Any]:
+    return lambda folder, chance: write(folder, _photos(folder, chance), *options)
 
 
-def _llff(folder: Path, chance: random.Random) -> Any:
-    return formats.write_llff(folder, _photos(folder, chance))
-
-
-def _blender(folder: Path, chance: random.Random) -> Any:
-    return formats.write_blender(folder, _photos(folder, chance), 3)
-
-
-_MODEL = tuple(f"sparse/0/{name}" for name in ("cameras", "images"))
 _WRITERS: dict[str, tuple[Callable[..., Any], tuple[str, ...], tuple[Callable[..., str], ...]]] = {
     "nerfstudio": (_nerfstudio, ("transforms.json",), (_json, _json, _array)),
-    "blender": (_blender, ("transforms_train.json",), (_json,)),
+    "blender": (_of_format(formats.write_blender, 3), ("transforms_train.json",), (_json,)),
     "cameras": (_cameras, ("cameras.json",), (_json,)),
-    "llff": (_llff, ("poses_bounds.npy",), (_array,)),
-    "colmap text": (_colmap("text"), tuple(f"{name}.txt" for name in _MODEL), (_text,)),
-    "colmap binary": (_colmap("binary"), tuple(f"{name}.bin" for name in _MODEL), (_text,)),
+    "llff": (_of_format(formats.write_llff), ("poses_bounds.npy",), (_array,)),
+    **{
+        f"colmap {kind}": (
+            _of_format(formats.write_colmap, kind),
+            (f"sparse/0/cameras.{suffix}", f"sparse/0/images.{suffix}"),
+            (_text,),
+        )
+        for kind, suffix in (("text", "txt"), ("binary", "bin"))
+    },
     "dl3dv": (_dl3dv, ("inner/transforms.json",), (_zipped,)),
     "chunks": (_chunks, ("train/index.json", "train/0.torch"), (_record, _record, _record, _json)),
 }

@@ -36,7 +36,7 @@ from qgs.data.photos.checks import (
     size_problems,
 )
 from qgs.data.scenes import warn_once
-from qgs.wording import listed
+from qgs.wording import listed, name_shown
 
 INDEX = "index.json"
 SUFFIX = ".torch"
@@ -125,11 +125,11 @@ def parse_record(file: str, data: Any) -> Record:
         names = names if len(names) == count else range(count)
     _expect(len(names) == count, where, f"{len(names)} names for {count} images")
     given = data.get("held_out")
-    given = given.flatten().tolist() if _is_plain(given) else given or ()
+    given = given.flatten().tolist() if _is_plain(given) else () if given is None else given
     held_out = tuple(given) if isinstance(given, list | tuple) else (given,)
     of_frames = all(isinstance(frame, int) and 0 <= frame < count for frame in held_out)
     wanted = f"'held_out' must list frames from 0 to {count - 1}"
-    _expect(of_frames, where, f"{wanted}, got {listed(map(repr, held_out))}")
+    _expect(of_frames, where, f"{wanted}, got {listed(map(_said, held_out))}")
     names = [str(name) for name in names]
     return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
 
@@ -144,6 +144,10 @@ def a_type(value: object) -> str:
     """The type of `value` with its article, such as "an int"."""
     name = type(value).__name__
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
+def _said(frame: Any) -> str:
+    return repr(frame) if isinstance(frame, int | str) else _described(frame)
 
 
 def _described(data: Any) -> str:
@@ -329,12 +333,12 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
     index = read_json(path, "copy it again, or remove it to have the chunks read instead")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
-    inside = {name for name in set(index.values()) if stays_inside(name)}
+    of_files = {n for n in set(index.values()) if stays_inside(n) and len(n) < 256}
     for key, name in index.items():
-        if name not in inside:
+        if name not in of_files:
             raise ValueError(
-                f"{path} places the scene {key!r} in {name!r}, outside its own folder: such an "
-                "index is not read"
+                f"{path} places the scene {name_shown(key)} in {name_shown(name)!r}, outside its "
+                "own folder or no name of a file: such an index is not read"
             )
     return index
 

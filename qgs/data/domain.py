@@ -73,7 +73,8 @@ class Domain:
             sound = all(isinstance(n, int | float) and n >= 0 for n in numbers)
             if not sound or name not in ("samples", *WORDS):
                 raise ValueError(f"{name[:50]} is {str(numbers)[:100]}")
-        self.samples, self.values = int(state["samples"]), dict(state["values"])
+        self.samples = int(state["samples"])
+        self.values = {name: [*map(float, numbers)] for name, numbers in state["values"].items()}
 
     @property
     def text(self) -> str:

@@ -9,10 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.geometry.rays import pixel_directions
-
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
+_ROWS = 64  # that are undistorted at once
+
 Mode: TypeAlias = Literal["bilinear", "nearest"]
 
 
@@ -92,15 +92,20 @@ def undistorted(
     if lens is None:
         return pixels
     height, width = pixels.shape[:2]
-    camera = torch.tensor(intrinsics)
-    focal, centre = camera.split(2)
-    directions = pixel_directions(camera, (height, width))[..., :2]
-    source = focal * lens.distorted(directions) + centre
-    grid = source / torch.tensor([width, height]) * 2 - 1  # (H, W, 2), -1 to 1 across the photo
-    seen = lens.sees(directions) & (grid.abs() <= 1).all(-1)
+    focal, centre = torch.tensor(intrinsics).split(2)
+    x = (torch.arange(width) + 0.5 - centre[0]) / focal[0]
+    y = (torch.arange(height)[:, None] + 0.5 - centre[1]) / focal[1]
     planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
-    flat = F.grid_sample(
-        planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
-    )[0]
-    result = (flat * seen).permute(1, 2, 0).numpy().reshape(pixels.shape)
-    return (result.round() if pixels.dtype.kind in "iu" else result).astype(pixels.dtype)
+    result = np.empty_like(pixels)
+    for top in range(0, height, _ROWS):  # photos of phones would take gigabytes at once
+        block = slice(top, top + _ROWS)
+        directions = torch.stack(torch.broadcast_tensors(x, y[block]), -1)  # (rows, W, 2)
+        source = focal * lens.distorted(directions) + centre
+        grid = source / torch.tensor([width, height]) * 2 - 1  # -1 to 1 across the photo
+        seen = lens.sees(directions) & (grid.abs() <= 1).all(-1)
+        flat = F.grid_sample(
+            planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
+        )[0]
+        part = (flat * seen).permute(1, 2, 0).numpy().reshape(result[block].shape)
+        result[block] = part.round() if pixels.dtype.kind in "iu" else part
+    return result

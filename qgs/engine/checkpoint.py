@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
+from zlib import crc32
 
 import numpy as np
 import torch
@@ -44,7 +45,7 @@ FORMAT_VERSION = 1
 """Raised when the format of the file changes."""
 
 _PARTS, _RECIPE = "qgs.state", "qgs.recipe"
-_FORMAT, _VERSION, _TENSORS = "qgs.state_version", "qgs.version", "qgs.tensors"
+_FORMAT, _VERSION, _TENSORS = "qgs.state_version", "qgs.version", "qgs.contents"
 
 State: TypeAlias = Mapping[str, Any]
 """Tensors and JSON values by name."""
@@ -83,7 +84,7 @@ def write_state(
                 tensors[f"{part}/{key}"] = tensor.cpu().clone(memory_format=torch.contiguous_format)
     metadata = {
         _PARTS: json.dumps(values),
-        _TENSORS: json.dumps(_kinds(tensors)),
+        _TENSORS: json.dumps(contents(tensors)),
         _RECIPE: json.dumps(recipe),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
@@ -113,13 +114,15 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         raise damaged(path, f"its recipe fails here, or needs other plugins: {error}") from error
 
 
-def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, list[Any]]:
-    return {name: [str(t.dtype).removeprefix("torch."), *t.shape] for name, t in tensors.items()}
+def contents(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """What tells tensors on the CPU from others: types, shapes, checksums of their bytes."""
+    sums = {n: crc32(t.reshape(-1).view(torch.uint8).numpy().data) for n, t in tensors.items()}
+    return {n: f"{t.dtype} {list(t.shape)} crc32 {sums[n]:08x}" for n, t in tensors.items()}
 
 
 def _refuse_others(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], path: Any) -> None:
     """Raise CheckpointError unless `tensors` are those that were written."""
-    found, wanted = _kinds(tensors), mapping_in(metadata, _TENSORS, path)
+    found, wanted = contents(tensors), mapping_in(metadata, _TENSORS, path)
     differing = [
         f"{name[:200]}: {found.get(name, 'absent')} instead of {str(wanted.get(name))[:200]}"
         for name in dict.fromkeys([*wanted, *found])

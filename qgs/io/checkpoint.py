@@ -25,7 +25,7 @@ from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, 
 from qgs.io.models import checkpoint_path
 from qgs.memory import TooLargeError
 from qgs.model import QueryGaussianModel
-from qgs.wording import listed
+from qgs.wording import listed, name_shown
 
 FORMAT_VERSION = 2
 """Raised when what a checkpoint holds changes."""
@@ -66,7 +66,8 @@ def opened_tensors(path: str | os.PathLike[str]) -> Iterator[Any]:
             yield file
     except SafetensorError as error:
         raise CheckpointError(
-            f"{path} is not a whole safetensors file ({error}); it may be cut off: copy it again"
+            f"{path} is not a whole safetensors file ({name_shown(str(error))}); it may be cut "
+            "off: copy it again"
         ) from error
 
 

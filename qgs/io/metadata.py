@@ -9,6 +9,7 @@ from typing import Any
 
 import qgs
 from qgs.composer import Recipe, RecipeError, resolve
+from qgs.wording import name_shown
 
 LARGEST = 50_000_000
 """Characters of one entry; states of runs with thousands of processes have fewer."""
@@ -21,8 +22,8 @@ class CheckpointError(ValueError):
 def damaged(path: str | os.PathLike[str], what: str) -> CheckpointError:
     """The error for a file whose metadata are not what we wrote. what: which, and why."""
     return CheckpointError(
-        f"{path} is damaged: {what}. Copy the file again from where it came, or take another "
-        "checkpoint of the run"
+        f"{path} is damaged: {name_shown(what, 5000)}. Copy the file again from where it "
+        "came, or take another checkpoint of the run"
     )
 
 
@@ -33,7 +34,7 @@ def reading(path: str | os.PathLike[str], key: str) -> Iterator[None]:
         yield
     except (RecipeError, CheckpointError):
         raise
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except Exception as error:  # hostile JSON makes anything of what is done with it
         kind = "nested too deep" if isinstance(error, RecursionError) else str(error)[:200]
         why = f"`{key}` in its metadata cannot be read ({type(error).__name__}: {kind})"
         raise damaged(path, why) from error

@@ -29,7 +29,7 @@ def test_a_refusal_is_judged(tmp_path: Path) -> None:
     with pytest.raises(FaultError, match="characters"):
         refused(RecipeError([RecipeProblem("a", "x" * 200_000, "", "f", 1)]))
     with pytest.raises(FaultError, match="no file is named"):
-        refused(ValueError("/tmp/run is bad"), "/tmp/run/state.safetensors")
+        refused(ValueError("runs/a is bad"), "runs/a/state.safetensors")
     with pytest.raises(FaultError, match="no terminal"):
         refused(ValueError("\x1b[31m"))
     with pytest.raises(FaultError, match="inside"):

@@ -13,17 +13,17 @@ from typing import Any
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from training_runs import Tiny, change_batches, run, run_calling
 
 import qgs
 from qgs.data.sampling import Batch
 from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
 from qgs.engine import training
-from qgs.engine.checkpoint import read_state
+from qgs.engine.checkpoint import contents, read_state
 from qgs.engine.fit import OutOfMemoryError, explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
-from qgs.io.checkpoint import CheckpointError
+from qgs.io.checkpoint import CheckpointError, load_domain
 from qgs.memory import TooLargeError, _left_by_groups, in_words, refuse_beyond_memory
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -62,7 +62,15 @@ def with_nan(name: str) -> Callable[[dict[str, torch.Tensor]], Any]:
     return lambda tensors: tensors[name].view(-1)[:1].fill_(torch.nan)
 
 
+def changed_contents(state: Path, change: Callable[[dict[str, torch.Tensor]], Any]) -> str:
+    """What a state would say of its tensors if it had been written with those of `change`."""
+    tensors = load_file(state)
+    change(tensors)
+    return json.dumps(contents(tensors))
+
+
 WEIGHT = "queries.features"
+EMA = "training.ema=0.9"
 MOMENT = "moments/model.queries.features/exp_avg"
 
 
@@ -90,13 +98,13 @@ def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
 ) -> None:
     state = copied / "state.safetensors"
     with safe_open(state, "pt") as file:
-        known = file.metadata()["qgs.tensors"]
+        known = file.metadata()["qgs.contents"]
         kinds = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118
     change(kinds)
-    now = {n: [str(t.dtype).removeprefix("torch."), *t.shape] for n, t in kinds.items()}
-    rewrite(state, change, **{"qgs.tensors": known if lists else json.dumps(now)})
+    rewrite(state, change, **{"qgs.contents": known if lists else json.dumps(contents(kinds))})
     before = {path.name: path.read_bytes() for path in copied.iterdir() if path.is_file()}
-    with pytest.raises(CheckpointError, match=words) as caught:
+    told = "crc32" if lists and words == "not finite" else words
+    with pytest.raises(CheckpointError, match=told) as caught:
         run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
     assert str(state) in str(caught.value)
     assert before == {p.name: p.read_bytes() for p in copied.iterdir() if p.is_file()}
@@ -107,9 +115,91 @@ def test_a_state_that_does_not_list_its_tensors_is_refused(copied: Path, tiny: T
     with safe_open(state, "pt") as file:
         tensors = {n: file.get_tensor(n).clone() for n in file.keys()}  # noqa: SIM118
         known = file.metadata()
-    del known["qgs.tensors"]
+    del known["qgs.contents"]
     save_file(tensors, state, known)
-    with pytest.raises(CheckpointError, match=r"qgs\.tensors"):
+    with pytest.raises(CheckpointError, match=r"qgs\.contents"):
+        run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
+
+
+@pytest.mark.parametrize(
+    "domain",
+    ['{"samples": 1e999, "ranges": {}}',
+     '{"samples": 3, "ranges": {"fov": [1' + "0" * 400 + ", 2]}}",
+     '{"samples": 3, "ranges": {"fov": 7}}', "[]", '{"samples": 3}', "{", "[" * 9000],
+    ids=lambda text: text[:40],
+)  # fmt: skip
+def test_a_damaged_domain_is_told_with_its_file(copied: Path, domain: str) -> None:
+    file = copied / "checkpoint.safetensors"
+    rewrite(file, lambda tensors: None, **{"qgs.extra.trained_on": domain})
+    with pytest.raises(CheckpointError, match=r"trained_on` in its metadata") as caught:
+        load_domain(file)
+    assert str(file) in str(caught.value)
+
+
+def test_a_run_starts_from_no_weights_that_are_not_finite(
+    copied: Path, tiny: Tiny, tmp_path: Path
+) -> None:
+    file = copied / "checkpoint.safetensors"
+    rewrite(file, with_nan(WEIGHT))
+    with pytest.raises(CheckpointError, match=f"{file} has weights that are not finite: {WEIGHT}"):
+        run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
+    rewrite(file, as_integers(WEIGHT))
+    with pytest.raises(
+        CheckpointError, match=f"{file} does not fit (.|\\n)*type of {WEIGHT}: torch.int32"
+    ):
+        run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_state_of_which_one_bit_is_another_is_refused(copied: Path, tiny: Tiny) -> None:
+    """What no shape, type or size tells: the run would go on with another weight."""
+    state = copied / "state.safetensors"
+    whole = bytearray(state.read_bytes())
+    whole[-100] ^= 1
+    state.write_bytes(whole)
+    with pytest.raises(CheckpointError, match=f"^{state} is damaged: not the tensors that were"):
+        run(tiny("tokengs", EMA), copied, resume=True)
+
+
+def test_moments_are_finite_but_squares(copied: Path, tiny: Tiny) -> None:
+    state = copied / "state.safetensors"
+    for name, sound in ((f"{MOMENT}_sq", True), (MOMENT, False)):
+        change = lambda t, name=name: t[name].view(-1)[:1].fill_(torch.inf)  # noqa: E731
+        rewrite(state, change, **{"qgs.contents": changed_contents(state, change)})
+        if sound:
+            run(tiny("tokengs", "training.steps=4", EMA), copied, resume=True)
+            continue
+        with pytest.raises(CheckpointError, match=r"`moments` cannot be restored .not finite") as e:
+            run(tiny("tokengs", "training.steps=5", EMA), copied, resume=True)
+        assert str(state) in str(e.value)
+
+
+def test_a_run_that_cannot_go_on_is_told_with_its_file(copied: Path, tiny: Tiny) -> None:
+    state = copied / "state.safetensors"
+    for options in (["seed=5"], ["training.batch_size=7"]):
+        with pytest.raises(ValueError, match=f"^{state} is of a run "):
+            run(tiny("tokengs", EMA, *options), copied, resume=True)
+    state.unlink()
+    state.mkdir()
+    with pytest.raises(FileExistsError, match=f"^{state} is missing or no file"):
+        run(tiny("tokengs", EMA), copied, resume=True)
+
+
+def test_messages_of_damage_stay_short(copied: Path) -> None:
+    file = copied / "checkpoint.safetensors"
+    whole = file.read_bytes()
+    header = whole[8 : 8 + int.from_bytes(whole[:8], "little")].replace(
+        b'"F32"', b'"%s"' % (b"x" * 10**5)
+    )
+    file.write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(CheckpointError, match="is not a whole safetensors file") as caught:
+        qgs.load(file)
+    assert len(str(caught.value)) < 1000
+
+
+def test_moments_of_another_shape_are_refused(copied: Path, tiny: Tiny) -> None:
+    rewrite(copied / "state.safetensors", first_row(MOMENT))
+    with pytest.raises(CheckpointError, match="not the tensors that were written"):
         run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
 
 

@@ -23,7 +23,13 @@ from safetensors.torch import save_file
 from training_runs import QUIET, Tiny, run, run_calling, same, weights
 
 from qgs.composer import Recipe
-from qgs.engine.checkpoint import OtherRunError, RandomStates, read_state, write_state
+from qgs.engine.checkpoint import (
+    OtherRunError,
+    RandomStates,
+    contents,
+    read_state,
+    write_state,
+)
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder
 from qgs.engine.tracking import TrainingProgress
@@ -291,11 +297,12 @@ def test_a_state_with_damaged_metadata_is_refused_by_its_name(tiny: Tiny, tmp_pa
     damage("`qgs.state_version` ", state_version="one")
     damage("`qgs.state_version` .*KeyError", state_version=None)
     damage("not the tensors that were written: foo", {"foo": torch.zeros(2)})
-    damage("`qgs.tensors` .*KeyError", tensors=None)
+    damage("`qgs.contents` .*KeyError", contents=None)
     for name in ("foo", "foo/bar"):
-        listed = {**json.loads(metadata["qgs.tensors"]), name: ["float32", 2]}
+        added = {name: torch.zeros(2)}
+        listed = {**json.loads(metadata["qgs.contents"]), **contents(added)}
         message = f"the tensor `{name}` belongs to no part"
-        damage(message, {name: torch.zeros(2)}, tensors=json.dumps(listed))
+        damage(message, added, contents=json.dumps(listed))
     for part, key, value, message in (
         ("counters", "step", None, r"`counters` .*step is 'None'"),
         ("counters", "step", -1, "step is '-1'"),

@@ -118,12 +118,21 @@ def depth_with_hole(folder: Path) -> str:
     return "d.npy"
 
 
+def endless(folder: Path) -> str:
+    write_colmap(folder, synthetic(folder / "photos"), "text")
+    with (folder / "sparse" / "0" / "images.txt").open("wb") as file:
+        file.truncate(10**12)
+    return "images.txt has a line of 33,554,432 characters or more"
+
+
 FOLDERS = {
     "a listing with a hole": json_with_hole,
     "COLMAP images with a hole": colmap_with_hole("bin", "images"),
     "COLMAP cameras with a hole": colmap_with_hole("bin", "cameras"),
     "COLMAP text with a hole": colmap_with_hole("txt", "images"),
     "a depth map of 3.6 gigapixels": depth_with_hole,
+    "images.txt of 1 TB": endless,
+    "a COLMAP word of 100,000 letters": colmap_of(" 50.0 ", f" {'x' * 100_000} "),
     "a pose of 400 digits": changed(pose),
     "a focal length of 400 digits": changed(lambda data: data.update(fl_x=HUGE)),
     "a principal point of 400 digits": changed(lambda data: data.update(cx=-HUGE)),
@@ -199,6 +208,10 @@ RECORDS = {
     "sizes of NaN": (record(sizes=torch.full((4, 2), torch.nan)), "'sizes' must be whole pixels"),
     "sizes of 0": (record(sizes=torch.zeros(4, 2).long()), "'sizes' must be whole pixels"),
     "held_out of a number": (record(held_out=7), "'held_out' must list frames from 0 to 3, got 7"),
+    "held_out that is nowhere": (
+        record(held_out=torch.zeros(2).to("meta")),
+        "got a sparse, quantised or expanded tensor",
+    ),
     "a list in itself": (record(names=[[]] * 3), "3 names for 4 images"),
     "a mask of another shape": (record(masks=[WRONG_MASK] * 4), "another aspect ratio"),
     "a mask that is none": (record(masks=[torch.zeros(9).byte()] * 4), "is unusable"),
@@ -251,12 +264,24 @@ def test_a_chunk_with_a_scene_of_one_photo(tmp_path):
     assert any("1 photos are there, and a scene needs 2" in line for line in lines)
 
 
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"s0": ' + "9" * 5000 + "}"])
+def test_keys_that_no_terminal_prints(tmp_path):
+    folder = saved(tmp_path, record(key="\x1b[2J" + "k" * 10_000))
+    with pytest.raises(ValueError, match="does not hold the scene 's0'") as caught:
+        everything(folder, ChunksSource)
+    assert "holds '\\x1b[2Jkkk" in str(caught.value)
+    assert len(str(caught.value)) < 2000
+
+
+INDICES = ["[" * 100_000, '{"s0": ' + "9" * 5000 + "}", json.dumps({"s0": "x" * 100_000})]
+
+
+@pytest.mark.parametrize("content", INDICES, ids=["deep", "number", "name"])
 def test_an_index_of_chunks(tmp_path, content):
     folder = saved(tmp_path, record())
     (folder / "train" / "index.json").write_text(content)
-    with pytest.raises(ValueError, match=r"index\.json"):
+    with pytest.raises(ValueError, match=r"index\.json") as caught:
         opened(folder, source=ChunksSource)
+    assert len(str(caught.value)) < 2000
     assert told(folder)
 
 

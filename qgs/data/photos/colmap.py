@@ -8,7 +8,6 @@ import io
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from functools import partial
 from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
@@ -21,6 +20,7 @@ from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
 from qgs.data.paths import open_file
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
+from qgs.wording import name_shown
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 _LENSES: dict[str, type[Lens] | None] = {
@@ -33,8 +33,8 @@ _LENSES: dict[str, type[Lens] | None] = {
     "SIMPLE_RADIAL_FISHEYE": Fisheye,
     "RADIAL_FISHEYE": Fisheye,
 }
+_LONGEST = 2**25  # characters of a line; that of a million points has fewer
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
-_LONGEST_LINE = 2**25  # characters; that of a million points has fewer
 
 
 class Colmap(PhotoReader):
@@ -68,7 +68,7 @@ class Colmap(PhotoReader):
         except ValueError as error:
             raise ValueError(
                 f"the COLMAP model {model} (cameras.{suffix}, images.{suffix}) cannot be read: "
-                f"{error}; export it again, or copy it again"
+                f"{name_shown(str(error))}; export it again, or copy it again"
             ) from error
         photos = image_folder(folder, images)
         frames = [
@@ -115,9 +115,11 @@ def _text_images(model: UPath) -> Iterator[Image]:
 def _lines(file: UPath, after: int = 0) -> Iterator[str]:
     """The lines of a file less comments, empty ones, and so many `after` each of the others."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8") as opened:
-        lines = iter(partial(opened.readline, _LONGEST_LINE), "")
-        for line in map(str.strip, lines):
-            if line and not line.startswith("#"):
+        lines = iter(lambda: opened.readline(_LONGEST), "")
+        for line in lines:
+            if len(line) == _LONGEST:
+                raise ValueError(f"{file.name} has a line of {_LONGEST:,} characters or more")
+            if (line := line.strip()) and not line.startswith("#"):
                 yield line
                 for _ in range(after):
                     next(lines, None)
