@@ -83,6 +83,10 @@ MOMENT = "moments/model.queries.features/exp_avg"
         (lambda t: t.update({MOMENT: t[MOMENT].double()}), MOMENT.partition("/")[2]),
         (lambda t: [t.pop(name) for name in list(t) if name.endswith("/exp_avg")], "exp_avg"),
         (lambda t: [t.pop(n) for n in list(t) if n.startswith(MOMENT[:-7])], "queries.features"),
+        (lambda t: t.update({f"{MOMENT[:-7]}foo": torch.ones(1)}), "queries.features.foo"),
+        (lambda t: t[f"{MOMENT}_sq"].neg_(), "negative or NaN: .*exp_avg_sq"),
+        (lambda t: t[f"{MOMENT[:-7]}step"].fill_(-5), "negative or NaN: .*step"),
+        (lambda t: t[MOMENT].fill_(torch.inf), "not finite: .*exp_avg"),
     ],
 )
 def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
