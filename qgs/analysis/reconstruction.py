@@ -185,7 +185,8 @@ class Reconstruction:
         """As `qgs.metrics.baselines`, on the compared views."""
         rows = [(s.psnr, s.baselines["nearest_input"]) for s in self.scores if s.baselines]
         means = [sum(values) / len(rows) for values in zip(*rows, strict=True)]
-        return worse_than_nearest(Psnr.column, *means) if means else ""
+        advice = ["refine longer, or on more photos"] if self.refinement else []
+        return worse_than_nearest(Psnr.column, *means, *advice) if means else ""
 
 
 @torch.no_grad()

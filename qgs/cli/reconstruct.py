@@ -134,9 +134,9 @@ def reconstruct(
         if fine is not None:
             scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
         better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
+        better = replace(better, remarks=[*filter(None, [better.worse_than_nearest])])
         console.print(score_table(better, "refined"))
-        if better.worse_than_nearest:
-            console.print(better.worse_than_nearest, soft_wrap=True, highlight=False)
+        console.print("\n".join(better.remarks), soft_wrap=True, highlight=False, markup=False)
         paths += write_reconstruction(model, better, out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)

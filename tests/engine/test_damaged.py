@@ -224,6 +224,20 @@ def test_out_of_memory_is_told_and_the_run_is_saved(
     assert run(recipe, tmp_path / "run", resume=True).resumed_at == 2
 
 
+def test_data_that_finds_no_memory_tells_that_the_run_is_saved(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(batch: Batch, numbers: Sequence[int]) -> None:
+        if max(numbers) >= 2:
+            raise MemoryError
+
+    change_batches(monkeypatch, fail)
+    recipe = tiny("tokengs", "training.save_every=0", "training.batch_size=1")
+    with pytest.raises(OutOfMemoryError, match=r"The run is saved at step 2\. With --resume, "):
+        run(recipe, tmp_path / "run")
+    assert read_state(tmp_path / "run/state.safetensors").parts["counters"]["step"] == 2
+
+
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory.\nTried")])
 def test_running_out_of_memory_is_told_in_one_line(error: Exception) -> None:
     words = rf"available\): {type(error).__name__}.*batch_size"
