@@ -25,7 +25,7 @@ from qgs.types import Cameras
 FRAMING = "(20% is cut off)"
 NEAREST = "the result is worse than the nearest photo, copied: PSNR "
 CAPPED = "of the scales of visible Gaussians are at the cap, model.head.scale_cap: 0.075"
-OUTSIDE = "the photos lie outside what this model was trained on"
+OUTSIDE = "the views lie outside what this model was trained on"
 WITHIN = "the cameras lie within what this model was trained on"
 
 evaluated = partial(run_qgs, "eval")
