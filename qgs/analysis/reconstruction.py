@@ -184,8 +184,11 @@ class Reconstruction:
     def worse_than_nearest(self) -> str:
         """As `qgs.metrics.baselines`, on the compared views."""
         rows = [(s.psnr, s.baselines["nearest_input"]) for s in self.scores if s.baselines]
-        means = [sum(values) / len(rows) for values in zip(*rows, strict=True)]
-        return worse_than_nearest(Psnr.column, *means) if means else ""
+        if not rows:
+            return ""
+        model, nearest = (sum(values) / len(rows) for values in zip(*rows, strict=True))
+        advice = {"or_else": "refine longer, or on more photos"} if self.refinement else {}
+        return worse_than_nearest(Psnr.column, model, nearest, **advice)
 
 
 @torch.no_grad()

@@ -52,7 +52,11 @@ def check_plugin(
             sound.setdefault(of_case[0].case.component, []).append(of_case[0].case)
         results += of_case
     for component, cases in sound.items():
-        for option, tried in idle_options(cases).items():
+        idle = idle_options(cases)
+        if untried := [option for option, tried in idle.items() if not tried]:
+            label = f"{component.slot}/{component.name}"
+            console.print(f"note: {label}: no other values were tried of {listed(untried)}")
+        for option, tried in ((option, tried) for option, tried in idle.items() if tried):
             console.print(
                 f"note: {component.slot}/{component.name}: no value of `{option}` that was tried "
                 f"({listed(tried)}) changed anything, so no check exercised it; give an example "

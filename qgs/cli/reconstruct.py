@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
     from qgs.contracts import Component, Scene, Split
+    from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
+    from qgs.types import Gaussians
 
 
 def reconstruct(
@@ -99,8 +101,6 @@ def reconstruct(
     from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
-    from qgs.engine.tuning import tune as fit
-    from qgs.engine.tuning import tuning_loss
     from qgs.io.checkpoint import load, load_domain, load_recipe
 
     console = Console()
@@ -116,30 +116,41 @@ def reconstruct(
     wanted = (frame_list(frames, "--frames", scene), frame_list(holdout, "--holdout", scene))
     sample, world = choose_sample(scene, recipe.views, inputs, *wanted)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    tuned = record = None
-    if tune:
-        rate = recipe.evaluation.tuning_rate
-        tuning = fit(model, sample.inputs, tuning_loss(recipe), tune, rate)
-        tuned, before, after = tuning.prediction.gaussians, tuning.losses[0], tuning.losses[-1]
-        record = {"steps": tune, "rate": rate, "loss_before": before, "loss_after": after}
-        losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
-        console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
+    tuned, record = tuned_tokens(model, recipe, sample, tune, console) if tune else (None, None)
     result = run(model, sample, world, seen, tuned, record)
     remarks = remarks_on(result, scene, model.head, recipe.views, trained)
     result = replace(result, remarks=remarks)
-    console.print(score_table(result, "feed-forward" if refine else ""))
-    console.print("\n".join(remarks), soft_wrap=True, highlight=False, markup=False)
+    show(result, "feed-forward" if refine else "", console)
     paths = write_reconstruction(model, result, out)
     if refine:
         if fine is not None:
             scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
         better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
-        console.print(score_table(better, "refined"))
-        if better.worse_than_nearest:
-            console.print(better.worse_than_nearest, soft_wrap=True, highlight=False)
+        show(better, "refined", console)
         paths += write_reconstruction(model, better, out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
+
+
+def tuned_tokens(
+    model: QueryGaussianModel, recipe: Recipe, sample: Sample, steps: int, console: Console
+) -> tuple[Gaussians, dict[str, float]]:
+    """Gaussians of tokens that are tuned on the inputs of `sample`, and a record of that."""
+    from qgs.engine.tuning import tune, tuning_loss
+
+    rate = recipe.evaluation.tuning_rate
+    tuning = tune(model, sample.inputs, tuning_loss(recipe), steps, rate)
+    before, after = tuning.losses[0], tuning.losses[-1]
+    losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
+    console.print(f"{steps} steps of token tuning: {losses}", highlight=False)
+    record = {"steps": steps, "rate": rate, "loss_before": before, "loss_after": after}
+    return tuning.prediction.gaussians, record
+
+
+def show(result: Reconstruction, what: str, console: Console) -> None:
+    """Print the scores and the remarks of `result`."""
+    console.print(score_table(result, what))
+    console.print("\n".join(result.remarks), soft_wrap=True, highlight=False, markup=False)
 
 
 def refined(
@@ -167,7 +178,8 @@ def refined(
     record = {"seconds": result.seconds, "steps": result.steps, "frames": frames}
     record |= {"photos": [scene.frame_name(frame) for frame in frames]}
     record |= {"stopped_by": result.stopped_by, "curve": [asdict(p) for p in result.curve]}
-    return reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
+    found = reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
+    return replace(found, remarks=[*filter(None, [found.worse_than_nearest])])
 
 
 def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:

@@ -169,7 +169,10 @@ def read_scene_list(file: UPath) -> list[str]:
                 f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
             )
     else:
-        text = read_file(file).decode("utf-8-sig")
+        try:
+            text = read_file(file).decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{file} is no text in UTF-8 ({error}): save it in UTF-8") from error
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
         names = [line for line in lines if line]
     if not names:

@@ -92,30 +92,30 @@ class Domain:
 
     def differences(self, found: Domain) -> list[str]:
         """In what `found` leaves these ranges, in words."""
-        told = []
+        told, seen = [], found.ranges
         for name, trained in self.ranges.items():
-            if name in found.ranges and not _inside(found.ranges[name], trained):
-                words = WORDS[name].format(_shown(found.ranges[name]))
-                if found.ranges[name][0] == math.inf:
+            if name in seen and not _inside(seen[name], trained):
+                words = WORDS[name].format(_shown(seen[name]))
+                if seen[name][0] == math.inf:
                     words = "their axes meet at no point before them"
                 told.append(f"{words} (trained: {_shown(trained)})")
         return told
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """A sentence: how photos lie to what a model was trained on; `trained` is empty if unknown.
+    """A sentence: how views lie to what a model was trained on; `trained` is empty if unknown.
 
     The model need not know their content either: only the cameras are compared.
     """
     if not trained.values:
         return (
-            "whether the photos are like those that this model was trained on is not known: its "
+            "whether the views are like those that this model was trained on is not known: its "
             "checkpoint does not tell, since an older qgs or other code trained it"
         )
     if apart := trained.differences(found):
         return (
-            f"the photos lie outside what this model was trained on: {', '.join(apart)}. Expect a "
-            "poor result; choose other input photos, or train on photos like these"
+            f"the views lie outside what this model was trained on: {', '.join(apart)}. Expect a "
+            "poor result; choose other input views, or train on views like these"
         )
     return (
         "the cameras lie within what this model was trained on, in distance, direction, depth and "

@@ -92,7 +92,7 @@ class EvaluationPlan:
     targets the other frames of the span.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
-    drawn: whether samples were, once `samples` has run. Raises ValueError without scenes.
+    drawn: scenes of which samples were, once `samples` has run. Raises ValueError without scenes.
     """
 
     def __init__(
@@ -102,7 +102,8 @@ class EvaluationPlan:
         evaluation: EvaluationConfig,
         index: EvaluationIndex | None = None,
     ) -> None:
-        self.framing, self.drawn = "", False
+        self.framing: str | None = None
+        self.drawn = set[str]()
         self._scenes = source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
@@ -126,7 +127,8 @@ class EvaluationPlan:
                 place = self._places[name]
                 scene = self._scenes[place]
                 for frames in self._choices(scene, place):
-                    self.framing = self.framing or framing(scene, frames[0][0])
+                    if self.framing is None:
+                        self.framing = framing(scene, frames[0][0])
                     yield make_sample(scene, *frames, self._views, mirror=False)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
@@ -141,7 +143,7 @@ class EvaluationPlan:
             kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
             yield from (windows[i] for i in kept)
         else:
-            self.drawn = True
+            self.drawn.add(scene.name)
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])
                 inputs, drawn = draw_frames(scene, self._views, rng)

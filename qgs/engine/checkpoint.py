@@ -35,6 +35,7 @@ from qgs.io.checkpoint import (
 from qgs.io.differences import (
     differing_tensors,
     differing_types,
+    nonfinite,
     shapes_of,
 )
 from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
@@ -242,12 +243,19 @@ def refuse_other_tensors(saved: State, wanted: Mapping[str, Tensor]) -> None:
         raise CheckpointError(f"{len(found)} differences: {listed(found, between='; ')}")
 
 
+_SQUARES = {"exp_avg_sq", "max_exp_avg_sq", "square_avg", "sum", "variance", "row_var", "col_var"}
+"""Where torch's optimisers keep squares of gradients, which finite gradients may make infinite."""
+
+
 def broken(state: State, part: str) -> str:
-    """The tensors of `state` with NaN or infinity, which only squares may reach; "" for none."""
+    """The tensors of `state` with values that no sound run has, in words; "" for none."""
     tensors = {k: v for k, v in state.items() if isinstance(v, Tensor)}
-    squares = {k for k, v in tensors.items() if part == "moments" and bool((v >= 0).all())}
-    names = [k for k, v in tensors.items() if k not in squares and not bool(v.isfinite().all())]
-    return f"not finite: {listed(names)}" if names else ""
+    kinds = {k: k.rpartition("/")[2] if part == "moments" else "" for k in tensors}
+    bad = nonfinite((k, v) for k, v in tensors.items() if kinds[k] not in _SQUARES)
+    counted = [k for k, kind in kinds.items() if kind in _SQUARES | {"step"}]
+    negative = [k for k in counted if not bool((tensors[k] >= 0).all())]  # or NaN
+    told = {"not finite": bad, "negative or NaN": [k for k in negative if k not in bad]}
+    return "; ".join(f"{what}: {listed(names)}" for what, names in told.items() if names)
 
 
 class OptimizerState:
@@ -272,10 +280,16 @@ class OptimizerState:
     def load_state(self, state: State) -> None:
         self._optimizer.state.clear()
         names = {path: path.rpartition("/")[0] for path in state if path != "idle"}
-        kept = {*names.values()}
-        if differing := sorted((kept | {*state["idle"]}) ^ self._parameters.keys()):
+        kept, idle = {*names.values()}, {*state["idle"]}
+        if differing := sorted((kept | idle) ^ self._parameters.keys()):
             raise CheckpointError(f"not of the parameters that are trained: {listed(differing)}")
-        wanted = {k: v for k, v in self._made().items() if k.rpartition("/")[0] in kept}
+        if both := sorted(kept & idle):
+            raise CheckpointError(f"both with moments and without: {listed(both)}")
+        made, alone = self._made()
+        made = {k: v for k, v in made.items() if k.rpartition("/")[0] in kept}
+        if alone and (others := sorted(names.keys() - made.keys())):
+            raise CheckpointError(f"not of this optimiser: {listed(others)}")
+        wanted = {k: v for k, v in made.items() if isinstance(v, Tensor)}
         refuse_other_tensors({key: state[key] for key in wanted if key in state}, wanted)
         for path, name in names.items():
             parameter, value = self._parameters[name], state[path]
@@ -283,8 +297,11 @@ class OptimizerState:
                 value = placed_like(value, parameter)
             self._optimizer.state[parameter][path.removeprefix(f"{name}/")] = value
 
-    def _made(self) -> dict[str, Tensor]:
-        """What a first step makes, in shape and type; nothing where steps need numbers."""
+    def _made(self) -> tuple[dict[str, Any], bool]:
+        """What a first step makes, in shape and type, and whether that is all.
+
+        Where steps need numbers it is what they prepare before.
+        """
         alike = {
             name: nn.Parameter(torch.empty(p.shape, dtype=p.dtype, device="meta"))
             for name, p in self._parameters.items()
@@ -292,15 +309,19 @@ class OptimizerState:
         memo = {id(p): alike[name] for name, p in self._parameters.items()}
         for parameter in alike.values():
             parameter.grad = torch.empty_like(parameter)
-        try:
-            optimizer = deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo)
-            for group in optimizer.param_groups:
-                group.update({key: False for key in ("fused", "foreach") if key in group})
-            optimizer.step()
-        except Exception:  # whatever an optimiser does with numbers that are not there
-            return {}
-        kept = {f"{n}/{k}": v for n, p in alike.items() for k, v in optimizer.state[p].items()}
-        return {path: value for path, value in kept.items() if isinstance(value, Tensor)}
+        optimizer, alone = (
+            deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo),
+            True,
+        )
+        for group in list(optimizer.param_groups):
+            optimizer.param_groups = [group]
+            group.update({key: False for key in ("fused", "foreach") if key in group})
+            try:
+                optimizer.step()
+            except Exception:  # whatever an optimiser does with numbers that are not there
+                alone = False
+        state = optimizer.state
+        return {f"{n}/{k}": v for n, p in alike.items() for k, v in state[p].items()}, alone
 
 
 class RandomStates:

@@ -86,11 +86,14 @@ def _remarks(
 ) -> Iterator[str]:
     """Sentences on what came of an evaluation, "" for those that do not apply."""
     scores, samples = evaluation.scores, recipe.evaluation.samples
-    if samples > 1 and not plan.drawn:
+    fixed = [score for score in scores if score.scene not in plan.drawn]
+    if samples > 1 and fixed:
+        where = f" for {len(fixed)} of {len(scores)} scenes" if len(fixed) < len(scores) else ""
         why = "the index names the views"
         if evaluation.held_out:
             why = "{} of {} held-out frames are judged, each once".format(*evaluation.held_out)
-        yield f"evaluation.samples={samples} changed nothing, since no views were drawn: {why}"
+        told = f"evaluation.samples={samples} changed nothing{where}"
+        yield f"{told}, since no views were drawn: {why}"
     capped = mean(s.values["scales_at_cap"] for s in scores)
     yield too_many_capped(model.head, capped, recipe.views)
     if evaluation.columns and not any(score.given for score in scores):

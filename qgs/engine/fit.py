@@ -73,7 +73,7 @@ def refuse_unfit(recipe: Recipe, accelerator: Accelerator) -> None:
 def explained(step: int, save: Callable[[int], None] | None = None) -> Iterator[None]:
     """Raise OutOfMemoryError where the `with` block, a step after `step` others, finds no memory.
 
-    save: saves the run as it is; None where it cannot be saved.
+    save: sees that the run is saved as it is; None where it cannot be saved.
     """
     try:
         yield

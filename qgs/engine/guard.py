@@ -22,6 +22,7 @@ from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
 from qgs.engine.objective import Objective
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
+from qgs.io.differences import nonfinite
 from qgs.io.files import replacing_entries
 from qgs.io.metadata import number_in
 from qgs.types import named_tensors
@@ -353,7 +354,7 @@ class GoodWeights:
 
 def broken_tensors(model: nn.Module) -> str:
     """Which tensors of `model` hold NaN or infinity; "" if none does."""
-    names = [n for n, t in unique_tensors(model).items() if not whole(torch.isfinite(t).all())]
+    names = nonfinite((name, whole(t)) for name, t in unique_tensors(model).items())
     return f"weights are not finite: {listed(names)}" if names else ""
 
 
@@ -363,8 +364,8 @@ def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
     bad = [f"loss term {name} is {n}" for name, n in terms.items() if not math.isfinite(n)]
     if bad or math.isfinite(numbers["gradient"]):
         return ", ".join(bad)
-    gradients = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
-    names = [name for name, gradient in gradients.items() if not torch.isfinite(gradient).all()]
+    parameters = module.named_parameters()
+    names = nonfinite((name, p.grad) for name, p in parameters if p.grad is not None)
     origin = f", from {listed(names)}" if names else ""
     return f"the gradient norm is {numbers['gradient']}{origin}"
 

@@ -279,7 +279,7 @@ class Trainer:
                 self.guard.save_to_go_on(self.step)
                 error = self.feed.error or SampleError(ELSEWHERE)
                 error.add_note(f"The run is saved at step {self.step}; continue with --resume")
-                with explained(self.step):
+                with explained(self.step, lambda step: None):  # it is saved
                     raise error
         stopped_by = stopped_by or self._stopped_by(stop)
         self.guard.finish(self.step, stopped=stopped_by is not None)

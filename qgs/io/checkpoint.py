@@ -1,6 +1,5 @@
 """A model as one safetensors file that carries its recipe; no pickle is ever read."""
 
-import errno
 import json
 import os
 import re
@@ -41,8 +40,8 @@ def write_tensors(
 ) -> None:
     """Write `tensors`, on the CPU and contiguous, to `path`, whole or not at all.
 
-    Raises OSError that tells the space needed and the space there is; what `path` held before is
-    then still there.
+    Raises OSError that tells the space needed and the space there is, CheckpointError for what the
+    format cannot hold; what `path` held before is then still there.
     """
     needed = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
     told = f" It takes {needed / 1e6:.1f} MB beside the file that it replaces, and"
@@ -50,9 +49,9 @@ def write_tensors(
         try:
             save_file(dict(tensors), temporary, dict(metadata))
         except SafetensorError as error:  # which tells the number in words alone
-            number = re.search(r"os error (\d+)", str(error))
-            code = int(number[1]) if number else errno.EIO
-            raise OSError(code, str(error), os.fspath(path)) from error
+            if number := re.search(r"os error (\d+)", str(error)):
+                raise OSError(int(number[1]), str(error), os.fspath(path)) from error
+            raise CheckpointError(f"{path} cannot be written: {error}") from error
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """In what two state dicts, or two recipes, differ: the lines that messages list."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -23,9 +23,14 @@ def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
+def nonfinite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
+    """Names of those of the named `tensors` that hold NaN or infinity."""
+    return [name for name, tensor in tensors if not bool(tensor.isfinite().all())]
+
+
 def refuse_broken(tensors: Mapping[str, Tensor], origin: object) -> None:
     """Raise ValueError when `tensors`, weights read from `origin`, hold NaN or infinity."""
-    if broken := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+    if broken := nonfinite(tensors.items()):
         fix = "its training had diverged, or the file is damaged: take another"
         raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
 

@@ -121,7 +121,7 @@ def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
 def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
     result = run_qgs("demo", photos_in(tmp_path / "mine", count, step=5.0), *models)
     assert result.exit_code == 0, result.output
-    assert result.output.count("few, more: the photos lie outside what this model was trained") == 1
+    assert result.output.count("few, more: the views lie outside what this model was trained") == 1
     assert result.output.count("(views.scale: auto)") == 1
     assert "Unseen" not in result.output
     apart = re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: ", result.output)

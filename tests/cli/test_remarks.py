@@ -25,7 +25,7 @@ from qgs.types import Cameras
 FRAMING = "(20% is cut off)"
 NEAREST = "the result is worse than the nearest photo, copied: PSNR "
 CAPPED = "of the scales of visible Gaussians are at the cap, model.head.scale_cap: 0.075"
-OUTSIDE = "the photos lie outside what this model was trained on"
+OUTSIDE = "the views lie outside what this model was trained on"
 WITHIN = "the cameras lie within what this model was trained on"
 
 evaluated = partial(run_qgs, "eval")
@@ -104,12 +104,17 @@ def only_scene(checkpoint: Path) -> str:
 
 
 def test_a_reconstruction_says_the_same(checkpoint: Path, photos: Path, tmp_path: Path) -> None:
-    result = run_qgs("reconstruct", checkpoint, photos, "--out", tmp_path, "--frames", "0,8")
+    more = ("--frames", "0,8", "--refine", 0.01)
+    result = run_qgs("reconstruct", checkpoint, photos, "--out", tmp_path, *more)
     assert result.exit_code == 0, result.output
     remarks = json.loads((tmp_path / "cameras.json").read_text())["remarks"]
     for words in (FRAMING, NEAREST, CAPPED, OUTSIDE):
         assert words in result.output
         assert any(words in remark for remark in remarks)
+    (remark,) = json.loads((tmp_path / "refined/cameras.json").read_text())["remarks"]
+    assert remark.startswith(NEAREST)
+    assert remark.endswith("or refine longer, or on more photos")
+    assert remark in result.output
 
 
 def test_photos_as_the_model_wants_them_are_not_remarked_on(

@@ -186,6 +186,9 @@ def test_lists_of_scenes(tmp_path):
     (tmp_path / "list.json").write_text("3")
     with pytest.raises(ValueError, match="must be a mapping whose keys are scenes"):
         read_scene_list(UPath(tmp_path / "list.json"))
+    file.write_text("s1\n", encoding="utf-16")
+    with pytest.raises(ValueError, match=r"list\.txt is no text in UTF-8 .*: save it in UTF-8"):
+        read_scene_list(file)
     file.write_text("# none\n")
     with pytest.raises(ValueError, match="names no scene"):
         read_scene_list(file)

@@ -109,7 +109,7 @@ def test_the_sentence() -> None:
     assert verdict(trained, within).startswith("the cameras lie within what this model was trained")
     wide = domain(around([0, 0, 1.5], [[-1.5, 0, 0], [1.5, 0, 0], [0, 0, 0]], focal=4.0))
     assert verdict(trained, wide).startswith(
-        "the photos lie outside what this model was trained on: there are 3 input views "
+        "the views lie outside what this model was trained on: there are 3 input views "
         "(trained: 2), the input cameras stand 3 apart (trained: 0.2 to 0.4), their axes differ by "
         "90 degrees (trained: 11.4), their field of view is 152 degrees wide (trained: 90). Expect"
     )

@@ -9,9 +9,11 @@ import pytest
 import torch
 from photo_formats import real_folder, row_of_frames
 from PIL import Image
+from upath import UPath
 
 from qgs.data.images import CropResize
 from qgs.data.lenses import RadialTangential
+from qgs.data.photos import read_listing
 
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
@@ -114,12 +116,30 @@ def test_what_cannot_be_meant_is_refused(tmp_path, frame, top, message):
         opened(folder(tmp_path, frame=frame, **top))
 
 
-def test_folders_and_files_that_are_not_there(tmp_path):
+def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         opened(tmp_path / "nothing")
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
     with pytest.raises(FileNotFoundError, match=r"holds a.png \(images: 1 in it\)"):
         opened(tmp_path)
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (4, 4)).save(tmp_path / "images" / "b.png")
+    (tmp_path / "secret").mkdir()
+    calls: list[str] = []
+    iterdir = type(UPath(tmp_path)).iterdir
+
+    def counted(place):
+        calls.append(place.name)
+        if place.name == "secret":
+            raise PermissionError(13, "Permission denied", str(place))
+        return iterdir(place)
+
+    monkeypatch.setattr(type(UPath(tmp_path)), "iterdir", counted)
+    said = r"images: 1 in it, 1 in images/, secret/ may not be read\)"
+    with pytest.raises(FileNotFoundError, match=said):
+        read_listing(UPath(tmp_path))
+    assert calls.count("images") == 1
+    monkeypatch.undo()
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(ValueError, match="not valid JSON"):
         opened(tmp_path)

@@ -91,6 +91,10 @@ MOMENT = "moments/model.queries.features/exp_avg"
         (lambda t: t.update({MOMENT: t[MOMENT].double()}), MOMENT.partition("/")[2]),
         (lambda t: [t.pop(name) for name in list(t) if name.endswith("/exp_avg")], "exp_avg"),
         (lambda t: [t.pop(n) for n in list(t) if n.startswith(MOMENT[:-7])], "queries.features"),
+        (lambda t: t.update({f"{MOMENT[:-7]}foo": torch.ones(1)}), "queries.features.foo"),
+        (lambda t: t[f"{MOMENT}_sq"].neg_(), "negative or NaN: .*exp_avg_sq"),
+        (lambda t: t[f"{MOMENT[:-7]}step"].fill_(-5), "negative or NaN: .*step"),
+        (lambda t: t[MOMENT].fill_(torch.inf), "not finite: .*exp_avg"),
     ],
 )
 def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
@@ -141,7 +145,7 @@ def test_a_run_starts_from_no_weights_that_are_not_finite(
 ) -> None:
     file = copied / "checkpoint.safetensors"
     rewrite(file, with_nan(WEIGHT))
-    with pytest.raises(CheckpointError, match=f"{file} has weights that are not finite: {WEIGHT}"):
+    with pytest.raises(CheckpointError, match=f"{file}: weights are not finite: {WEIGHT}"):
         run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
     rewrite(file, as_integers(WEIGHT))
     with pytest.raises(
@@ -308,6 +312,20 @@ def test_out_of_memory_is_told_and_the_run_is_saved(
     assert "batch_size" in str(e.value)
     monkeypatch.undo()
     assert run(recipe, tmp_path / "run", resume=True).resumed_at == 2
+
+
+def test_data_that_finds_no_memory_tells_that_the_run_is_saved(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(batch: Batch, numbers: Sequence[int]) -> None:
+        if max(numbers) >= 2:
+            raise MemoryError
+
+    change_batches(monkeypatch, fail)
+    recipe = tiny("tokengs", "training.save_every=0", "training.batch_size=1")
+    with pytest.raises(OutOfMemoryError, match=r"The run is saved at step 2\. With --resume, "):
+        run(recipe, tmp_path / "run")
+    assert read_state(tmp_path / "run/state.safetensors").parts["counters"]["step"] == 2
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory.\nTried")])

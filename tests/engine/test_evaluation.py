@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from photo_formats import synthetic, write_nerfstudio
-from qgs_rooms.source import RoomsSource
+from qgs_rooms.source import RoomScene, RoomsSource
 from rich.console import Console
 from training_runs import Tiny, same
 
@@ -236,6 +236,24 @@ def test_no_scene_at_all_and_an_empty_batch_are_errors(tiny: Tiny, tmp_path: Pat
         evaluate(model, recipe)
     with pytest.raises(ValueError, match="at least 1, got 0"):
         evaluate(model, recipe, batch=0)
+
+
+def test_what_is_said_of_some_scenes_is_said_of_them_alone(
+    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two scenes one has a held-out frame; of all photos only the first is as it is stored."""
+    held_out = property(lambda scene: (3,) if scene.name == "test/000000" else ())
+    monkeypatch.setattr(RoomScene, "held_out", held_out)
+    asked: list[int] = []
+    told = lambda scene, frame: "" if not asked.append(frame) and len(asked) == 1 else "cut"  # noqa: E731
+    monkeypatch.setattr("qgs.data.evaluation.framing", told)
+    recipe = tiny("tokengs", "evaluation.samples=3")
+    evaluation = evaluate(recipe.build_model(), recipe)
+    assert [len(score.views) for score in evaluation.scores] == [1, 3]
+    said = "evaluation.samples=3 changed nothing for 1 of 2 scenes, since no views were drawn: "
+    assert f"{said}1 of 1 held-out frames are judged, each once" in evaluation.remarks
+    assert len(asked) == 1
+    assert "cut" not in evaluation.remarks
 
 
 def test_failed_samples_fail_their_scene(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:

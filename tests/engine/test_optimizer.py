@@ -14,7 +14,7 @@ from training_runs import Tiny, run, same, weights
 
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.composer import resolve
-from qgs.engine.checkpoint import read_state, write_state
+from qgs.engine.checkpoint import CheckpointError, OptimizerState, read_state, write_state
 from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups
 from qgs.io.checkpoint import unique_tensors
 
@@ -309,3 +309,38 @@ def test_a_restored_average_goes_on_alike(tiny: Tiny) -> None:
     restored.update()
     assert average.state().keys() == unique_tensors(model).keys()
     assert all(torch.equal(t, average.state()[name]) for name, t in restored.state().items())
+
+
+def restored(made: type[torch.optim.Optimizer], change: Callable[[dict[str, Any]], Any]) -> None:
+    """Restore the moments of a step of two groups, with a change, into a new optimiser."""
+    states = []
+    for _ in range(2):
+        model = nn.Sequential(nn.Linear(3, 2), nn.Linear(2, 2))
+        optimizer = made([{"params": list(part.parameters())} for part in model], lr=0.1)
+        states.append(OptimizerState(model, optimizer))
+        model(torch.ones(1, 3)).sum().backward()
+        optimizer.step()
+    state = states[0].state()
+    change(state)
+    states[1].load_state(state)
+
+
+@pytest.mark.parametrize("name", ["AdamW", "Adafactor"])
+def test_moments_of_a_parameter_that_has_none_are_refused(name: str) -> None:
+    made = getattr(torch.optim, name)
+    restored(made, lambda state: None)
+    with pytest.raises(CheckpointError, match=r"with moments and without: 1\.weight"):
+        restored(made, lambda s: s.update({"idle": ["1.weight"], "1.weight/step": torch.ones(())}))
+
+
+def test_moments_are_compared_where_a_step_needs_numbers() -> None:
+    for key in ("0.weight/row_var", "1.weight/col_var"):
+        with pytest.raises(CheckpointError, match=key):
+            restored(
+                torch.optim.Adafactor, lambda state, key=key: state.update({key: torch.ones(7)})
+            )
+
+
+def test_what_an_optimiser_does_not_keep_is_refused() -> None:
+    with pytest.raises(CheckpointError, match=r"not of this optimiser: 0\.weight/foo"):
+        restored(torch.optim.AdamW, lambda state: state.update({"0.weight/foo": torch.ones(1)}))

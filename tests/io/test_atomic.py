@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
-from qgs.io.checkpoint import write_tensors
+from qgs.io.checkpoint import CheckpointError, write_tensors
 from qgs.io.files import (
     DiskFullError,
     is_leftover,
@@ -64,7 +64,6 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
         ("I/O error: Disk quota exceeded (os error 122)", errno.EDQUOT, True),
         ("I/O error: File too large (os error 27)", errno.EFBIG, False),
         ("I/O error: Permission denied (os error 13)", errno.EACCES, False),
-        ("invalid header", errno.EIO, False),
     ],
 )
 def test_a_disk_is_called_full_only_where_it_is(
@@ -80,6 +79,20 @@ def test_a_disk_is_called_full_only_where_it_is(
     assert full or caught.value.errno == number
     assert words in str(caught.value)
     assert ("It takes 0.0 MB beside" in str(caught.value)) == full
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_format_cannot_hold_is_no_fault_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise SafetensorError("Error while serializing: invalid header")
+
+    monkeypatch.setattr("qgs.io.checkpoint.save_file", fail)
+    with pytest.raises(
+        CheckpointError, match=r"a\.safetensors cannot be written: .*invalid header"
+    ):
+        write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
     assert not list(tmp_path.iterdir())
 
 

@@ -94,6 +94,17 @@ class ReadsTheTop(ContentCrossAttention):
         return self.core.explain(state.features, memory.keys, queries, bias)
 
 
+class ReadsNoMore(ReadsTheTop):
+    """Options of all kinds that nothing reads."""
+
+    name = "reads_no_more"
+
+    class Config(ReadsTheTop.Config):
+        dropout: float = 0.0
+        words: str = "none"
+        none: int | None = None
+
+
 def _installed(*components, **parts) -> InstalledPlugin:
     return InstalledPlugin(Plugin("mine", CONTRACT_VERSION, components, **parts), "qgs-mine", "1.2")
 
@@ -132,8 +143,13 @@ def test_options_that_no_check_exercised_are_noted(monkeypatch) -> None:
     assert idle_options([small, Case(ReadsTheTop.Config(top=8, norm_eps=0.1))]).keys() == {
         "careful"
     }
-    result = _report(monkeypatch, _installed(ReadsTheTop), "--core")
+    more = idle_options([Case(ReadsNoMore.Config())])
+    assert more == idle | {"dropout": ["0.5", "1.0"], "words": [], "none": []}
+    result = _report(monkeypatch, _installed(ReadsTheTop, ReadsNoMore), "--core")
     assert result.exit_code == 0, result.output
+    untried = "note: cross_attention/reads_no_more: no other values were tried of words, none\n"
+    assert untried in result.output
+    assert "reads_the_top: no other values" not in result.output
     note = "note: cross_attention/reads_the_top: no value of `top` that was tried (31, 33, 64) "
     assert f"{note}changed anything, so no check exercised it; " in result.output
     assert "`norm_eps`" not in result.output
@@ -145,7 +161,7 @@ def test_options_that_no_check_exercised_are_noted(monkeypatch) -> None:
         (OneCycleAdamW, set()),
         (LatentQueries, set()),
         (Opacity, set()),
-        (TorchRenderer, {"near", "far", "transmittance_min"}),
+        (TorchRenderer, {"near", "far", "transmittance_min", "background"}),
     ],
 )
 def test_components_of_every_kind_of_slot_are_exercised(component, idle) -> None:

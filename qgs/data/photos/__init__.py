@@ -12,7 +12,7 @@ from qgs.data.photos.cameras import CamerasJson
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.llff import Llff
 from qgs.data.photos.nerfstudio import Nerfstudio
-from qgs.data.photos.reader import Listing, PhotoReader, image_files
+from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoReader
 from qgs.data.scenes import warn_once
 from qgs.wording import listed
 
@@ -63,11 +63,17 @@ def _listings() -> str:
     return ", ".join(f"{reader.listing} ({reader.name})" for reader in READERS)
 
 
-def _image_counts(folder: UPath, name: str = "", depth: int = 4) -> Iterator[tuple[str, int]]:
-    """Names below `folder`, "" for itself, of folders with images, and how many these are."""
-    if count := len(image_files(folder)):
-        yield name, count
-    for item in sorted(folder.iterdir(), key=lambda item: item.name) if depth else ():
+def _image_counts(folder: UPath, name: str = "", depth: int = 2) -> Iterator[str]:
+    """How many images `folder` and the folders below it hold, in words; each is listed once."""
+    try:
+        items = sorted(folder.iterdir(), key=lambda item: item.name)
+    except PermissionError:
+        yield f"{name} may not be read"
+        return
+    items = [item for item in items if not item.name.startswith(".")]
+    if count := sum(item.name.lower().endswith(IMAGE_SUFFIXES) for item in items):
+        yield f"{count} in {name or 'it'}"
+    for item in items if depth else ():
         if item.is_dir():
             yield from _image_counts(item, f"{name}{item.name}/", depth - 1)
 
@@ -79,7 +85,7 @@ def _nothing(folder: UPath, format: Format, held: list[type[PhotoReader]]) -> st
         other = f"; it can be read as {names}" if held else ""
         return f"{folder} has no {listing}, which {format} needs{other}"
     inside = sorted(item.name for item in folder.iterdir())
-    images = listed(f"{count} in {name or 'it'}" for name, count in _image_counts(folder))
+    images = listed(_image_counts(folder))
     return (
         f"{folder} has no transforms.json nor another listing of cameras; it holds "
         f"{listed(inside) or 'nothing'} (images: {images or 'none'}). Camera poses are "

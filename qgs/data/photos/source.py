@@ -97,8 +97,8 @@ class PhotoScene(EncodedScene):
             if alike not in known:
                 known[alike] = _checked(image_size(frame.path), frame, frame.path)
             size = known[alike]
-            listed = torch.tensor(frame.at_size(size), dtype=torch.float64)
-            intrinsics.append(CropResize(size, self._config.image_size).intrinsics(listed))
+            stored = torch.tensor(frame.at_size(size), dtype=torch.float64)
+            intrinsics.append(CropResize(size, self._config.image_size).intrinsics(stored))
         c2w = torch.from_numpy(np.stack([frame.c2w for frame in self._frames]))
         return Cameras(c2w, torch.stack(intrinsics), self._config.image_size)
 
@@ -125,18 +125,18 @@ class PhotoScene(EncodedScene):
 
     def stored_size(self, frame: int) -> Size:
         """See `Scene`."""
-        listed = self._frames[frame]
-        return _checked(image_size(listed.path), listed, listed.path)
+        photo = self._frames[frame]
+        return _checked(image_size(photo.path), photo, photo.path)
 
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
-        listed, size = self._frames[frame], self.stored_size(frame)
+        photo, size = self._frames[frame], self.stored_size(frame)
         buffer = io.BytesIO()
-        if listed.mask is not None:
-            Image.fromarray(_whole_mask(listed)).save(buffer, "png")
+        if photo.mask is not None:
+            Image.fromarray(_whole_mask(photo)).save(buffer, "png")
         return EncodedFrame(
-            listed.name, read_file(listed.path), listed.c2w, listed.at_size(size), size,
-            listed.lens, buffer.getvalue() or None, self._config.background,
+            photo.name, read_file(photo.path), photo.c2w, photo.at_size(size), size,
+            photo.lens, buffer.getvalue() or None, self._config.background,
         )  # fmt: skip
 
     def _stacked(
