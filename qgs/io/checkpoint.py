@@ -63,7 +63,7 @@ def opened_tensors(path: str | os.PathLike[str]) -> Iterator[Any]:
     try:
         with safe_open(path, "pt") as file:
             yield file
-    except SafetensorError as error:
+    except (SafetensorError, MemoryError) as error:  # MemoryError: a file of terabytes
         raise CheckpointError(
             f"{path} is not a whole safetensors file ({name_shown(str(error))}); it may be cut "
             "off: copy it again"
@@ -172,8 +172,8 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
         available = {"qgs", *available_plugins()}
         absent = [release for plugin, release in releases.items() if plugin not in available]
         raise CheckpointError(
-            f"{path} was made with {', '.join(releases.values())}, and its recipe fails here; "
-            f"install {', '.join(absent) or 'those releases'}:\n{error}"
+            f"{path} was made with {listed(releases.values())}, and its recipe fails here; "
+            f"install {listed(absent) or 'those releases'}:\n{error}"
         ) from error
 
 
