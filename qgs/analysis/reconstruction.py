@@ -185,8 +185,8 @@ class Reconstruction:
         """As `qgs.metrics.baselines`, on the compared views."""
         rows = [(s.psnr, s.baselines["nearest_input"]) for s in self.scores if s.baselines]
         means = [sum(values) / len(rows) for values in zip(*rows, strict=True)]
-        advice = ["refine longer, or on more photos"] if self.refinement else []
-        return worse_than_nearest(Psnr.column, *means, *advice) if means else ""
+        advice = {"or_else": "refine longer, or on more photos"} if self.refinement else {}
+        return worse_than_nearest(Psnr.column, *means, **advice) if means else ""
 
 
 @torch.no_grad()
