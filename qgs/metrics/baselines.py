@@ -32,7 +32,7 @@ _TRAINED_OTHERWISE = "train longer, or on photos like these"
 
 
 def worse_than_nearest(
-    column: Column, model: float | None, nearest: float | None, or_else: str = _TRAINED_OTHERWISE
+    column: Column, model: float | None, nearest: float | None, *, or_else: str = _TRAINED_OTHERWISE
 ) -> str:
     """A sentence where `nearest_input` scores better than the model, else "".
 

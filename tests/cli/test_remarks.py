@@ -14,6 +14,7 @@ from PIL import Image
 
 import qgs
 from qgs.components import GaussianHead
+from qgs.composer import resolve
 from qgs.contracts import Column, ModelDims, Scene
 from qgs.data.domain import KEY, trained_domain
 from qgs.data.evaluation import EvaluationPlan
@@ -56,7 +57,7 @@ def checkpoint(photos: Path, tmp_path_factory) -> Path:
         "data": {"type": "qgs/photos", "path": str(photos), "image_size": [16, 16], "holdout": 3},
         "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"},
     }
-    resolved = qgs.composer.resolve(recipe)
+    resolved = resolve(recipe)
     model = resolved.build_model()
     with torch.no_grad():
         model.head.linear.bias.unflatten(0, (-1, 14))[:, 6:9] = 5.0

@@ -107,7 +107,7 @@ def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
     change(kinds)
     rewrite(state, change, **{"qgs.contents": known if lists else json.dumps(contents(kinds))})
     before = {path.name: path.read_bytes() for path in copied.iterdir() if path.is_file()}
-    told = "crc32" if lists and words == "not finite" else words
+    told = "crc32" if lists and words.startswith(("not finite", "negative")) else words
     with pytest.raises(CheckpointError, match=told) as caught:
         run(tiny("tokengs", "training.steps=4", "training.ema=0.9"), copied, resume=True)
     assert str(state) in str(caught.value)
@@ -145,7 +145,7 @@ def test_a_run_starts_from_no_weights_that_are_not_finite(
 ) -> None:
     file = copied / "checkpoint.safetensors"
     rewrite(file, with_nan(WEIGHT))
-    with pytest.raises(CheckpointError, match=f"{file}: weights are not finite: {WEIGHT}"):
+    with pytest.raises(ValueError, match=f"{file}: weights are not finite: {WEIGHT}"):
         run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
     rewrite(file, as_integers(WEIGHT))
     with pytest.raises(
