@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from attack import JUNK, Use, attack, other_bytes, other_leaf, refused
+from attack import JUNK, FaultError, Use, attack, other_bytes, other_leaf, refused
 from kill_training import RECIPE
 from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.data.domain import Domain, verdict
+from qgs.engine.fit import OutOfMemoryError
 from qgs.engine.guard import TrainingError
 from qgs.engine.training import train
 from qgs.io.checkpoint import load_domain, load_step
@@ -247,6 +248,8 @@ def judged(use: Callable[[Path], None], path: Path) -> str:
     """How the use of a file ends. Raises what nobody should see."""
     try:
         use(path)
+    except OutOfMemoryError as error:
+        raise FaultError(f"allocates before it checks: {error}") from error
     except (ValueError, OSError, TrainingError) as error:
         return f"{path.stem} {refused(error, str(path))}"
     return f"{path.stem} success"

@@ -5,7 +5,7 @@
     python tools/kill_training.py --what packing --count 50
 
 After each kill -9 of a training the state and the checkpoint must be whole, and the run must go on
-from there; at the end its weights must equal, to the bit, those of the same run without a kill.
+from there; at the end its state must equal, to the bit, that of the same run without a kill.
 Evaluations and packings are killed as they open, move or remove one of their files, or a moment
 later. They leave whole files alone and the run as it was, and in the end, called again, what they
 leave without a kill. Prints one line and ends with 1 if anything is lost.
@@ -38,7 +38,7 @@ from qgs.engine.checkpoint import read_state
 from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
-from qgs.io.checkpoint import load_recipe
+from qgs.io.checkpoint import load_domain, load_recipe
 from qgs.io.files import is_leftover
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
@@ -102,24 +102,40 @@ def kill_training(options: argparse.Namespace) -> int:
             last = step
         os.waitpid(start(recipe, run), 0)
         os.waitpid(start(recipe_of(options.width, options.steps, 0), Path(scratch, "through")), 0)
-        ours, theirs = (
-            read_state(Path(scratch, name, "state.safetensors")).parts["weights"]
-            for name in ("run", "through")
-        )
-        equal = all(torch.equal(theirs[name], tensor) for name, tensor in ours.items())
+        differing = differing_values(*(Path(scratch, name) for name in ("run", "through")))
     print(
         f"{kills} kills, {inside} inside a save, at step {last} of {options.steps} after the last; "
-        f"{lost} times the state was older than before; weights "
-        + ("equal" if equal else "DIFFER from")
-        + " those without kills"
+        f"{lost} times the state was older than before; in the end "
+        + (
+            f"UNLIKE a run without kills: {differing}"
+            if differing
+            else "equal to one without kills"
+        )
     )
-    return 0 if equal and not lost and kills == options.count else 1
+    return 0 if not differing and not lost and kills == options.count else 1
+
+
+def differing_values(first: Path, second: Path) -> list[str]:
+    """What differs in the states of two runs, but for the seconds that they took."""
+    ours, theirs = (read_state(run / "state.safetensors").parts for run in (first, second))
+    names = {(part, key) for parts in (ours, theirs) for part in parts for key in parts[part]}
+    return [
+        f"{part}/{key}"
+        for part, key in sorted(names)
+        if key != "seconds" and not same(ours[part].get(key), theirs[part].get(key))
+    ]
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal, tensors to the bit."""
+    tensors = isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor)
+    return torch.equal(one, other) if tensors else bool(one == other)
 
 
 def evaluate_run(run: Path, out: Path) -> None:
     """As `qgs eval` does."""
-    recipe = load_recipe(run / "checkpoint.safetensors")
-    evaluate(qgs.load(run / "checkpoint.safetensors"), recipe).write(out)
+    file = run / "checkpoint.safetensors"
+    evaluate(qgs.load(file), load_recipe(file), trained_on=load_domain(file)).write(out)
 
 
 def pack_rooms(recipe: Recipe, out: Path) -> None:

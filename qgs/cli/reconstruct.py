@@ -101,8 +101,10 @@ def reconstruct(
     from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
+    from qgs.engine.growth import refuse_too_many
     from qgs.io.checkpoint import load, load_domain, load_recipe
 
+    refuse_too_many(gaussians or 0)
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
     model, recipe, trained = load(file, device), load_recipe(file), load_domain(file)

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.transforms import quat_to_matrix
+from qgs.memory import refuse_beyond_memory
 from qgs.types import Gaussians
 
 DEAD = 0.005
@@ -19,6 +20,14 @@ fog that stands before an object every single one is faint."""
 _BESIDE = 0.2  # of a parent's scales: how far a copy lies from it
 _MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
+
+
+def refuse_too_many(count: int) -> None:
+    """Raise TooLargeError when memory does not hold `count` Gaussians while they are optimised."""
+    numbers = 14 * 4  # of a Gaussian; each with its gradient and two moments
+    refuse_beyond_memory(
+        "a refinement", {f"{count} Gaussians": 4 * numbers * count}, "Take fewer (--gaussians)."
+    )
 
 
 class Leaves:

@@ -11,7 +11,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.engine.distributed import StopRequest, stop_requests
-from qgs.engine.growth import Leaves
+from qgs.engine.growth import Leaves, refuse_too_many
 from qgs.engine.tracking import TrainingProgress
 from qgs.losses.photometric import mean_squared_error, mean_ssim
 from qgs.metrics.images import psnr
@@ -73,10 +73,12 @@ def refine(
     The first Ctrl-C finishes the step and returns what there is. Any world will do: its size is
     measured by the distance of the Gaussians from the cameras.
 
-    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
+    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite;
+    TooLargeError for more of them than memory holds.
     """
     wanted = gaussians.count if count is None else count
     _refuse_unusable(gaussians, views, seconds, wanted)
+    refuse_too_many(wanted)
     quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
     with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
         renderer = renderer or AutoRenderer(AutoRenderer.Config())

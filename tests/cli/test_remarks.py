@@ -15,7 +15,7 @@ from PIL import Image
 import qgs
 from qgs.components import GaussianHead
 from qgs.composer import resolve
-from qgs.contracts import Column, ModelDims, Scene
+from qgs.contracts import Column, ModelDims, Scene, ViewsConfig
 from qgs.data.domain import KEY, trained_domain
 from qgs.data.evaluation import EvaluationPlan
 from qgs.data.images import framing
@@ -166,7 +166,10 @@ def test_what_is_as_good_as_the_nearest_photo_is_not_worse() -> None:
 
 def test_few_scales_at_the_cap_are_not_told() -> None:
     head = GaussianHead(GaussianHead.Config(scale_cap=0.1), ModelDims(16, 2, 1))
-    assert too_many_capped(head, TOLD - 0.01) == ""
-    told = too_many_capped(head, TOLD)
+    assert too_many_capped(head, TOLD - 0.01, ViewsConfig()) == ""
+    told = too_many_capped(head, TOLD, ViewsConfig())
     assert told.startswith("25% of the scales of visible Gaussians are at the cap, ")
+    assert told.endswith("take a smaller views.scale_factor")
+    auto = too_many_capped(head, TOLD, ViewsConfig(scale="auto"))
+    assert auto.endswith("take a smaller views.scale_factor with views.scale: constant")
     assert "model.head.scale_cap: 0.1," in told

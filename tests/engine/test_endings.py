@@ -2,7 +2,6 @@
 
 import json
 import multiprocessing
-import resource
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from training_runs import QUIET, Tiny, change_batches, losses, run, run_calling, same, weights
 
 from qgs.data.sampling import Batch
@@ -112,17 +112,20 @@ def test_a_stop_is_heard_between_two_scenes(tiny: Tiny, tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "evaluations.jsonl").exists()
 
 
-def test_a_full_disk_is_told_with_what_to_do(tiny: Tiny, tmp_path: Path) -> None:
+def test_a_full_disk_is_told_with_what_to_do(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(tensors: Any, path: Path, metadata: Any) -> None:
+        path.write_bytes(bytes(40_000))
+        raise SafetensorError("I/O error: No space left on device (os error 28)")
+
     recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
     run(tiny("tokengs", "training.steps=3"), folder)
     whole = Folder(folder).state.read_bytes()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))
-    try:
+    with monkeypatch.context() as patched:
+        patched.setattr("qgs.io.checkpoint.save_file", full)
         with pytest.raises(OSError, match=r"It takes \d+\.\d MB .* --resume"):
             run(recipe, folder, resume=True)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert Folder(folder).state.read_bytes() == whole
     assert run(recipe, folder, resume=True).steps == 4
 

@@ -126,6 +126,7 @@ def unusable() -> Iterator[Any]:
     yield pytest.param(one, photos, {"seconds": 0}, "0 seconds.*at least one of each", id="seconds")
     yield pytest.param(one, photos, {"count": 0}, "0 Gaussians wanted", id="count")
     yield pytest.param(broken, photos, {}, "not finite", id="nan")
+    yield pytest.param(one, photos, {"count": 10**11}, "22.4 TB of memory", id="memory")
 
 
 @pytest.mark.parametrize(("gaussians", "views", "options", "message"), [*unusable()])

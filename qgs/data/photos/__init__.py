@@ -63,7 +63,7 @@ def _listings() -> str:
     return ", ".join(f"{reader.listing} ({reader.name})" for reader in READERS)
 
 
-def _image_counts(folder: UPath, name: str = "", depth: int = 2) -> Iterator[str]:
+def _image_counts(folder: UPath, name: str = "", depth: int = 3) -> Iterator[str]:
     """How many images `folder` and the folders below it hold, in words; each is listed once."""
     try:
         items = sorted(folder.iterdir(), key=lambda item: item.name)
