@@ -1,7 +1,8 @@
 """Query-based feed-forward 3D Gaussian splatting from composable, checked components.
 
 model = qgs.compose("recipes/tiny/locus.yaml", overrides=["model.queries.count=128"])
-prediction = model(views)
+result = model.reconstruct("photos")  # or Views, in any world
+prediction = model(views)  # in the model's own world
 rendering = model.render(prediction.gaussians, cameras)
 qgs.save(model, path); model = qgs.load(path)
 """
@@ -15,11 +16,14 @@ from typing import TYPE_CHECKING, Any
 from query_gaussians import refuse_other_qgs
 
 if TYPE_CHECKING:
+    from qgs.analysis.reconstruction import Reconstruction
+    from qgs.analysis.scenes import read_photos
     from qgs.analysis.trace import trace
     from qgs.composer import compose
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.engine.refining import refine
     from qgs.io.checkpoint import load, save
+    from qgs.io.ply import load_ply, save_ply
     from qgs.model import QueryGaussianModel
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
 
@@ -42,9 +46,13 @@ _ELSEWHERE = {
     "Plugin": "qgs.contracts.plugin",
     "QueryGaussianModel": "qgs.model",
     "compose": "qgs.composer",
+    "Reconstruction": "qgs.analysis.reconstruction",
     "load": "qgs.io.checkpoint",
+    "load_ply": "qgs.io.ply",
+    "read_photos": "qgs.analysis.scenes",
     "refine": "qgs.engine.refining",
     "save": "qgs.io.checkpoint",
+    "save_ply": "qgs.io.ply",
     "trace": "qgs.analysis.trace",
 }
 """Where public names come from that are not of `qgs.types`."""
@@ -57,12 +65,16 @@ __all__ = [
     "Prediction",
     "QueryGaussianModel",
     "QueryState",
+    "Reconstruction",
     "Rendering",
     "Views",
     "compose",
     "load",
+    "load_ply",
+    "read_photos",
     "refine",
     "save",
+    "save_ply",
     "trace",
 ]
 

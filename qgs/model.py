@@ -1,8 +1,11 @@
 """The model: views to image memory, queries through the decoder layers, states to Gaussians."""
 
+import os
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor, nn
 
 from qgs.components.blocks import LayerScale
@@ -18,6 +21,7 @@ from qgs.contracts import (
     SelfAttention,
     Supervision,
 )
+from qgs.data.domain import Domain, warn_of_unlike
 from qgs.types import (
     Cameras,
     Gaussians,
@@ -28,6 +32,9 @@ from qgs.types import (
     Rendering,
     Views,
 )
+
+if TYPE_CHECKING:
+    from qgs import Reconstruction
 
 
 class DecoderLayer(nn.Module):
@@ -63,6 +70,7 @@ class QueryGaussianModel(nn.Module):
 
     refinements: one per decoder layer, at `refinement_of`; layers may share a module.
     recipe: the resolved recipe this model was composed from, None for one built by hand.
+    trained_on: what its checkpoint tells of the views that it was trained on, None if nothing.
     """
 
     def __init__(
@@ -90,6 +98,15 @@ class QueryGaussianModel(nn.Module):
         self.supervision = supervision
         self.renderer = renderer
         self.recipe = recipe
+        self.trained_on: Domain | None = None
+        self._warned = False
+
+    def __repr__(self) -> str:
+        """A line for each slot; `repr` of `encoder` and the like shows the modules inside."""
+        return import_module("qgs.analysis.shown").model_text(self)
+
+    def _repr_html_(self) -> str:
+        return import_module("qgs.analysis.shown").model_html(self)
 
     @property
     def depth(self) -> int:
@@ -102,12 +119,22 @@ class QueryGaussianModel(nn.Module):
         layers: Collection[int] | None = None,
         state: QueryState | None = None,
     ) -> Prediction:
-        """Reconstruct every scene of `views`.
+        """Reconstruct every scene of `views`, whose cameras are in the model's world.
 
         layers: see `predict`. state: the initial state; None for the learned queries.
+        In evaluation, a warning tells once what of `views` is not as it was in training.
         """
+        if not (self.training or self._warned or torch.compiler.is_compiling()):
+            settings = (self.recipe or {}).get("views")
+            self._warned = warn_of_unlike(views, settings, self.trained_on)
         initial = self.queries(views.images.shape[0]) if state is None else state
         return self.predict(self.encoder(views), initial, layers)
+
+    def reconstruct(
+        self, photos: "str | os.PathLike[str] | Views", **options: Any
+    ) -> "Reconstruction":
+        """One scene of photos in any world; options: see `qgs.analysis.scenes.reconstruct`."""
+        return import_module("qgs.analysis.scenes").reconstruct(self, photos, **options)
 
     def predict(
         self, memory: ImageMemory, state: QueryState, layers: Collection[int] | None = None

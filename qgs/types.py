@@ -14,6 +14,7 @@ Containers are frozen. A component returns a new one and never writes into the o
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from importlib import import_module
 from typing import Any, Self, cast
 
 import torch
@@ -22,6 +23,17 @@ from torch import Tensor
 
 class TensorContainer:
     """A frozen dataclass of tensors, containers and mappings of them."""
+
+    def __init_subclass__(cls) -> None:
+        """Give every class this `__repr__`, which `dataclass` then leaves as it is."""
+        cls.__repr__ = TensorContainer.__repr__
+
+    def __repr__(self) -> str:
+        """Shapes, and what else is unusual; no numbers."""
+        parts = [f"{name}: {_told(item)}" for name, item in _items(self)]
+        several = any(isinstance(item, TensorContainer) for _, item in _items(self))
+        lines = "\n  ".join(["", *(part.replace("\n", "\n  ") for part in parts)]) + "\n"
+        return f"{type(self).__name__}({lines if several else ', '.join(parts)})"
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """The container with every tensor moved as by `Tensor.to`; a dtype moves geometry too."""
@@ -55,6 +67,20 @@ def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
     elif isinstance(value, TensorContainer | Mapping | list | tuple):
         for key, item in _items(value):
             yield from named_tensors(item, f"{name}.{key}" if name else str(key))
+
+
+def _told(item: Any) -> str:
+    """A part of a container in words: of a tensor its shape, its type and device if unusual."""
+    if isinstance(item, Tensor):
+        unusual = [str(item.dtype).removeprefix("torch.")] * (item.dtype != torch.float32)
+        unusual += [str(item.device)] * (item.device.type != "cpu")
+        return " ".join([str(tuple(item.shape)), *unusual])
+    if isinstance(item, Mapping):
+        told = [
+            type(v).__name__ if isinstance(v, TensorContainer) else _told(v) for v in item.values()
+        ]
+        return f"{{{', '.join(f'{key}: {text}' for key, text in zip(item, told, strict=True))}}}"
+    return repr(item)
 
 
 def _items(value: Any) -> Iterator[tuple[Any, Any]]:
@@ -277,6 +303,16 @@ class Gaussians(TensorContainer):
     def __getitem__(self, index: Any) -> Self:
         return map_tensors(lambda x: x[index], self)
 
+    def most_opaque(self, count: int) -> Self:
+        """The `count` most opaque of each scene, all where there are fewer, opaque ones first."""
+        chosen = self.opacities.topk(min(count, self.count), -1).indices
+        parts = {name: getattr(self, name) for name in ("means", "scales", "quats", "colors")}
+        wide = {
+            k: x.gather(-2, chosen[..., None].expand(*chosen.shape, x.shape[-1]))
+            for k, x in parts.items()
+        }
+        return replace(self, opacities=self.opacities.gather(-1, chosen), **wide)
+
 
 @dataclass(frozen=True)
 class Rendering(TensorContainer):
@@ -326,3 +362,7 @@ class Prediction(TensorContainer):
     gaussians: Gaussians
     state: QueryState
     layers: Mapping[int, LayerPrediction]
+
+    def _repr_png_(self) -> bytes | None:
+        """Its picture in a notebook; what draws it is of a higher layer, and imported then."""
+        return import_module("qgs.analysis.shown").prediction_png(self)

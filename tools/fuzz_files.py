@@ -29,7 +29,7 @@ from qgs.engine.fit import OutOfMemoryError
 from qgs.engine.guard import TrainingError
 from qgs.engine.training import train
 from qgs.io.checkpoint import load_domain, load_step
-from qgs.io.ply import write_ply
+from qgs.io.ply import save_ply
 
 STEPS = 2
 LARGE = {
@@ -224,7 +224,7 @@ def use_checkpoint(checkpoint: Path) -> None:
     model = qgs.load(checkpoint)
     with torch.no_grad():
         gaussians = model.decode(model.queries(1))
-    write_ply(gaussians, checkpoint.with_suffix(".ply"))
+    save_ply(gaussians, checkpoint.with_suffix(".ply"))
     load_step(checkpoint)
     verdict(load_domain(checkpoint), Domain())
 

@@ -26,7 +26,7 @@ import torch
 import yaml
 from attack import FaultError, Use, attack, refused
 
-from qgs.cli.recipe_tables import parameter_counts
+from qgs.analysis.shown import parameter_counts
 from qgs.composer import PluginError, Recipe, RecipeError, resolve
 from qgs.composer.recipe import annotated, flat
 from qgs.composer.registry import load_sound_plugins

@@ -20,7 +20,7 @@ import torch
 
 import qgs
 from qgs.analysis.reconstruction import choose_sample
-from qgs.cli.reconstruct import chosen_scene
+from qgs.analysis.scenes import chosen_scene
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import Scene
 from qgs.data.sampling import Sample, training_frames, views_in

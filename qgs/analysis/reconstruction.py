@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,26 @@ from qgs.data.images import framing
 from qgs.data.sampling import Sample, make_sample, own_world, training_frames, views_in
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
+    Picture,
     depth_picture,
     depth_range,
     finer,
+    png_bytes,
     rgb_picture,
     side_by_side,
     write_gif,
     write_png,
 )
-from qgs.geometry.poses import look_at
+from qgs.geometry.poses import look_at, relative_to, scaled
+from qgs.geometry.transforms import moved
 from qgs.io.files import replacing_entries, write_text
-from qgs.io.ply import write_ply
+from qgs.io.ply import save_ply
 from qgs.memory import refuse_beyond_memory
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
 from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Gaussians, Rendering, Views
+from qgs.types import Cameras, Gaussians, Prediction, Rendering, Views
 from qgs.wording import listed, numbered
 
 ORBIT_FRAMES = 48
@@ -165,13 +169,16 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Gaussians (1, G) of a sample, and what its cameras see of them.
+    """Gaussians (1, G) of a sample by `model`, in its world, and what its cameras see of them.
 
-    world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, refinement: of
-    Gaussians; None without. remarks: sentences on the photos and what came of them.
+    prediction: None where the Gaussians were tuned or refined. world: reference pose (4, 4) and
+    scale, as of `own_world`. tuning: of tokens, refinement: of Gaussians; None without. remarks:
+    sentences on the photos and what came of them.
     """
 
+    model: QueryGaussianModel
     sample: Sample
+    prediction: Prediction | None
     gaussians: Gaussians
     rendering: Rendering
     scores: list[ViewScore]
@@ -190,6 +197,34 @@ class Reconstruction:
         advice = {"or_else": "refine longer, or on more photos"} if self.refinement else {}
         return worse_than_nearest(Psnr.column, model, nearest, **advice)
 
+    @property
+    def in_photos_world(self) -> Gaussians:
+        """The Gaussians (1, G) in the frame and unit of the photos' cameras, as for `save_ply`."""
+        reference, scale = self.world
+        return moved(self.gaussians, reference, 1 / float(scale))
+
+    def render(self, cameras: Cameras) -> Rendering:
+        """What cameras (1, V) in the photos' world see, depth in its unit too."""
+        reference, scale = (part.to(cameras.c2w.device) for part in self.world)
+        c2w = scaled(relative_to(reference, cameras.c2w.double()), scale).float()
+        own = Cameras(c2w, cameras.intrinsics.float(), cameras.size).to(self.gaussians.means.device)
+        with torch.no_grad():
+            seen = self.model.render(self.gaussians, own)
+        return replace(seen, depth=seen.depth / float(scale))
+
+    def save(self, folder: str | PathLike[str]) -> list[Path]:
+        """Write what `qgs reconstruct` writes; see `write_reconstruction`."""
+        return write_reconstruction(self.model, self, Path(folder))
+
+    def __repr__(self) -> str:
+        """Scene, views with PSNR, and the remarks."""
+        views = [f"{s.kind} {self.sample.label(s.frame)} {s.psnr:.2f} dB" for s in self.scores]
+        heading = f"Reconstruction of {self.sample.scene}: {self.gaussians.count:,} Gaussians"
+        return "\n  ".join([heading, *views, *self.remarks])
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(overview(self, dpi=72))
+
 
 @torch.no_grad()
 def reconstruct(
@@ -205,7 +240,9 @@ def reconstruct(
 
     seen: in training. tuned: given Gaussians, by the tuning or the refinement that is recorded.
     """
-    gaussians: Gaussians = model(sample.inputs).gaussians if tuned is None else tuned
+    prediction: Prediction | None = model(sample.inputs) if tuned is None else None
+    gaussians = tuned if prediction is None else prediction.gaussians
+    assert gaussians is not None
     rendering = model.render(gaussians, _cameras(sample))
     truth = sample.targets.images
     photos = torch.cat([sample.inputs.images, truth], 1)
@@ -221,7 +258,9 @@ def reconstruct(
         others = {name: values[index] for name, values in baselines.items()}
         value = quality[len(sample.input_frames) + index]
         scores.append(ViewScore(frame, kind, value, others))
-    return Reconstruction(sample, gaussians, rendering, scores, world, tuning, refinement)
+    return Reconstruction(
+        model, sample, prediction, gaussians, rendering, scores, world, tuning, refinement
+    )
 
 
 def remarks_on(
@@ -273,7 +312,7 @@ def write_reconstruction(
     with torch.no_grad():
         frames = model.render(reconstruction.gaussians, path).rgb[0]
     with replacing_entries(out) as fresh:
-        write_ply(reconstruction.gaussians, fresh / "gaussians.ply")
+        save_ply(reconstruction.gaussians, fresh / "gaussians.ply")
         _write_views(reconstruction, fresh)
         write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif", FRAMES_PER_SECOND)
         record = json.dumps(_camera_record(reconstruction, path), indent=1)
@@ -283,28 +322,39 @@ def write_reconstruction(
 
 
 def _write_views(reconstruction: Reconstruction, out: Path) -> None:
-    """Every view as a file, and an overview of at most OVERVIEW_COLUMNS: inputs stay longest."""
+    """Every view as a file, and the overview."""
+    rows = _pictures(reconstruction)
+    for i, score in enumerate(reconstruction.scores):
+        name = f"{score.frame:05d}_{score.kind.split()[0]}.png"
+        write_png(side_by_side([rows["photo"][i], rows["render"][i]]), out / "views" / name)
+        write_png(rows["depth"][i], out / "depth" / name)
+    write_png(overview(reconstruction), out / "overview.png")
+
+
+def _pictures(reconstruction: Reconstruction) -> dict[str, list[Picture]]:
+    """Photo, render and depth of every view."""
     sample, rendering = reconstruction.sample, reconstruction.rendering
-    scores, kinds = reconstruction.scores, [s.kind.split()[0] for s in reconstruction.scores]
     near, far = depth_range(rendering.depth)
-    rows = {
+    return {
         "photo": [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])],
         "render": [rgb_picture(image) for image in rendering.rgb[0]],
         "depth": [depth_picture(depth, near, far) for depth in rendering.depth[0]],
     }
-    for i, (score, kind) in enumerate(zip(scores, kinds, strict=True)):
-        name = f"{score.frame:05d}_{kind}.png"
-        write_png(side_by_side([rows["photo"][i], rows["render"][i]]), out / "views" / name)
-        write_png(rows["depth"][i], out / "depth" / name)
+
+
+def overview(reconstruction: Reconstruction, dpi: int = 120) -> Picture:
+    """Photos over renders and depth, of at most OVERVIEW_COLUMNS views: inputs stay longest."""
+    sample, scores, rows = reconstruction.sample, reconstruction.scores, _pictures(reconstruction)
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
     quality = [f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}" for score in scores]
     files = [Path(sample.names.get(s.frame, "")).name for s in scores]
     titles = [
-        f"frame {numbered(scores[i].frame, files[i])}\n{kinds[i]}, {quality[i]}" for i in shown
+        f"frame {numbered(scores[i].frame, files[i])}\n{scores[i].kind.split()[0]}, {quality[i]}"
+        for i in shown
     ]
     chosen = {label: [pictures[i] for i in shown] for label, pictures in rows.items()}
-    overview = figure_picture(grid_figure(chosen, titles, depth_row=("depth", near, far)))
-    write_png(overview, out / "overview.png")
+    scale = depth_range(reconstruction.rendering.depth)
+    return figure_picture(grid_figure(chosen, titles, depth_row=("depth", *scale)), dpi)
 
 
 def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, Any]:

@@ -8,12 +8,14 @@ import typer
 from qgs.cli import (
     bench,
     check_plugin,
+    convert,
     demo,
     evaluate,
     inspect,
     new_plugin,
     recipes,
     reconstruct,
+    report,
     train,
     weights,
 )
@@ -37,6 +39,8 @@ COMMANDS = {
     "train": train.train,
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
+    "convert": convert.convert,
+    "report": report.report,
     "import": weights.import_,
     "export": weights.export,
     "bench": bench.bench,

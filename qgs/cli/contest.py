@@ -21,7 +21,7 @@ from qgs.drawing.figures import Curves
 from qgs.engine.evaluation import Evaluation, evaluate
 from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
-from qgs.io.ply import write_ply
+from qgs.io.ply import save_ply
 from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
 from qgs.wording import short_names
@@ -194,4 +194,4 @@ def write_examples(report: Report, target: Path) -> None:
     """The first pictured scene as TARGET/NAME/example.ply, by every contender."""
     for contender in report.contenders:
         gaussians = contender.model(report.samples[0].inputs).gaussians
-        write_ply(gaussians, target / contender.name / "example.ply")
+        save_ply(gaussians, target / contender.name / "example.ply")

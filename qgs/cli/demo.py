@@ -65,12 +65,13 @@ def demo(
     if train:
         _contest(given or RECIPES, 120 if seconds is None else seconds, seed or 0, target, device)
     else:
-        _show_trained(models, given[0] if given else None, target, console, device)
+        show_trained(models, given[0] if given else None, target, console, device)
 
 
-def _show_trained(
+def show_trained(
     models: Sequence[str] | None, photos: str | None, target: Path, console: Console, device: str
 ) -> None:
+    """Judge `models`, those that come with qgs by default, and write their report into `target`."""
     from qgs.cli import contest, trained
 
     try:
@@ -140,10 +141,10 @@ def _write(report: Report, entries: Sequence[Entry], target: Path, console: Cons
         console.print(f"  {command}  {what}", soft_wrap=True, highlight=False)
 
 
-def new_folder(out: Path | None) -> Path:
-    """`out`, refused when it holds anything; None takes the first of demo, demo-2, ... not used."""
+def new_folder(out: Path | None, name: str = "demo") -> Path:
+    """`out`, refused when it holds anything; None takes the first of NAME, NAME-2, ... not used."""
     if out is None:
-        names = map(Path, chain(["demo"], (f"demo-{number}" for number in count(2))))
+        names = map(Path, chain([name], (f"{name}-{number}" for number in count(2))))
         return next(name for name in names if not name.exists())
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")

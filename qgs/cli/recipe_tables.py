@@ -2,10 +2,9 @@
 
 from rich.markup import escape
 from rich.table import Table
-from torch import nn
 
+from qgs.analysis.shown import parameter_counts
 from qgs.composer import Recipe
-from qgs.composer.slots import LAYER_SLOTS
 from qgs.io.differences import differing_options
 from qgs.model import QueryGaussianModel
 
@@ -51,28 +50,6 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
             parameters.add_section()
         parameters.add_row(name, f"{x:,}", f"{y:,}", f"{y - x:+,}" if x != y else "")
     return [slots, options, parameters]
-
-
-def parameter_counts(model: QueryGaussianModel) -> dict[str, int]:
-    """Component to its number of parameters, decoder layers summed by slot."""
-    sublayers = {
-        f"decoder.{slot}": sum(_count(getattr(layer, slot)) for layer in model.decoder)
-        for slot in LAYER_SLOTS
-        if slot != "refinement"
-    }
-    return {
-        "encoder": _count(model.encoder),
-        "queries": _count(model.queries),
-        **sublayers,
-        "decoder.refinement": _count(model.refinements),
-        "decoder.layer_scale": _count(model.decoder) - sum(sublayers.values()),
-        "head": _count(model.head),
-        "centers": _count(model.centers),
-    }
-
-
-def _count(module: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in module.parameters())
 
 
 def _types(recipe: Recipe, name: str) -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Component, Scene, Split
+    from qgs.contracts import Scene
     from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
     from qgs.types import Gaussians
@@ -97,6 +97,7 @@ def reconstruct(
 
     from qgs.analysis.reconstruction import choose_sample, remarks_on, write_reconstruction
     from qgs.analysis.reconstruction import reconstruct as run
+    from qgs.analysis.scenes import chosen_scene, frame_list
     from qgs.composer import resolve
     from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
@@ -115,7 +116,8 @@ def reconstruct(
         console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
     sources = registry.components("data")
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
-    wanted = (frame_list(frames, "--frames", scene), frame_list(holdout, "--holdout", scene))
+    named = {"--frames": frames, "--holdout": holdout}.items()
+    wanted = [None if text is None else frame_list(text, name, scene) for name, text in named]
     sample, world = choose_sample(scene, recipe.views, inputs, *wanted)
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     tuned, record = tuned_tokens(model, recipe, sample, tune, console) if tune else (None, None)
@@ -191,65 +193,6 @@ def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:
         raise ValueError(f"{listed(given)} needs --refine SECONDS: add it, such as --refine 30")
     if seconds is not None and not 0 < seconds < float("inf"):
         raise ValueError(f"--refine must be a number of seconds above 0, got {seconds:g}")
-
-
-def chosen_scene(
-    recipe: Recipe,
-    path: str,
-    size: tuple[int, int] | None,
-    name: str | None,
-    sources: Mapping[str, type[Component]],
-) -> tuple[Scene, Sequence[int]]:
-    """The scene called `name` at `path`, or the only one, and the frames a model was trained on.
-
-    size: (H, W) of its images, the recipe's by default. sources: that may open `path`, by
-    PLUGIN/NAME. Raises ValueError when there are several scenes and none is named, when none has
-    the name, and for a recipe without data, which has no image size, when none is given.
-    """
-    from qgs.data.recognition import open_for
-    from qgs.data.sampling import training_frames
-
-    if recipe.data_config is None and size is None:
-        raise ValueError(
-            "the checkpoint's recipe has no data, so its image size is not known; give it, "
-            "such as --size 256x256"
-        )
-    source, is_training_data = open_for(path, size, recipe.data_config, sources)
-    splits: tuple[Split, ...] = ("train", "test")
-    places: dict[str, tuple[Split, int]] = {
-        known: (split, place) for split in splits for place, known in enumerate(source.names(split))
-    }
-    if name is None and len(places) == 1:
-        (name,) = places
-    if name not in places:
-        found = f"no scene {name!r}, but" if name is not None else f"{len(places)} scenes:"
-        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them with --scene")
-    split, place = places[name]
-    scene = source.scenes(split)[place]
-    seen = is_training_data and scene.name in source.names("train")
-    return scene, training_frames(scene) if seen else ()
-
-
-def frame_list(text: str | None, option: str, scene: Scene) -> list[int] | None:
-    """Frame numbers of "0,8,x.jpg"; None stays None. A photo's folders may be left out.
-
-    Raises ValueError for what is neither a number nor the name of one photo of `scene`.
-    """
-    if text is None:
-        return None
-    names = [scene.frame_name(frame) for frame in range(len(scene))]
-    frames: list[int] = []
-    for part in map(str.strip, text.split(",")):
-        found = [f for f, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
-        found = [int(part)] if part.removeprefix("-").isdecimal() else found
-        if len(found) != 1:
-            fits = f"fits {listed(map(scene.label, found))}" if found else "is no photo"
-            raise ValueError(
-                f"{option}: {part!r} {fits}. Give numbers or file names of photos with commas "
-                f"between, such as 0,8,16, of {scene.label(0)} to {scene.label(len(names) - 1)}"
-            )
-        frames += found
-    return frames
 
 
 def score_table(result: Reconstruction, what: str = "") -> Table:

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import SceneSource, ViewsConfig
+from qgs.data.scenes import warn_once
 from qgs.data.stream import training_batches
-from qgs.geometry.poses import look_at_depth
-from qgs.types import Cameras
+from qgs.geometry.poses import first_camera, largest_distance, look_at_depth, mean_camera
+from qgs.types import Cameras, Views
 
 SAMPLES = 256
 """Training samples that are measured, the first ones."""
@@ -28,6 +29,8 @@ OUTLIERS = 0.02
 infinitely far."""
 TOLERANCE = 1.1
 """Views are outside where they leave the trained range by more than this factor."""
+GROSS = 5.0
+"""Input cameras this many times as far apart as in training are no mere extrapolation."""
 KEY = "trained_on"
 """Where a checkpoint's extra metadata holds `Domain.text`."""
 
@@ -121,6 +124,53 @@ def verdict(trained: Domain, found: Domain) -> str:
         "the cameras lie within what this model was trained on, in distance, direction, depth and "
         "field of view; what they show may still be new to it"
     )
+
+
+def odd_images(images: Tensor) -> str:
+    """What is wrong with the range of `images` (..., H, W), of every eighth pixel; "" if nothing.
+
+    Resampling may leave [0, 1] a little.
+    """
+    low, high = map(float, images[..., ::8, ::8].aminmax())
+    if low >= -0.5 and high <= 1.5:
+        return ""
+    return (
+        f"images have values from {low:.3g} to {high:.3g} and must lie in [0, 1]: divide 8-bit "
+        "values by 255, undo a subtracted mean"
+    )
+
+
+def warn_of_unlike(
+    views: Views, settings: Mapping[str, Any] | None, trained: Domain | None
+) -> bool:
+    """Warn where `views` cannot be what a model was trained on; whether it did. Some 0.1 ms.
+
+    settings: `views` of its recipe. Looks at values, but not while a CUDA graph is captured.
+    """
+    c2w = views.cameras.c2w
+    if c2w.is_meta or (c2w.is_cuda and torch.cuda.is_current_stream_capturing()):
+        return False
+    told = [odd_images(views.images)] if views.images.numel() else []
+    if settings is not None and c2w.numel():
+        first = settings["frame"] == "first_cam"
+        place = (first_camera if first else mean_camera)(c2w)
+        if float((place - torch.eye(4).to(place)).abs().max()) > 0.05:
+            distance = float(place[..., :3, 3].norm(dim=-1).max())
+            told.append(
+                f"the {'first' if first else 'mean'} camera is not at the origin of the model's "
+                f"world, looking along +z, but {distance:.3g} away or turned; cameras are OpenCV "
+                "camera-to-world (x right, y down, z forward; of OpenGL axes negate columns 1, 2)"
+            )
+    reach = (trained.ranges if trained else {}).get("baseline", (0.0, math.inf))[1]
+    apart = float(largest_distance(c2w).max()) if c2w.numel() else 0.0
+    if apart > GROSS * reach:
+        told.append(f"input cameras stand {apart:.3g} apart, in training at most {reach:.3g}")
+    if told := [*filter(None, told)]:
+        warn_once(
+            f"{'; '.join(told)}. Expect a poor result. `model.reconstruct(views)` brings cameras "
+            "in any frame and unit to those of the model"
+        )
+    return bool(told)
 
 
 def trained_domain(source: SceneSource, views: ViewsConfig, seed: int) -> Domain:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TextIO
 
 from qgs.io.files import is_leftover, read_records, told_where_full, write_text
-from qgs.io.models import checkpoint_path
+from qgs.io.models import CHECKPOINT, checkpoint_path
 
 
 class FolderGoneError(OSError):
@@ -26,7 +26,7 @@ class RunFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.recipe = self.path / "recipe.yaml"
-        self.checkpoint = self.path / "checkpoint.safetensors"
+        self.checkpoint = self.path / CHECKPOINT
         self.checkpoint_ema = self.path / "checkpoint_ema.safetensors"
         self.state = self.path / "state.safetensors"
         self.evaluation = self.path / "evaluation"
@@ -134,9 +134,8 @@ class RunFolder:
 
 
 def checkpoint_of(name: str | Path) -> Path:
-    """The checkpoint of a run folder, or what `checkpoint_path` finds; raises as that does."""
-    path = checkpoint_path(name)
-    file = RunFolder(path).checkpoint if path.is_dir() else path
+    """What `checkpoint_path` finds; raises as that does, and FileNotFoundError for no file."""
+    file = checkpoint_path(name)
     if not file.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {file}; give a run folder of `qgs train`, a .safetensors file, its "

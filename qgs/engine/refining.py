@@ -97,7 +97,7 @@ class _Run:
     ) -> None:
         self.renderer, self.wanted = renderer, wanted
         if wanted < gaussians.count:
-            gaussians = gaussians[:, gaussians.opacities[0].topk(wanted).indices]
+            gaussians = gaussians.most_opaque(wanted)
         self.start, eyes = gaussians.count, views.cameras.c2w[0, :, :3, 3]
         distances = torch.cdist(gaussians.means[0], eyes)
         self.size = float(distances.median().clamp_min(1e-6))  # of the scene, in its units

@@ -137,8 +137,8 @@ def load(
 ) -> QueryGaussianModel:
     """Rebuild the model that `save` wrote, on `device` (default: CPU), in evaluation mode.
 
-    path: also PLUGIN/NAME of a shipped model, or a URL, see `checkpoint_path`. Weights of half
-    precision become float32.
+    path: also a run folder of `qgs train`, PLUGIN/NAME of a shipped model, or a URL, see
+    `checkpoint_path`. Weights of half precision become float32.
     Raises FileNotFoundError, ValueError for weights that are NaN or infinite, or CheckpointError,
     which names the releases that wrote the file where a plugin is missing or another release of it
     cannot stand for it.
@@ -154,6 +154,7 @@ def load(
         ) from error
     load_weights(model, tensors, str(path))
     refuse_broken(tensors, path)
+    model.trained_on = load_domain(path)
     return (model if device is None else model.to(device)).eval()
 
 

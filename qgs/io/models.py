@@ -16,19 +16,23 @@ from qgs.contracts.plugin import ENTRY_POINT_GROUP
 from qgs.data.paths import opened_path
 from qgs.io.files import replacing
 
+CHECKPOINT = "checkpoint.safetensors"
+"""In a run folder: the latest good weights."""
+
 
 def checkpoint_path(name: str | os.PathLike[str]) -> Path:
     """The local path that `name` stands for; anything that exists under that name comes first.
 
-    name: a path, PLUGIN/NAME of a model that an installed plugin ships (`qgs list`), or a URL that
-    fsspec opens, whose file is kept in `cache_folder` and its SHA-256 told on standard error.
+    name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
+    plugin ships (`qgs list`), or a URL that fsspec opens, whose file is kept in `cache_folder` and
+    its SHA-256 told on standard error.
     Raises FileNotFoundError for a model that a plugin does not ship, PluginError for a plugin that
     cannot be used, OSError for a download that fails; a path that does not exist is returned.
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
     if path.exists():
-        return path
+        return path / CHECKPOINT if path.is_dir() else path
     if "://" in text:
         return _downloaded(text)
     plugin, slash, model = text.partition("/")

@@ -4,10 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
+import torch.nn.functional as F
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseError
+from torch import Tensor
 
+from qgs.data.scenes import warn_once
 from qgs.io.files import replacing
-from qgs.types import Gaussians
+from qgs.types import Gaussians, map_tensors
+from qgs.wording import listed
 
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
@@ -18,40 +22,100 @@ OPACITY_EPS = 1e-6
 SCALE_MIN = 1e-12
 """Smallest scale stored, world units: the logarithm of 0 is infinite."""
 
-PROPERTIES = (
-    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
-    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
-)  # fmt: skip
+_MEANS, _COLORS, _SCALES, _QUATS = (
+    ("x", "y", "z"),
+    ("f_dc_0", "f_dc_1", "f_dc_2"),
+    ("scale_0", "scale_1", "scale_2"),
+    ("rot_0", "rot_1", "rot_2", "rot_3"),
+)
+NEEDED = (*_MEANS, *_COLORS, "opacity", *_SCALES, *_QUATS)
+REST = tuple(f"f_rest_{index}" for index in range(45))
+"""Higher spherical harmonics, all 0 here. Several readers know no file without all of them: the
+viewer of the 3DGS release, plugins of game engines, versions of PlayCanvas that show black."""
+PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *_QUATS)
 
 
-def write_ply(gaussians: Gaussians, path: str | Path) -> None:
-    """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
+def one_scene(gaussians: Gaussians, kind: str) -> Gaussians:
+    """The Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
 
-    Colours become f_dc, opacities logits, scales logarithms; quaternions stay w x y z; normals are
-    zero. The file appears whole or not at all. Raises ValueError for several scenes or for numbers
-    that are not finite.
+    Raises ValueError for several scenes or for numbers that are not finite. kind: of the file.
     """
     batch = gaussians.means.shape[:-2]
     if batch not in ((), (1,)):
         raise ValueError(
-            f"a PLY file holds one scene, got Gaussians of batch shape {tuple(batch)}; "
+            f"a {kind} file holds one scene, got Gaussians of batch shape {tuple(batch)}; "
             "write them one by one, as gaussians[i]"
         )
-    scene = gaussians[0] if batch else gaussians
-    parts = [
-        scene.means,
-        torch.zeros_like(scene.means),
-        (scene.colors - 0.5) / SH_C0,
-        scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
-        scene.scales.clamp_min(SCALE_MIN).log(),
-        scene.quats,
-    ]
-    table = torch.cat([part.detach().float().cpu() for part in parts], -1)
-    broken = int((~table.isfinite()).any(-1).sum())
-    if broken:
-        raise ValueError(f"{broken} of {len(table)} Gaussians have numbers that are not finite")
-    vertices = np.empty(len(table), dtype=[(name, "<f4") for name in PROPERTIES])
-    for column, name in enumerate(PROPERTIES):
-        vertices[name] = table[:, column]
+    scene = map_tensors(Tensor.detach, gaussians[0] if batch else gaussians).to(
+        "cpu", torch.float32
+    )
+    finite = [part.isfinite()[..., None].flatten(1).all(-1) for part in vars(scene).values()]
+    if broken := int((~torch.stack(finite).all(0)).sum()):
+        raise ValueError(f"{broken} of {scene.count} Gaussians have numbers that are not finite")
+    return scene
+
+
+def save_ply(gaussians: Gaussians, path: str | Path) -> None:
+    """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
+
+    Colours become f_dc, opacities logits, scales logarithms; quaternions stay w x y z; normals and
+    f_rest are zero. The file appears whole or not at all. Raises ValueError for several scenes or
+    for numbers that are not finite.
+    """
+    scene = one_scene(gaussians, "PLY")
+    columns = {
+        _MEANS: scene.means,
+        _COLORS: (scene.colors - 0.5) / SH_C0,
+        ("opacity",): scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
+        _SCALES: scene.scales.clamp_min(SCALE_MIN).log(),
+        _QUATS: scene.quats,
+    }
+    vertices = np.zeros(scene.count, dtype=[(name, "<f4") for name in PROPERTIES])
+    for names, values in columns.items():
+        for name, column in zip(names, values.unbind(-1), strict=True):
+            vertices[name] = column
     with replacing(path) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
+
+
+def load_ply(path: str | Path) -> Gaussians:
+    """The Gaussians (1, G) of a PLY file in the layout of the 3DGS release, whatever wrote it.
+
+    Colours are those of f_dc alone: a warning says so where the file's depend on the direction.
+    Raises FileNotFoundError, and ValueError for another kind of file or of PLY, such as a
+    compressed one, and for numbers that are not finite.
+    """
+    try:
+        file = PlyData.read(str(path))
+    except (PlyHeaderParseError, PlyElementParseError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{path} is no whole PLY file ({error}); give one as `qgs reconstruct` writes it"
+        ) from error
+    found = {element.name: element for element in file.elements}
+    names = found["vertex"].data.dtype.names if "vertex" in found else ()
+    if missing := [name for name in NEEDED if name not in names]:
+        kind = "a compressed PLY" if "chunk" in found else "no PLY of Gaussians"
+        raise ValueError(
+            f"{path} is {kind}: it lacks {listed(missing)}; give one with the properties of the "
+            "3DGS release, as SuperSplat's uncompressed export writes it"
+        )
+    vertices = found["vertex"].data
+    rest = [name for name in names if name.startswith("f_rest_")]
+    if any(vertices[name].any() for name in rest):
+        warn_once(f"{path} has colours that depend on the direction; their mean (f_dc) is taken")
+
+    def columns(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
+
+    scene = Gaussians(
+        means=columns(*_MEANS),
+        scales=columns(*_SCALES).exp(),
+        quats=F.normalize(columns(*_QUATS), dim=-1),
+        opacities=columns("opacity")[:, 0].sigmoid(),
+        colors=columns(*_COLORS) * SH_C0 + 0.5,
+    )
+    try:
+        one_scene(scene, "PLY")
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return scene[None]

@@ -117,6 +117,22 @@ def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
     assert "<small>seconds</small>" not in page
 
 
+def test_a_report_of_runs_shows_how_they_were_trained(models, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "checkpoint.safetensors").write_bytes((tmp_path / models[1]).read_bytes())
+    steps = [{"step": n, "seconds": n / 2, "loss": 1 / n, "psnr": 10.0 + n} for n in range(1, 9)]
+    (run / "history.jsonl").write_text("".join(json.dumps(step) + "\n" for step in steps))
+    result = run_qgs("report", "run", models[3])
+    assert result.exit_code == 0, result.output
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<h2>Training</h2>" in page
+    assert "judged on the test split of their recipe" in page
+    photos = photos_in(tmp_path / "mine", 6, step=0.1)
+    assert run_qgs("report", "run", "--photos", photos).exit_code == 0
+    assert "<h2>Your photos</h2>" in (tmp_path / "report-2" / "report.html").read_text()
+
+
 @pytest.mark.parametrize("count", [3, 20])
 def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
     result = run_qgs("demo", photos_in(tmp_path / "mine", count, step=5.0), *models)

@@ -11,7 +11,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import qgs
-from qgs.cli.reconstruct import frame_list
+from qgs.analysis.scenes import frame_list
 
 RECIPE = {
     "recipe": 1,
@@ -138,7 +138,6 @@ def test_photos_are_named_by_number_or_file(checkpoint, photos, tmp_path):
 def test_photos_that_are_not_there_are_refused(photos, tmp_path):
     scene = opened(photos).scenes("train")[0]
     assert frame_list("0,8", "--frames", scene) == [0, 8]
-    assert frame_list(None, "--frames", scene) is None
     ends = r"of 0 \(images/0\.png\) to 6 \(images/6\.png\)"
     with pytest.raises(ValueError, match=rf"--frames: '0-8' is no photo\. .*{ends}"):
         frame_list("0-8", "--frames", scene)

@@ -14,7 +14,7 @@ from qgs_datatools import packing
 from upath import UPath
 
 import qgs
-from qgs.cli.reconstruct import chosen_scene
+from qgs.analysis.scenes import chosen_scene
 from qgs.composer import resolve
 from qgs.composer.registry import load_registry
 from qgs.data import PhotosSource

@@ -1,25 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
-from qgs.io.ply import OPACITY_EPS, PROPERTIES, SH_C0, write_ply
+from qgs.io.ply import OPACITY_EPS, PROPERTIES, SH_C0, load_ply, save_ply
 from qgs.types import Gaussians
-
-
-def read_ply(path) -> Gaussians:
-    vertices = PlyData.read(str(path))["vertex"].data
-
-    def columns(*names: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
-
-    return Gaussians(
-        means=columns("x", "y", "z"),
-        scales=columns("scale_0", "scale_1", "scale_2").exp(),
-        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        opacities=columns("opacity")[:, 0].sigmoid(),
-        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * SH_C0 + 0.5,
-    )[None]
 
 
 def random_gaussians(*batch: int, seed: int = 0) -> Gaussians:
@@ -39,15 +24,15 @@ def random_gaussians(*batch: int, seed: int = 0) -> Gaussians:
 
 def test_round_trip(tmp_path):
     gaussians = random_gaussians(1, 200)
-    write_ply(gaussians, tmp_path / "scene.ply")
-    again = read_ply(tmp_path / "scene.ply")
+    save_ply(gaussians, tmp_path / "scene.ply")
+    again = load_ply(tmp_path / "scene.ply")
     for name in ("means", "scales", "quats", "opacities", "colors"):
         torch.testing.assert_close(getattr(again, name), getattr(gaussians, name))
 
 
 def test_file_follows_the_3dgs_conventions(tmp_path):
     gaussians = random_gaussians(50)
-    write_ply(gaussians, tmp_path / "scene.ply")
+    save_ply(gaussians, tmp_path / "scene.ply")
     ply = PlyData.read(str(tmp_path / "scene.ply"))
     assert not ply.text
     assert ply.byte_order == "<"
@@ -63,19 +48,19 @@ def test_file_follows_the_3dgs_conventions(tmp_path):
 def test_certain_opacities_stay_finite(tmp_path):
     gaussians = random_gaussians(2)
     gaussians.opacities.copy_(torch.tensor([0.0, 1.0]))
-    write_ply(gaussians, tmp_path / "scene.ply")
-    opacities = read_ply(tmp_path / "scene.ply").opacities[0]
+    save_ply(gaussians, tmp_path / "scene.ply")
+    opacities = load_ply(tmp_path / "scene.ply").opacities[0]
     torch.testing.assert_close(opacities, torch.tensor([OPACITY_EPS, 1 - OPACITY_EPS]))
 
 
 def test_no_gaussians_at_all(tmp_path):
-    write_ply(random_gaussians(1, 0), tmp_path / "empty.ply")
-    assert read_ply(tmp_path / "empty.ply").count == 0
+    save_ply(random_gaussians(1, 0), tmp_path / "empty.ply")
+    assert load_ply(tmp_path / "empty.ply").count == 0
 
 
 def test_several_scenes_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"one scene.*\(2,\)"):
-        write_ply(random_gaussians(2, 5), tmp_path / "two.ply")
+        save_ply(random_gaussians(2, 5), tmp_path / "two.ply")
     assert not list(tmp_path.iterdir())
 
 
@@ -83,5 +68,74 @@ def test_numbers_that_are_not_finite_are_refused_and_nothing_is_left(tmp_path):
     gaussians = random_gaussians(4)
     gaussians.means[2, 0] = float("nan")
     with pytest.raises(ValueError, match="1 of 4 Gaussians"):
-        write_ply(gaussians, tmp_path / "nan.ply")
+        save_ply(gaussians, tmp_path / "nan.ply")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_layout_is_that_of_the_3dgs_release(tmp_path):
+    save_ply(random_gaussians(3), tmp_path / "scene.ply")
+    vertex = PlyData.read(tmp_path / "scene.ply")["vertex"].data
+    assert vertex.dtype.names is not None
+    assert len(vertex.dtype.names) == 62
+    assert vertex.dtype.names[8:10] == ("f_dc_2", "f_rest_0")
+    assert vertex.dtype.names[53:56] == ("f_rest_44", "opacity", "scale_0")
+    assert not any(vertex[f"f_rest_{index}"].any() for index in range(45))
+
+
+def test_a_parser_of_others_reads_the_same_numbers(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="gsply, a reader of splat files, is not installed")
+    gaussians = random_gaussians(1, 200)
+    save_ply(gaussians, tmp_path / "scene.ply")
+    read = gsply.plyread(str(tmp_path / "scene.ply"))
+    for name, values in {
+        "means": read.means,
+        "scales": np.exp(read.scales),
+        "quats": read.quats,
+        "opacities": 1 / (1 + np.exp(-read.opacities)),
+        "colors": 0.5 + SH_C0 * read.sh0,
+    }.items():
+        np.testing.assert_allclose(
+            values.reshape(getattr(gaussians, name)[0].shape),
+            getattr(gaussians, name)[0],
+            rtol=1e-5,
+            atol=1e-6,
+            err_msg=name,
+        )
+
+
+def test_files_of_others_are_read(tmp_path, caplog):
+    gaussians = random_gaussians(5)
+    save_ply(gaussians, tmp_path / "scene.ply")
+    vertices = PlyData.read(tmp_path / "scene.ply")["vertex"].data
+    few = [name for name in PROPERTIES if not name.startswith(("f_rest", "n"))]
+    smaller = np.empty(5, dtype=[(name, ">f8") for name in reversed(few)])
+    for name in few:
+        smaller[name] = vertices[name] * (2 if name.startswith("rot") else 1)
+    PlyData([PlyElement.describe(smaller, "vertex")], text=True).write(tmp_path / "other.ply")
+    torch.testing.assert_close(load_ply(tmp_path / "other.ply").quats[0], gaussians.quats)
+    assert caplog.text == ""
+    vertices["f_rest_3"] = 1
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(tmp_path / "rest.ply")
+    torch.testing.assert_close(load_ply(tmp_path / "rest.ply").colors[0], gaussians.colors)
+    assert "rest.ply has colours that depend on the direction" in caplog.text
+
+
+def test_what_is_no_ply_of_gaussians_is_refused(tmp_path):
+    points = np.zeros(3, dtype=[(name, "<f4") for name in ("x", "y", "z")])
+    chunks = np.zeros(1, dtype=[("min_x", "<f4")])
+    elements = [PlyElement.describe(points, "vertex"), PlyElement.describe(chunks, "chunk")]
+    PlyData(elements[:1]).write(tmp_path / "points.ply")
+    PlyData(elements).write(tmp_path / "compressed.ply")
+    save_ply(random_gaussians(3), tmp_path / "whole.ply")
+    (tmp_path / "cut.ply").write_bytes((tmp_path / "whole.ply").read_bytes()[:-5])
+    (tmp_path / "noise.ply").write_bytes(b"\x89PNG\r\n\xff")
+    for name, told in {
+        "points": "is no PLY of Gaussians: it lacks f_dc_0",
+        "compressed": "is a compressed PLY: it lacks",
+        "cut": "is no whole PLY file",
+        "noise": "is no whole PLY file",
+    }.items():
+        with pytest.raises(ValueError, match=f"{name}.ply {told}"):
+            load_ply(tmp_path / f"{name}.ply")
+    with pytest.raises(FileNotFoundError):
+        load_ply(tmp_path / "none.ply")

@@ -1,0 +1,201 @@
+"""A user's photos, or views made in Python, as one scene; and its reconstruction in one call."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike, fspath
+
+import torch
+from torch import Tensor
+
+from qgs.analysis.reconstruction import Reconstruction, choose_sample, remarks_on
+from qgs.analysis.reconstruction import reconstruct as reconstruct_sample
+from qgs.composer import Recipe, resolve
+from qgs.composer.registry import load_sound_plugins
+from qgs.contracts import Component, Scene, SceneSource, Split
+from qgs.data.domain import Domain, odd_images
+from qgs.data.recognition import open_for
+from qgs.data.sampling import training_frames, views_in
+from qgs.data.scenes import warn_once
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Views
+from qgs.wording import listed
+
+Frames = Sequence[int | str]
+Size = tuple[int, int]
+
+
+def read_photos(
+    folder: str | PathLike[str],
+    *,
+    size: Size | None = None,
+    frames: Frames | None = None,
+    scene: str | None = None,
+) -> Views:
+    """Photos and cameras of a folder, or its URL, as Views (1, V) in the photos' own world.
+
+    size: (H, W) that they are cropped and resized to; of the first photo by default. frames:
+    numbers or file names; all by default. scene: name, where the folder holds several. Formats are
+    those of `qgs reconstruct`. Raises FileNotFoundError, ValueError, and TooLargeError for more
+    photos than fit into memory.
+    """
+    sources, path = _sources(), fspath(folder)
+    found = named_scene(open_for(path, size, None, sources)[0], path, scene)
+    if size is None and (stored := found.stored_size(0)):
+        found = named_scene(open_for(path, stored, None, sources)[0], path, scene)
+    wanted = frame_list(range(len(found)) if frames is None else frames, "frames", found)
+    here = torch.eye(4, dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    return views_in(here, found, tuple(wanted))
+
+
+def reconstruct(
+    model: QueryGaussianModel,
+    photos: str | PathLike[str] | Views,
+    *,
+    inputs: int | None = None,
+    frames: Frames | None = None,
+    compare: Frames | None = None,
+    size: Size | None = None,
+    scene: str | None = None,
+    overrides: Sequence[str] = (),
+) -> Reconstruction:
+    """Reconstruct one scene as `qgs reconstruct` does, in the frame and scale of the recipe.
+
+    photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, of which all
+        are inputs unless `frames` says otherwise. OpenCV cameras, images in [0, 1].
+    inputs: how many; the recipe's number by default. frames: which photos, by number or file name;
+        spread by default. compare: photos to compare with; of a folder, some between the inputs.
+    size: (H, W) of the photos of a folder; the recipe's by default. scene: name, where a folder
+        holds several. overrides: of the recipe's `views`, such as "views.scale=auto".
+
+    Raises ValueError for a model without a recipe, several scenes, and images out of range, and as
+    the data do.
+    """
+    if model.recipe is None:
+        raise ValueError(
+            "this model was built by hand and has no recipe, so the frame and scale of its world "
+            "are not known; build it with qgs.compose, or bring cameras into its world yourself"
+        )
+    if foreign := [text for text in overrides if not text.startswith("views.")]:
+        raise ValueError(f"`overrides` change `views` alone here, got {listed(foreign)}")
+    recipe = resolve(model.recipe, overrides)
+    if isinstance(photos, Views):
+        if size is not None or scene is not None:
+            raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
+        found, seen = GivenScene(photos), ()
+        frames = range(len(found)) if frames is None and inputs is None else frames
+    else:
+        found, seen = chosen_scene(recipe, fspath(photos), size, scene, _sources())
+    wanted = None if frames is None else frame_list(frames, "frames", found)
+    against = None if compare is None else frame_list(compare, "compare", found)
+    sample, world = choose_sample(found, recipe.views, inputs, wanted, against)
+    device = next(model.parameters()).device
+    sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
+    training = model.training
+    try:
+        result = reconstruct_sample(model.eval(), sample, world, seen)
+    finally:
+        model.train(training)
+    remarks = remarks_on(result, found, model.head, recipe.views, model.trained_on or Domain())
+    return replace(result, remarks=remarks)
+
+
+class GivenScene(Scene):
+    """Views (1, V) as a scene. Raises ValueError for several scenes and images out of range."""
+
+    name = "views"
+
+    def __init__(self, views: Views) -> None:
+        if views.images.shape[0] != 1:
+            raise ValueError(
+                f"one scene is reconstructed at a time, got {views.images.shape[0]}; of several "
+                "take one, such as map_tensors(lambda x: x[:1], views)"
+            )
+        if fault := odd_images(views.images):
+            raise ValueError(fault)
+        self.views = views.to("cpu")
+
+    @property
+    def cameras(self) -> Cameras:
+        """See `Scene`."""
+        cameras = self.views.cameras[0]
+        return Cameras(cameras.c2w.double(), cameras.intrinsics, cameras.size)
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`."""
+        return self.views.images[0, list(frames)].float()
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`."""
+        return None if self.views.masks is None else self.views.masks[0, list(frames)].float()
+
+
+def _sources() -> dict[str, type[Component]]:
+    """All installed sources of data, by PLUGIN/NAME; a warning names plugins left out."""
+    registry, broken = load_sound_plugins()
+    for problem in broken:
+        warn_once(f"left out: {problem}")
+    return registry.components("data")
+
+
+def chosen_scene(
+    recipe: Recipe,
+    path: str,
+    size: Size | None,
+    name: str | None,
+    sources: Mapping[str, type[Component]],
+) -> tuple[Scene, Sequence[int]]:
+    """The scene called `name` at `path`, or the only one, and the frames a model was trained on.
+
+    size: (H, W) of its images, the recipe's by default. sources: that may open `path`, by
+    PLUGIN/NAME. Raises as `named_scene`, and ValueError for a recipe without data, which has no
+    image size, when none is given.
+    """
+    if recipe.data_config is None and size is None:
+        raise ValueError(
+            "the checkpoint's recipe has no data, so its image size is not known; give it, "
+            "such as --size 256x256 (in Python size=(256, 256))"
+        )
+    source, is_training_data = open_for(path, size, recipe.data_config, sources)
+    scene = named_scene(source, path, name)
+    seen = is_training_data and scene.name in source.names("train")
+    return scene, training_frames(scene) if seen else ()
+
+
+def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
+    """The scene called `name` of `source`, opened at `path`, or the only one.
+
+    Raises ValueError when there are several and none is named, and when none has the name.
+    """
+    splits: tuple[Split, ...] = ("train", "test")
+    places: dict[str, tuple[Split, int]] = {
+        known: (split, place) for split in splits for place, known in enumerate(source.names(split))
+    }
+    if name is None and len(places) == 1:
+        (name,) = places
+    if name not in places:
+        found = f"no scene {name!r}, but" if name is not None else f"{len(places)} scenes:"
+        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them with --scene")
+    split, place = places[name]
+    return source.scenes(split)[place]
+
+
+def frame_list(frames: str | Frames, option: str, scene: Scene) -> list[int]:
+    """Frame numbers of "0,8,x.jpg" or [0, 8, "x.jpg"].
+
+    Folders of a photo may be left out. Raises ValueError for what is neither a number nor the name
+    of one photo of `scene`.
+    """
+    names = [scene.frame_name(frame) for frame in range(len(scene))]
+    numbers: list[int] = []
+    for part in frames.split(",") if isinstance(frames, str) else map(str, frames):
+        part = part.strip()
+        found = [f for f, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
+        found = [int(part)] if part.removeprefix("-").isdecimal() else found
+        if len(found) != 1:
+            fits = f"fits {listed(map(scene.label, found))}" if found else "is no photo"
+            raise ValueError(
+                f"{option}: {part!r} {fits}. Give numbers or file names of photos with commas "
+                f"between, such as 0,8,16, of {scene.label(0)} to {scene.label(len(names) - 1)}"
+            )
+        numbers += found
+    return numbers

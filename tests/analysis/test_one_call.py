@@ -1,0 +1,217 @@
+"""`model.reconstruct` and `qgs.read_photos`; warnings of a model given views in another world."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from commands import run_qgs
+from photo_formats import row_of_frames
+from PIL import Image
+
+import qgs
+from qgs.geometry.poses import look_at
+from qgs.geometry.transforms import matrix_to_quat, quat_to_matrix
+from qgs.io.ply import load_ply
+from qgs.renderers import AutoRenderer
+from qgs.types import Cameras, Views
+
+RECIPE = {
+    "recipe": 1,
+    "model": {
+        "width": 32,
+        "heads": 2,
+        "queries": {"count": 8},
+        "decoder": {"depth": 1},
+        "head": {"gaussians_per_query": 4},
+        "supervision": {"layers": [1]},
+    },
+    "data": {"type": "qgs/photos", "path": "nowhere", "image_size": [16, 24]},
+    "views": {"inputs": 2, "gap": [2, 4], "scale": "distance", "scale_factor": 0.5},
+}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return qgs.compose(RECIPE).eval()
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for index in range(7):
+        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
+    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
+    (folder / "transforms.json").write_text(json.dumps(row_of_frames(7, step=5.0, **camera)))
+    return folder
+
+
+def somewhere(count: int = 3) -> Views:
+    """Photos by cameras far from the origin, in units of which 100 lie between neighbours."""
+    generator = torch.Generator().manual_seed(1)
+    eyes = torch.tensor([[700.0, -300.0, 50.0]]) + 100 * torch.rand(count, 3, generator=generator)
+    c2w = look_at(eyes, torch.tensor([-1.0, 0.3, 0.1]).expand(count, 3), torch.tensor([0.0, 0, -1]))
+    lens = torch.tensor([20.0, 20.0, 12.0, 8.0]).expand(1, count, 4)
+    images = torch.rand(1, count, 3, 16, 24, generator=generator)
+    return Views(images, Cameras(c2w[None], lens, (16, 24)))
+
+
+def test_a_folder_is_reconstructed_as_by_the_command(model, photos, tmp_path):
+    qgs.save(model, tmp_path / "model.safetensors")
+    options = ("--frames", "1,5", "--set", "views.scale=auto")
+    done = run_qgs(
+        "reconstruct", tmp_path / "model.safetensors", photos, "--out", tmp_path / "a", *options
+    )
+    assert done.exception is None
+    result = model.reconstruct(photos, frames=[1, "5.png"], overrides=["views.scale=auto"])
+    result.save(tmp_path / "b")
+    assert (tmp_path / "b/gaussians.ply").read_bytes() == (
+        tmp_path / "a/gaussians.ply"
+    ).read_bytes()
+    assert (tmp_path / "b/cameras.json").read_text() == (tmp_path / "a/cameras.json").read_text()
+    assert {f.name for f in (tmp_path / "a").iterdir()} == {
+        f.name for f in (tmp_path / "b").iterdir()
+    }
+    assert "input 1 (images/1.png)" in repr(result)
+    assert len(repr(result)) < 1500
+    assert result._repr_png_().startswith(b"\x89PNG")
+
+
+def test_views_in_any_world_give_the_same_scene(model, caplog):
+    views = somewhere()
+    result = model.reconstruct(views)
+    inputs = result.sample.inputs
+    torch.testing.assert_close(inputs.cameras.c2w[0, 0], torch.eye(4), atol=1e-5, rtol=0)
+    spread = inputs.cameras.c2w[0, :, :3, 3].norm(dim=-1).max()
+    assert float(spread) == pytest.approx(0.5, rel=1e-4)
+    assert caplog.text == ""
+    assert result.prediction is not None
+    torch.testing.assert_close(result.prediction.gaussians.means, model(inputs).gaussians.means)
+    turn = look_at(torch.tensor([3.0, 1, 2]), torch.tensor([1.0, 2, 3]), torch.tensor([0.0, 1, 0]))
+    c2w = turn @ views.cameras.c2w
+    c2w[..., :3, 3] *= 0.01
+    moved = Views(views.images, Cameras(c2w, views.cameras.intrinsics, views.cameras.size))
+    again = model.reconstruct(moved)
+    torch.testing.assert_close(again.gaussians.means, result.gaussians.means, atol=1e-3, rtol=1e-3)
+
+
+def test_gaussians_lie_in_the_world_of_the_photos(model, tmp_path):
+    views = somewhere()
+    result = model.reconstruct(views)
+    placed = result.in_photos_world
+    qgs.save_ply(placed, tmp_path / "placed.ply")
+    renderer = AutoRenderer(AutoRenderer.Config())
+    seen = renderer(qgs.load_ply(tmp_path / "placed.ply"), views.cameras)
+    own = model.render(result.gaussians, result.sample.inputs.cameras)
+    asked = result.render(views.cameras)
+    factor = float(result.world[1])
+    for rendering in (seen, asked):
+        torch.testing.assert_close(rendering.rgb, own.rgb, atol=5e-3, rtol=0)
+        torch.testing.assert_close(rendering.depth * factor, own.depth, atol=5e-3, rtol=1e-2)
+    assert float((own.rgb - 1).abs().max()) > 0.05, "there is something to see"
+
+
+def test_rotations_become_quaternions():
+    quats = torch.nn.functional.normalize(
+        torch.randn(50, 4, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
+    quats = torch.cat([quats, torch.eye(4), torch.tensor([[1e-4, 1, 0, 0], [0, 0.6, 0.8, 0]])])
+    for rotation in quat_to_matrix(torch.nn.functional.normalize(quats, dim=-1)):
+        torch.testing.assert_close(
+            quat_to_matrix(matrix_to_quat(rotation)), rotation, atol=1e-5, rtol=0
+        )
+
+
+def test_the_model_stays_as_it_was(model):
+    model = qgs.compose(RECIPE).train()
+    model.reconstruct(somewhere())
+    assert model.training
+
+
+def test_what_cannot_be_reconstructed_is_refused(model, photos):
+    views = somewhere()
+    with pytest.raises(ValueError, match=r"values from .* divide 8-bit values by 255"):
+        model.reconstruct(Views(views.images * 255, views.cameras))
+    two = Views(
+        views.images.repeat(2, 1, 1, 1, 1),
+        Cameras(
+            views.cameras.c2w.repeat(2, 1, 1, 1), views.cameras.intrinsics.repeat(2, 1, 1), (16, 24)
+        ),
+    )
+    with pytest.raises(ValueError, match="one scene is reconstructed at a time, got 2"):
+        model.reconstruct(two)
+    with pytest.raises(ValueError, match="are for folders"):
+        model.reconstruct(views, size=(16, 24))
+    with pytest.raises(ValueError, match="`overrides` change `views` alone here, got seed=1"):
+        model.reconstruct(views, overrides=["seed=1"])
+    with pytest.raises(ValueError, match=r"frames: '9\.png' is no photo"):
+        model.reconstruct(photos, frames=["9.png"])
+    by_hand = qgs.compose(RECIPE)
+    by_hand.recipe = None
+    with pytest.raises(ValueError, match="has no recipe"):
+        by_hand.reconstruct(views)
+
+
+def test_photos_are_read_in_their_own_world_and_size(photos):
+    views = qgs.read_photos(photos)
+    assert views.images.shape == (1, 7, 3, 20, 24)
+    stored = np.asarray(Image.open(photos / "images/3.png"))
+    np.testing.assert_allclose(views.images[0, 3].permute(1, 2, 0) * 255, stored, atol=0.01)
+    assert views.cameras.intrinsics[0, 0].tolist() == [20, 20, 12, 10]
+    centres = views.cameras.c2w[0, :, :3, 3]
+    torch.testing.assert_close((centres[1:] - centres[:-1]).norm(dim=-1), torch.full((6,), 5.0))
+    few = qgs.read_photos(photos, size=(10, 12), frames=["2.png", 0])
+    assert few.images.shape == (1, 2, 3, 10, 12)
+    torch.testing.assert_close(few.cameras.c2w[0], views.cameras.c2w[0, [2, 0]])
+    with pytest.raises(FileNotFoundError):
+        qgs.read_photos(photos / "nothing")
+
+
+def test_a_model_warns_once_of_views_that_no_training_had(caplog):
+    views, model = somewhere(), qgs.compose(RECIPE)
+    model(views)
+    assert caplog.text == "", "in training nothing is looked at"
+    model.eval()
+    model(views)
+    model(views)
+    assert caplog.text.count("is not at the origin of the model's world") == 1
+    assert "model.reconstruct(views)" in caplog.text
+    caplog.clear()
+    fresh = qgs.compose(RECIPE).eval()
+    own = fresh.reconstruct(views).sample.inputs
+    fresh(own)
+    assert caplog.text == ""
+    opengl = own.cameras.c2w * torch.tensor([1.0, -1, -1, 1])
+    fresh(Views(own.images, Cameras(opengl, own.cameras.intrinsics, own.cameras.size)))
+    assert "negate columns 1, 2" in caplog.text
+    caplog.clear()
+    fresh = qgs.compose(RECIPE).eval()
+    fresh(Views(own.images * 255, own.cameras))
+    assert "images have values from" in caplog.text
+
+
+def test_a_trained_model_warns_of_cameras_much_farther_apart(caplog, tmp_path):
+    ranges = {"samples": 4, "ranges": {"baseline": [0.1, 0.5]}}
+    qgs.save(
+        qgs.compose(RECIPE), tmp_path / "m.safetensors", extra={"trained_on": json.dumps(ranges)}
+    )
+    model = qgs.load(tmp_path / "m.safetensors")
+    own = model.reconstruct(somewhere()).sample.inputs
+    assert caplog.text == ""
+    far = own.cameras.c2w.clone()
+    far[..., :3, 3] *= 200
+    model(Views(own.images, Cameras(far, own.cameras.intrinsics, own.cameras.size)))
+    assert "input cameras stand 1" in caplog.text
+    assert "apart, in training at most 0.5" in caplog.text
+
+
+def test_a_run_folder_is_loaded(tmp_path):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*run/checkpoint\.safetensors"):
+        qgs.load(tmp_path / "run")
+    qgs.save(qgs.compose(RECIPE), tmp_path / "run/checkpoint.safetensors")
+    assert qgs.load(tmp_path / "run").recipe == qgs.compose(RECIPE).recipe
+    assert load_ply is qgs.load_ply
