@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+import time
 from pathlib import Path
 from unittest.mock import Mock, call
 
@@ -52,6 +53,7 @@ def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_pa
         for step in range(first, 5):
             tracking.log({"loss": value}, step)
         tracking.close()
+        time.sleep(1.1)  # files of one second are read in the order of a number in their names
     events = tensorboard_events(tmp_path).Scalars("loss")
     assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
 
