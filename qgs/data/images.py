@@ -17,6 +17,7 @@ from qgs.contracts import Scene
 from qgs.data.paths import LARGEST, StoreError, open_file
 from qgs.data.scenes import warn_once
 from qgs.memory import is_out_of_memory
+from qgs.wording import name_shown
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
 TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
@@ -90,7 +91,8 @@ def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
             raise
         reason = str(error) or type(error).__name__
         raise ValueError(
-            f"{path} cannot be read as {kind} ({reason}): replace the file, or remove its frame"
+            f"{name_shown(str(path))} cannot be read as {kind} ({reason}): replace the file, or "
+            "remove its frame"
         ) from error
 
 
