@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.contracts import Head, Scene, ViewsConfig
+from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
 from qgs.data.sampling import Sample, make_sample, own_world, training_frames, views_in
@@ -264,15 +264,15 @@ def reconstruct(
 
 
 def remarks_on(
-    result: Reconstruction, scene: Scene, head: Head, views: ViewsConfig, trained_on: Domain
+    result: Reconstruction, scene: Scene, model: QueryGaussianModel, views: ViewsConfig
 ) -> list[str]:
-    """What is to be said of a prediction for photos of `scene`. trained_on: see `verdict`."""
+    """What is to be said of what `model` predicts for photos of `scene`."""
     sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
     said = (
-        verdict(trained_on, found),
+        verdict(model.trained_on or Domain(), found),
         framing(scene, sample.input_frames[0]),
-        too_many_capped(head, capped_share(head, result.gaussians), views),
+        too_many_capped(model.head, capped_share(model.head, result.gaussians), views),
         result.worse_than_nearest,
     )
     return [*filter(None, said)]

@@ -12,7 +12,7 @@ from qgs.analysis.reconstruction import reconstruct as reconstruct_sample
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
-from qgs.data.domain import Domain, odd_images
+from qgs.data.domain import odd_images
 from qgs.data.recognition import open_for
 from qgs.data.sampling import training_frames, views_in
 from qgs.data.scenes import warn_once
@@ -95,8 +95,7 @@ def reconstruct(
         result = reconstruct_sample(model.eval(), sample, world, seen)
     finally:
         model.train(training)
-    remarks = remarks_on(result, found, model.head, recipe.views, model.trained_on or Domain())
-    return replace(result, remarks=remarks)
+    return replace(result, remarks=remarks_on(result, found, model, recipe.views))
 
 
 class GivenScene(Scene):

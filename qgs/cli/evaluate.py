@@ -77,7 +77,7 @@ def evaluate(
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
     from qgs.engine.folder import RunFolder, checkpoint_of
-    from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
+    from qgs.io.checkpoint import load, load_recipe, load_step
 
     use_threads(threads)
     for setting in settings:
@@ -87,14 +87,14 @@ def evaluate(
                 + ", ".join(SECTIONS)
             )
     checkpoint = checkpoint_of(runs[0])
-    recipe, trained_on = load_recipe(checkpoint), load_domain(checkpoint)
+    recipe = load_recipe(checkpoint)
     if settings:
         recipe = resolve(recipe.tree, settings)
     model = load(checkpoint, choose_device(device))
     own = Path(runs[0]).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     step = load_step(checkpoint)
-    evaluation = evaluate_into(model, recipe, step, folder, console, batch, trained_on)
+    evaluation = evaluate_into(model, recipe, step, folder, console, batch, model.trained_on)
     run = RunFolder(checkpoint.parent)
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
         hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"

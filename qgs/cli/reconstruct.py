@@ -103,12 +103,12 @@ def reconstruct(
     from qgs.engine.distributed import choose_device
     from qgs.engine.folder import checkpoint_of
     from qgs.engine.growth import refuse_too_many
-    from qgs.io.checkpoint import load, load_domain, load_recipe
+    from qgs.io.checkpoint import load, load_recipe
 
     refuse_too_many(gaussians or 0)
     console = Console()
     file, device = checkpoint_of(checkpoint), choose_device(device)
-    model, recipe, trained = load(file, device), load_recipe(file), load_domain(file)
+    model, recipe = load(file, device), load_recipe(file)
     if overrides:
         recipe = resolve(recipe.tree, overrides)
     registry, broken = load_sound_plugins()
@@ -122,8 +122,7 @@ def reconstruct(
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     tuned, record = tuned_tokens(model, recipe, sample, tune, console) if tune else (None, None)
     result = run(model, sample, world, seen, tuned, record)
-    remarks = remarks_on(result, scene, model.head, recipe.views, trained)
-    result = replace(result, remarks=remarks)
+    result = replace(result, remarks=remarks_on(result, scene, model, recipe.views))
     show(result, "feed-forward" if refine else "", console)
     paths = write_reconstruction(model, result, out)
     if refine:

@@ -309,10 +309,8 @@ class OptimizerState:
         memo = {id(p): alike[name] for name, p in self._parameters.items()}
         for parameter in alike.values():
             parameter.grad = torch.empty_like(parameter)
-        optimizer, alone = (
-            deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo),
-            True,
-        )
+        optimizer = deepcopy(getattr(self._optimizer, "optimizer", self._optimizer), memo)
+        alone = True
         for group in list(optimizer.param_groups):
             optimizer.param_groups = [group]
             group.update({key: False for key in ("fused", "foreach") if key in group})
