@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -69,16 +69,13 @@ def view(
         console.print(f"wrote {html}", soft_wrap=True)
         return
 
-    import viser
-
     from qgs_viewer.panel import Panel
+    from qgs_viewer.server import quiet_server
 
-    server = viser.ViserServer(host=host, port=port, label=opened.title, verbose=False)
-    Panel(server, opened)
-    address = f"http://{'localhost' if host == '127.0.0.1' else host}:{server.get_port()}"
-    console.print(f"{opened.title}: {address} (Ctrl-C ends it)", soft_wrap=True, highlight=False)
-    try:
-        while True:
-            time.sleep(3600)
-    except KeyboardInterrupt:
-        server.stop()
+    with quiet_server(host, port, opened.title) as server:
+        Panel(server, opened)
+        name = "localhost" if host in {"127.0.0.1", "0.0.0.0"} else host
+        where = f"http://{name}:{server.get_port()}"
+        console.print(f"{opened.title}: {where} (Ctrl-C ends it)", soft_wrap=True, highlight=False)
+        with suppress(KeyboardInterrupt):
+            server.sleep_forever()

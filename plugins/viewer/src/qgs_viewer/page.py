@@ -1,10 +1,9 @@
 """The scene as one HTML page that needs no network: for reports, mails, talks."""
 
-import viser
-
 from qgs_viewer.choice import Choice
 from qgs_viewer.look import Look
-from qgs_viewer.stage import Stage, first_eye
+from qgs_viewer.server import quiet_server, stand
+from qgs_viewer.stage import Stage
 
 
 def scene_html(look: Look, choice: Choice | None = None, *, dark: bool = False) -> str:
@@ -13,12 +12,7 @@ def scene_html(look: Look, choice: Choice | None = None, *, dark: bool = False) 
     choice: what is shown of it; by default the scene with the anchors of the last layer. Some
     0.7 MB for viser's own code, and about 25 bytes more a Gaussian.
     """
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        eye, target = first_eye(look)
-        server.initial_camera.position, server.initial_camera.look_at = eye, target
-        server.initial_camera.up = (0.0, -1.0, 0.0)
+    with quiet_server() as server:
+        stand(server, look)
         Stage(server.scene).put(look, choice or Choice(layer=look.depth))
         return server.get_scene_serializer().as_html(dark)
-    finally:
-        server.stop()

@@ -15,8 +15,9 @@ from qgs_viewer.choice import Choice, Others
 from qgs_viewer.look import Look
 from qgs_viewer.pictures import PARTS, attention_parts
 from qgs_viewer.placement import hit, near_ray
+from qgs_viewer.server import stand
 from qgs_viewer.sources import ModelSource, Source
-from qgs_viewer.stage import Stage, first_eye
+from qgs_viewer.stage import Stage
 
 MOST_BOXES = 24
 """Up to so many photos each have a check box; more are named in a line of text."""
@@ -39,9 +40,7 @@ class Panel:
         self.choice = Choice(layer=self.look.depth)
         self._lock, self._quiet = RLock(), False
         server.gui.configure_theme(show_logo=False, show_share_button=False)
-        eye, target = first_eye(self.look)
-        server.initial_camera.position, server.initial_camera.look_at = eye, target
-        server.initial_camera.up = np.array([0.0, -1.0, 0.0])
+        stand(server, self.look)
         self._head()
         if self.look.queries:
             self._query()
@@ -77,7 +76,7 @@ class Panel:
             hint = f"0 to {last}, or {NONE} for none"
             self.number = gui.add_number("query", NONE, min=NONE, max=last, step=1, hint=hint)
             self._on(self.number, self._picked)
-            self.others = gui.add_dropdown("other queries", get_args(Others), "faint")
+            self.others = gui.add_dropdown("other queries", get_args(Others), initial_value="faint")
             self._on(self.others, lambda: {"others": self.others.value})
             hint = "Supports are those after this layer; 0 is the learned start."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)

@@ -64,7 +64,7 @@ class Stage:
     @property
     def anchor_radius(self) -> float:
         """Half the size of an anchor's dot, shown world."""
-        return 0.008 * self.unit
+        return 0.005 * self.unit
 
     def _draw_photos(self, look: Look, every: Cameras | None) -> None:
         self.scene.remove_by_name(_VIEWS)
@@ -162,18 +162,3 @@ def distance_to(look: Look) -> float:
     else:
         eye = look.placement.points(look.views.cameras.c2w[0, :1, :3, 3])[0]
     return max(float((means - eye).norm(dim=-1).median()), 1e-6)
-
-
-def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
-    """Where the viewer stands at first and what it looks at, both (3,), shown world."""
-    middle = look.placement.points(look.gaussians.means[0]).median(0).values
-    unit = distance_to(look)
-    if look.views is None:
-        return (middle - torch.tensor([0.0, 0.0, 2.5 * unit])).numpy(), middle.numpy()
-    c2w = look.views.cameras.c2w[0]
-    eye = look.placement.points(c2w[:, :3, 3]).mean(0)
-    forward = (look.placement.rotation @ c2w[:, :3, 2].mean(0).cpu().double())
-    aside = look.placement.rotation @ c2w[0, :3, 0].cpu().double()
-    up = -(look.placement.rotation @ c2w[0, :3, 1].cpu().double())
-    place = eye - 0.45 * unit * forward + 0.3 * unit * aside + 0.25 * unit * up
-    return place.numpy(), (eye + unit * forward).numpy()
