@@ -45,9 +45,21 @@ def query_colors(count: int) -> np.ndarray:
     return np.array([query_color(query) for query in range(count)], np.uint8).reshape(-1, 3)
 
 
+def anchor_colors(count: int, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` anchors are shown, by number, and their colours uint8."""
+    colors, numbers = query_colors(count), np.arange(count)
+    if choice.query is None or choice.others == "shown":
+        return numbers, colors
+    if choice.others == "hidden":
+        return numbers[[choice.query]], colors[[choice.query]]
+    paled = (0.3 * colors + 0.7 * 235).astype(np.uint8)
+    paled[choice.query] = colors[choice.query]
+    return numbers, paled
+
+
 def painted(look: Look, choice: Choice) -> Splats:
     """The Gaussians of `look`, coloured and faded as was chosen."""
-    found, queries = look.splats(), look.queries
+    found, queries = look.splats, look.queries
     if not queries:
         return found
     colors, opacities = found.colors, found.opacities

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -48,6 +49,7 @@ class Look:
         """How many decoder layers there are; 0 without a model."""
         return self.inside.model.depth if self.inside else 0
 
+    @cached_property
     def splats(self) -> Splats:
         """All Gaussians in the shown world."""
         return splats(self.gaussians, self.placement)

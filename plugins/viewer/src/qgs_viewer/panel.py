@@ -24,9 +24,9 @@ MOST_BOXES = 24
 NONE = -1
 """The number in the field `query` while none is picked."""
 _CAPTIONS = {
-    "content": "content: logits of what the patches show",
-    "geometry": "geometry: added to them, by the anchor and the rays",
-    "result": "result: the attention, softmax of the sum",
+    "content": "content: logits of what patches show",
+    "geometry": "geometry: what rays and anchor add",
+    "result": "result: softmax of the sum",
 }
 
 
@@ -39,35 +39,35 @@ class Panel:
         self.look: Look = source.look(source.frames)
         self.choice = Choice(layer=self.look.depth)
         self._lock, self._quiet = RLock(), False
-        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.configure_theme(
+            control_layout="fixed", show_logo=False, show_share_button=False
+        )
         stand(server, self.look)
         self._head()
         if self.look.queries:
             self._query()
         if source.labels:
             self._inputs()
+        if source.notes:
+            with server.gui.add_folder("remarks", expand_by_default=False):
+                server.gui.add_markdown("\n\n".join(source.notes))
         self.stage.put(self.look, self.choice, source.cameras())
         if self.look.queries:
             server.scene.on_click()(self._clicked)
 
     def _head(self) -> None:
-        gui = self.server.gui
-        self._told = gui.add_markdown("")
-        self._tell()
-        if self.look.queries:
-            self.colors = gui.add_dropdown("colours", ("of the scene", "by query"))
-            self._on(self.colors, lambda: {"by_query": self.colors.value == "by query"})
+        gui, queries = self.server.gui, self.look.queries
+        told = f"**{self.source.title}**\n\n{self.look.gaussians.count:,} Gaussians"
+        if queries:
+            told += f" of {queries:,} queries. Click on one, or on an anchor."
+        gui.add_markdown(told)
+        if queries:
+            names = ("of the scene", "by query")
+            self.colors = gui.add_dropdown("colours", names, initial_value=names[0])
+            self._on(self.colors, lambda: {"by_query": self.colors.value == names[1]})
         if self.look.views is not None:
-            self.photos = gui.add_checkbox("photos and cameras", True)
+            self.photos = gui.add_checkbox("cameras", True)
             self._on(self.photos, lambda: {"photos": self.photos.value})
-
-    def _tell(self) -> None:
-        count = f"{self.look.gaussians.count:,} Gaussians"
-        queries = f" of {self.look.queries:,} queries" if self.look.queries else ""
-        lines = [f"**{self.source.title}**", count + queries, *self.source.notes]
-        if self.look.queries:
-            lines.append("Click on a Gaussian or an anchor to see its query.")
-        self._told.content = "\n\n".join(lines)
 
     def _query(self) -> None:
         gui, depth = self.server.gui, self.look.depth
@@ -190,8 +190,7 @@ class Panel:
             anchor = near_ray(found.centers[0].numpy(), origin, direction, radius)
             if anchor is not None:
                 return anchor
-        assert self.stage.splats is not None
-        gaussian = hit(self.stage.splats, origin, direction)
+        gaussian = hit(self.look.splats, origin, direction)
         return None if gaussian is None else self.look.query_of(gaussian)
 
 

@@ -13,6 +13,8 @@ from qgs.types import Cameras, Gaussians
 LEAST_WEIGHT = 0.02
 """Blending weight on a clicked ray below which a Gaussian counts as not hit."""
 
+_FLOAT16 = 2.0**15
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -53,6 +55,13 @@ class Splats:
     covariances: np.ndarray
     opacities: np.ndarray
     colors: np.ndarray
+
+
+    @property
+    def magnification(self) -> float:
+        """By what lengths are multiplied so that float16, which viewers get covariances in, holds
+        the largest covariance and, with it, standard deviations 10,000 times smaller."""
+        return float(np.sqrt(_FLOAT16 / max(np.abs(self.covariances).max(), 1e-30)))
 
 
 @full_precision

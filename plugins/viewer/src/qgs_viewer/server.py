@@ -11,6 +11,9 @@ import viser
 from qgs_viewer.look import Look
 from qgs_viewer.stage import distance_to
 
+FIELD_OF_VIEW = 0.95
+"""Of the viewer's window, vertical, radians."""
+
 
 @contextmanager
 def quiet_server(
@@ -30,7 +33,7 @@ def stand(server: viser.ViserServer, look: Look) -> None:
     """New viewers stand behind and above the input cameras, or before a scene without cameras."""
     eye, target = first_eye(look)
     server.initial_camera.position, server.initial_camera.look_at = eye, target
-    server.initial_camera.up = (0.0, -1.0, 0.0)
+    server.initial_camera.up, server.initial_camera.fov = (0.0, -1.0, 0.0), FIELD_OF_VIEW
 
 
 def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from viser.transforms import SO3
 from qgs.drawing.figures import INK, MUTED
 from qgs.drawing.images import enlarged, rgb_picture
 from qgs.types import Cameras
-from qgs_viewer.choice import Choice, painted, query_color, query_colors
+from qgs_viewer.choice import Choice, anchor_colors, painted, query_color
 from qgs_viewer.look import Look
 from qgs_viewer.placement import Splats, corners, on_photo
 
@@ -29,7 +29,6 @@ class Stage:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.scene = scene
-        self.splats: Splats | None = None
         self.unit = 1.0
         self._gaussians: viser.GaussianSplatHandle | None = None
         scene.set_up_direction("-y")
@@ -42,19 +41,23 @@ class Stage:
 
     def update(self, look: Look, choice: Choice) -> None:
         """Draw what a choice changes."""
-        self.splats = look.splats()
-        shown = painted(look, choice)
-        parts = (shown.centers, shown.covariances, shown.colors, shown.opacities)
-        if self._gaussians is None:
-            self._gaussians = self.scene.add_gaussian_splats("/gaussians", *parts)
-        else:
-            self._gaussians.set_gaussians(*parts)
+        self._draw_gaussians(painted(look, choice))
         if (views := self.scene.get_handle_by_name(_VIEWS)) is not None:
             views.visible = choice.photos
         self._draw_anchors(look, choice)
         self._draw_support(look, choice)
         self._draw_path(look, choice)
         self._draw_reading(look, choice)
+
+    def _draw_gaussians(self, shown: Splats) -> None:
+        factor = shown.magnification
+        parts = (shown.centers * factor, shown.covariances * factor**2)
+        parts = (*parts, shown.colors, shown.opacities)
+        if self._gaussians is None:
+            self._gaussians = self.scene.add_gaussian_splats("/gaussians", *parts, scale=1 / factor)
+        else:
+            self._gaussians.set_gaussians(*parts)
+            self._gaussians.scale = 1 / factor
 
     @property
     def photo_depth(self) -> float:
@@ -97,8 +100,9 @@ class Stage:
         if found is None or not choice.anchors:
             self.scene.remove_by_name("/anchors")
             return
+        numbers, colors = anchor_colors(look.queries, choice)
         self.scene.add_point_cloud(
-            "/anchors", found.centers[0].float().numpy(), query_colors(look.queries),
+            "/anchors", found.centers[0].float().numpy()[numbers], colors,
             point_size=2 * self.anchor_radius, point_shape="circle", precision="float32",
         )  # fmt: skip
 
@@ -107,7 +111,7 @@ class Stage:
         if found is None or choice.query is None:
             self.scene.remove_by_name("/support")
             return
-        ball = trimesh.creation.icosphere(subdivisions=3)
+        ball = trimesh.creation.icosphere(subdivisions=2)
         points = torch.from_numpy(np.array(ball.vertices)) @ found.axes[0, choice.query].mT
         points = points + found.centers[0, choice.query]
         self.scene.add_mesh_simple(
@@ -135,7 +139,7 @@ class Stage:
             return
         hub = look.hub(choice.query, choice.layer - 1).expand_as(reading.points)
         lines = torch.stack([hub, reading.points], 1)
-        strength = (reading.shares / reading.shares.max())[:, None].numpy()
+        strength = 0.25 + 0.75 * (reading.shares / reading.shares.max())[:, None].numpy()
         pale = strength * np.array(query_color(choice.query)) + (1 - strength) * 235
         colors = pale.round().astype(np.uint8)[:, None].repeat(2, 1)
         self._lines("/reading", lines, colors, 2.0)
