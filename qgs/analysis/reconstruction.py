@@ -168,7 +168,8 @@ class Reconstruction:
     """Gaussians (1, G) of a sample, and what its cameras see of them.
 
     world: reference pose (4, 4) and scale, as of `own_world`. tuning: of tokens, refinement: of
-    Gaussians; None without. remarks: sentences on the photos and what came of them.
+    Gaussians; None without. remarks: sentences on the photos and what came of them. model: the
+    checkpoint, as `qgs.load` takes it; "" where it is not known.
     """
 
     sample: Sample
@@ -179,6 +180,7 @@ class Reconstruction:
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
     remarks: Sequence[str] = ()
+    model: str = ""
 
     @property
     def worse_than_nearest(self) -> str:
@@ -309,6 +311,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
+        "model": reconstruction.model,
         "tuning": reconstruction.tuning,
         "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,

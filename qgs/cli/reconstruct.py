@@ -126,7 +126,8 @@ def reconstruct(
         console.print(f"{tune} steps of token tuning: {losses}", highlight=False)
     result = run(model, sample, world, seen, tuned, record)
     remarks = remarks_on(result, scene, model.head, trained)
-    result = replace(result, remarks=remarks)
+    named = str(file.resolve()) if Path(checkpoint).exists() else checkpoint
+    result = replace(result, remarks=remarks, model=named)
     console.print(score_table(result, "feed-forward" if refine else ""))
     console.print("\n".join(remarks), soft_wrap=True, highlight=False, markup=False)
     paths = write_reconstruction(model, result, out)

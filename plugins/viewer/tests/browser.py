@@ -57,7 +57,9 @@ class Page:
         self.call("Page.navigate", url=url)
 
     def evaluate(self, code: str) -> Any:
-        found = self.call("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
+        found = self.call(
+            "Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 

@@ -19,7 +19,9 @@ app = typer.Typer(help="See a reconstruction in the browser.")
 def view(
     source: Annotated[
         str,
-        typer.Argument(help="Run folder, checkpoint, PLUGIN/NAME, PLY, or finished reconstruction."),
+        typer.Argument(
+            help="Run folder, checkpoint, PLUGIN/NAME, PLY, or what qgs reconstruct wrote."
+        ),
     ],
     photos: Annotated[
         str | None,

@@ -84,6 +84,7 @@ class FinishedScene(Scene):
 
     @property
     def cameras(self) -> Cameras:
+        """All views, as cameras.json tells them."""
         c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
         lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
         height, width = self._views[0]["size"]
@@ -102,6 +103,7 @@ class FinishedScene(Scene):
         return torch.stack(pictures)
 
     def frame_name(self, frame: int) -> str:
+        """The photo's file, or its number in the scene."""
         view = self._views[frame]
         return str(view.get("photo") or view["frame"])
 

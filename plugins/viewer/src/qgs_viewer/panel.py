@@ -39,9 +39,7 @@ class Panel:
         self.look: Look = source.look(source.frames)
         self.choice = Choice(layer=self.look.depth)
         self._lock, self._quiet = RLock(), False
-        server.gui.configure_theme(
-            control_layout="fixed", show_logo=False, show_share_button=False
-        )
+        server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
         stand(server, self.look)
         self._head()
         if self.look.queries:

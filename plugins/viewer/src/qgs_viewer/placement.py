@@ -56,7 +56,6 @@ class Splats:
     opacities: np.ndarray
     colors: np.ndarray
 
-
     @property
     def magnification(self) -> float:
         """By what lengths are multiplied so that float16, which viewers get covariances in, holds

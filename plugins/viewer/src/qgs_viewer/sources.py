@@ -1,9 +1,9 @@
 """From what a user names to something that gives looks: a PLY, a reconstruction, a model."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -30,44 +30,36 @@ SAME = 0.02
 A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths."""
 
 
-class Source(Protocol):
+class Source(ABC):
     """What is looked at. title: its name. notes: what is to be said of it. frames: of the inputs
     at first. labels: of all frames; none where the inputs cannot be changed."""
 
-    title: str
-    notes: Sequence[str]
-    frames: Sequence[int]
-    labels: Sequence[str]
-
-    def look(self, frames: Sequence[int]) -> Look:
-        """The scene as made of these frames. Raises ValueError for frames that do not fit."""
-        ...
-
-    def cameras(self) -> Cameras | None:
-        """Cameras (F,) of all frames in the shown world; None without."""
-        ...
-
-
-@dataclass
-class FixedSource:
-    """Gaussians that no model is known of."""
-
-    fixed: Look
     title: str
     notes: Sequence[str] = ()
     frames: Sequence[int] = ()
     labels: Sequence[str] = ()
 
+    @abstractmethod
+    def look(self, frames: Sequence[int]) -> Look:
+        """The scene as made of these frames. Raises ValueError for frames that do not fit."""
+
+    def cameras(self) -> Cameras | None:
+        """Cameras (F,) of all frames in the shown world; None without."""
+        return None
+
+
+class FixedSource(Source):
+    """Gaussians that no model is known of, whose inputs cannot be changed."""
+
+    def __init__(self, fixed: Look, title: str, notes: Sequence[str]) -> None:
+        self.fixed, self.title, self.notes = fixed, title, notes
+
     def look(self, frames: Sequence[int]) -> Look:
         """The one look there is."""
         return self.fixed
 
-    def cameras(self) -> Cameras | None:
-        """None: only the inputs are shown."""
-        return None
 
-
-class ModelSource:
+class ModelSource(Source):
     """A model with a scene. The shown world is that of the first look.
 
     Frames may be any of the scene: another number than the recipe's is what the user asks for.

@@ -1,6 +1,6 @@
 """Draws a look into a scene of viser: Gaussians, photos, anchors, a query and what it reads."""
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -144,11 +144,10 @@ class Stage:
         colors = pale.round().astype(np.uint8)[:, None].repeat(2, 1)
         self._lines("/reading", lines, colors, 2.0)
 
-    def _lines(self, name: str, lines: Tensor, color: object, width: float) -> None:
+    def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
         """Segments (n, 2, 3), `width` pixels wide."""
-        add: Callable[..., object] = self.scene.add_line_segments
         points = lines.float().cpu().numpy()
-        add(name, points, color, thickness=width, thickness_units="screen")
+        self.scene.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
 
 
 def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
