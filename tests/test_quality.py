@@ -16,8 +16,6 @@ MAX_CORE_LINES, MAX_CORE_FILES = 24_000, 200
 FORMER_NAME = re.compile(
     r"\bqgs-(locus|ellipsoid|rooms|datatools|viewer)\b|pip install (qgs)\b|\bqgs\["
 )
-    r"\bqgs-(locus|ellipsoid|rooms|datatools|viewer)\b|pip install (qgs)\b|\bqgs\["
-)
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
