@@ -39,7 +39,8 @@ class Panel:
         self.look: Look = source.look(source.frames)
         self.choice = Choice(layer=self.look.depth)
         self._lock, self._quiet = RLock(), False
-        server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
         stand(server, self.look)
         self._head()
         if self.look.queries:
