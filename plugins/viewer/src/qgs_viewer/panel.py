@@ -58,7 +58,8 @@ class Panel:
         gui, queries = self.server.gui, self.look.queries
         told = f"**{self.source.title}**\n\n{self.look.gaussians.count:,} Gaussians"
         if queries:
-            told += f" of {queries:,} queries. Click on one, or on an anchor."
+            told += f" of {queries:,} queries. Click on one"
+            told += "." if self.look.support(0) is None else ", or on an anchor."
         gui.add_markdown(told)
         if queries:
             names = ("of the scene", "by query")

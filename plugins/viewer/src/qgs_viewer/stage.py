@@ -11,6 +11,7 @@ from viser.transforms import SO3
 
 from qgs.drawing.figures import INK, MUTED
 from qgs.drawing.images import enlarged, rgb_picture
+from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
 from qgs_viewer.choice import Choice, anchor_colors, painted, query_color
 from qgs_viewer.look import Look
@@ -18,8 +19,10 @@ from qgs_viewer.placement import Splats, corners, on_photo
 
 PHOTO_SIDE = 256
 """Pixels on the longer side of photos in the scene: small ones are enlarged, large ones reduced."""
-FRUSTUM = 0.14
-"""Depth of a camera's frustum, per distance from the first input camera to the Gaussians."""
+FRUSTUM = 0.12
+"""Depth of a camera's frustum, per distance from the input cameras to the scene."""
+SOLID = 0.1
+"""Opacity of the Gaussians that tell how large a scene is."""
 _VIEWS = "/views"
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0))
 
@@ -158,10 +161,19 @@ def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
 
 
 def distance_to(look: Look) -> float:
-    """From the first input camera to the Gaussians; without cameras from their own middle."""
-    means = look.placement.points(look.gaussians.means[0])
+    """How far the scene is from the input cameras: the median of what they see of it, shown world.
+
+    Without cameras, how far Gaussians are from their middle. What is nearly clear does not count.
+    """
+    gaussians = look.gaussians
+    solid = gaussians.means[0, gaussians.opacities[0] > SOLID].detach().cpu()
+    solid = solid if len(solid) else gaussians.means[0].detach().cpu()
     if look.views is None:
-        eye = means.median(0).values
+        found = (solid - solid.median(0).values).norm(dim=-1)
     else:
-        eye = look.placement.points(look.views.cameras.c2w[0, :1, :3, 3])[0]
-    return max(float((means - eye).norm(dim=-1).median()), 1e-6)
+        cameras = look.views.cameras.to("cpu")
+        points = to_camera(solid[None], cameras)[0]
+        pixels, size = to_pixels(points, cameras.intrinsics[0]), torch.tensor(cameras.size[::-1])
+        seen = (points[..., 2] > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
+        found = points[..., 2][seen] if seen.any() else points.norm(dim=-1)
+    return max(float(found.median()) * look.placement.scale, 1e-6)
