@@ -21,7 +21,7 @@ import qgs
 from qgs.cli.new_plugin import rendered
 
 ROOT = Path(__file__).parents[1]
-PLUGINS = ("locus", "ellipsoid", "rooms", "datatools")
+PLUGINS = ("locus", "ellipsoid", "rooms", "datatools", "viewer")
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "qgs": "query-gaussians",

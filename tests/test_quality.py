@@ -13,7 +13,9 @@ SOURCES = ("qgs", "plugins", "tests", "tools")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 24_000, 200
-FORMER_NAME = re.compile(r"\bqgs-(locus|ellipsoid|rooms|datatools)\b|pip install (qgs)\b|\bqgs\[")
+FORMER_NAME = re.compile(
+    r"\bqgs-(locus|ellipsoid|rooms|datatools|viewer)\b|pip install (qgs)\b|\bqgs\["
+)
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 

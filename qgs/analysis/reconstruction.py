@@ -173,7 +173,8 @@ class Reconstruction:
 
     prediction: None where the Gaussians were tuned or refined. world: reference pose (4, 4) and
     scale, as of `own_world`. tuning: of tokens, refinement: of Gaussians; None without. remarks:
-    sentences on the photos and what came of them.
+    sentences on the photos and what came of them. checkpoint: of the model, as `qgs.load` takes it;
+    "" where it is not known.
     """
 
     model: QueryGaussianModel
@@ -186,6 +187,7 @@ class Reconstruction:
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
     remarks: Sequence[str] = ()
+    checkpoint: str = ""
 
     @property
     def worse_than_nearest(self) -> str:
@@ -364,6 +366,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
+        "model": reconstruction.checkpoint,
         "tuning": reconstruction.tuning,
         "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,

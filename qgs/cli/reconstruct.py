@@ -122,7 +122,9 @@ def reconstruct(
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     tuned, record = tuned_tokens(model, recipe, sample, tune, console) if tune else (None, None)
     result = run(model, sample, world, seen, tuned, record)
-    result = replace(result, remarks=remarks_on(result, scene, model, recipe.views))
+    named = str(file.resolve()) if Path(checkpoint).exists() else checkpoint
+    remarks = remarks_on(result, scene, model, recipe.views)
+    result = replace(result, remarks=remarks, checkpoint=named)
     show(result, "feed-forward" if refine else "", console)
     paths = write_reconstruction(model, result, out)
     if refine:

@@ -1,0 +1,75 @@
+"""What a user chose to see, and how Gaussians are painted by it."""
+
+import colorsys
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from qgs.drawing.figures import Color
+from qgs_viewer.look import Look
+from qgs_viewer.placement import Splats
+
+Others = Literal["shown", "faint", "hidden"]
+FAINT = 0.12
+"""Opacity of the Gaussians of other queries, as a part of their own."""
+_GREY = 0.75
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is shown. query: the picked one. layer: of supports and attention, 0 the start.
+
+    others: what becomes of the Gaussians of other queries once one is picked. patches: how many of
+    those that it reads get a line. by_query: colours of queries instead of the scene's.
+    """
+
+    by_query: bool = False
+    query: int | None = None
+    layer: int = 0
+    others: Others = "faint"
+    patches: int = 24
+    anchors: bool = True
+    photos: bool = True
+
+
+def query_color(query: int) -> Color:
+    """A colour of its own for each query; neighbours in number differ much (golden ratio)."""
+    hue, light = (query * 0.61803398875) % 1, (0.45, 0.6, 0.52)[query % 3]
+    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.8)
+    return round(red * 255), round(green * 255), round(blue * 255)
+
+
+def query_colors(count: int) -> np.ndarray:
+    """`query_color` of the first `count` queries, uint8 (count, 3)."""
+    return np.array([query_color(query) for query in range(count)], np.uint8).reshape(-1, 3)
+
+
+def anchor_colors(count: int, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` anchors are shown, by number, and their colours uint8."""
+    colors, numbers = query_colors(count), np.arange(count)
+    if choice.query is None or choice.others == "shown":
+        return numbers, colors
+    if choice.others == "hidden":
+        return numbers[[choice.query]], colors[[choice.query]]
+    paled = (0.3 * colors + 0.7 * 235).astype(np.uint8)
+    paled[choice.query] = colors[choice.query]
+    return numbers, paled
+
+
+def painted(look: Look, choice: Choice) -> Splats:
+    """The Gaussians of `look`, coloured and faded as was chosen."""
+    found, queries = look.splats, look.queries
+    if not queries:
+        return found
+    colors, opacities = found.colors, found.opacities
+    if choice.by_query:
+        colors = query_colors(queries).repeat(len(colors) // queries, 0).astype(np.float32) / 255
+    if choice.query is not None and choice.others != "shown":
+        mine = np.zeros(len(colors), bool)
+        mine[look.members(choice.query)] = True
+        part = FAINT if choice.others == "faint" else 0.0
+        opacities = np.where(mine[:, None], np.maximum(opacities, 0.5), opacities * part)
+        greys = colors.mean(1, keepdims=True) * (1 - _GREY) + _GREY
+        colors = np.where(mine[:, None], colors, greys)
+    return replace(found, colors=colors, opacities=opacities.astype(np.float32))

@@ -1,0 +1,85 @@
+"""The Gaussians, photos and cameras of a finished reconstruction."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from qgs.contracts import Scene
+from qgs.io.ply import load_ply
+from qgs.types import Cameras, Gaussians
+
+PLY, CAMERAS = "gaussians.ply", "cameras.json"
+"""What a folder of a finished reconstruction holds."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A reconstruction that `qgs reconstruct` wrote: its Gaussians and views, in its world.
+
+    inputs: numbers of the input views in `scene`. model: what made the Gaussians, as it was named;
+    "" where they were tuned or refined, or are of a release that did not tell.
+    """
+
+    gaussians: Gaussians
+    scene: "FinishedScene"
+    inputs: Sequence[int]
+    model: str
+
+
+class FinishedScene(Scene):
+    """The views that a reconstruction was compared with, as frames in its world."""
+
+    def __init__(self, name: str, folder: Path, views: Sequence[dict[str, Any]]) -> None:
+        self.name, self._folder, self._views = name, folder, views
+
+    @property
+    def cameras(self) -> Cameras:
+        """All views, as cameras.json tells them."""
+        c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
+        lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
+        height, width = self._views[0]["size"]
+        return Cameras(c2w, lenses, (height, width))
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """Photos, the left part of the pictures in views/."""
+        height, width = self.cameras.size
+        pictures = []
+        for frame in frames:
+            view = self._views[frame]
+            name = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
+            with Image.open(self._folder / "views" / name) as image:
+                pixels = np.asarray(image.convert("RGB"))[:height, :width]
+            pictures.append(torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255)
+        return torch.stack(pictures)
+
+    def frame_name(self, frame: int) -> str:
+        """The photo's file, or its number in the scene."""
+        view = self._views[frame]
+        return str(view.get("photo") or view["frame"])
+
+
+def read_finished(folder: Path) -> Finished:
+    """What `qgs reconstruct --out FOLDER` wrote. Raises ValueError with the file that is broken."""
+    record = folder / CAMERAS
+    gaussians = load_ply(folder / PLY)
+    try:
+        told = json.loads(record.read_text(encoding="utf-8"))
+        views = told["views"]
+        scene = FinishedScene(str(told["scene"]), folder, views)
+        inputs = [place for place, view in enumerate(views) if view["kind"] == "input"]
+        scene.images(range(len(views)))  # so that a file that is missing is told now
+        changed = told.get("tuning") or told.get("refinement")
+        model = "" if changed else str(told.get("model") or "")
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(
+            f"{record} is no record of a reconstruction ({type(error).__name__}: {error}); make it "
+            "again with `qgs reconstruct`, or view the PLY alone"
+        ) from error
+    return Finished(gaussians, scene, inputs, model)

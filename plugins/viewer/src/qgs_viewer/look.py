@@ -1,0 +1,136 @@
+"""A reconstruction as it can be looked at: its queries, their supports, and what they read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from qgs.analysis.trace import Trace, trace
+from qgs.contracts import AttentionWeights
+from qgs.model import QueryGaussianModel
+from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
+from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
+
+
+@dataclass(frozen=True)
+class Inside:
+    """What a model had in hand: the image memory, and the state after each layer, 0 the start."""
+
+    model: QueryGaussianModel
+    memory: ImageMemory
+    states: Sequence[QueryState]
+
+
+@dataclass(frozen=True)
+class Look:
+    """Gaussians (1, G), the views (1, V) they were made of with labels, and their place.
+
+    inside: None where no model is known, so that there are no queries. frames: numbers of the views
+    in their scene.
+    """
+
+    gaussians: Gaussians
+    views: Views | None = None
+    labels: Sequence[str] = ()
+    frames: Sequence[int] = ()
+    placement: Placement = field(default_factory=Placement.identity)
+    inside: Inside | None = None
+    _traces: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def queries(self) -> int:
+        """How many queries there are to pick; 0 without a model."""
+        return self.inside.model.queries.count if self.inside else 0
+
+    @property
+    def depth(self) -> int:
+        """How many decoder layers there are; 0 without a model."""
+        return self.inside.model.depth if self.inside else 0
+
+    @cached_property
+    def splats(self) -> Splats:
+        """All Gaussians in the shown world."""
+        return splats(self.gaussians, self.placement)
+
+    def query_of(self, gaussian: int) -> int | None:
+        """The query that a Gaussian is of; None without a model."""
+        return gaussian * self.queries // self.gaussians.count if self.queries else None
+
+    def members(self, query: int) -> slice:
+        """The Gaussians of a query."""
+        each = self.gaussians.count // self.queries
+        return slice(query * each, (query + 1) * each)
+
+    def support(self, layer: int) -> SpatialSupport | None:
+        """Supports (1, N) after a layer in the shown world, layer 0 the learned start.
+
+        None for queries without a position.
+        """
+        if self.inside is None:
+            return None
+        found = self.inside.model.queries.support(self.inside.states[layer])
+        if found is None:
+            return None
+        place = self.placement
+        return SpatialSupport(place.points(found.centers), place.vectors(found.axes))
+
+    def attention(self, query: int, layer: int) -> AttentionWeights | None:
+        """What a query reads in a layer, (1, h, 1, M); None if it tells nothing, or in layer 0."""
+        if self.inside is None or layer == 0:
+            return None
+        if query not in self._traces:
+            model, memory = self.inside.model, self.inside.memory
+            with torch.no_grad(), trace(model, queries=[query]) as record:
+                model.predict(memory, self.inside.states[0])
+            self._traces[query] = record
+        return self._traces[query].layers[layer].cross_attention
+
+    def hub(self, query: int, layer: int) -> Tensor:
+        """Where lines of a query start, (3,): its support's centre, or its Gaussians' mean."""
+        found = self.support(layer)
+        if found is not None:
+            return found.centers[0, query]
+        return self.placement.points(self.gaussians.means[0, self.members(query)]).mean(0)
+
+    def strongest(self, query: int, layer: int, count: int, depth: float) -> "Reading | None":
+        """The `count` patches that a query attends to most, on photos `depth` from their cameras.
+
+        Mean over heads. None where attention tells nothing.
+        """
+        weights = self.attention(query, layer)
+        if weights is None or self.views is None or self.inside is None:
+            return None
+        grid, cameras = self.inside.memory.grid, self.views.cameras[0]
+        pixels = patch_centers(grid, cameras.size)
+        points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
+        shares = weights.weights[0, :, 0].float().mean(0).cpu()
+        strongest = shares.topk(min(count, len(shares)))
+        return Reading(self.placement.points(points.cpu()[strongest.indices]), strongest.values)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Patches that a query reads: points (k, 3) in the shown world, shares (k,) of attention."""
+
+    points: Tensor
+    shares: Tensor
+
+
+@torch.no_grad()
+def look_inside(
+    model: QueryGaussianModel,
+    views: Views,
+    labels: Sequence[str] = (),
+    frames: Sequence[int] = (),
+    placement: Placement | None = None,
+) -> Look:
+    """What `model` makes of views (1, V), with all that can be asked of it."""
+    memory, start = model.encoder(views), model.queries(1)
+    prediction = model.predict(memory, start, range(1, model.depth + 1))
+    states = [start, *(layer.state for layer in prediction.layers.values())]
+    inside = Inside(model, memory, states)
+    placement = placement or Placement.identity()
+    labels = labels or [f"view {view}" for view in range(views.images.shape[1])]
+    return Look(prediction.gaussians, views, labels, frames, placement, inside)

@@ -1,0 +1,214 @@
+"""The controls beside the scene: what is shown, which query, which input photos."""
+
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from threading import RLock
+from typing import Any, get_args
+
+import numpy as np
+import viser
+
+from qgs.analysis.scenes import frame_list
+from qgs_viewer.choice import Choice, Others
+from qgs_viewer.look import Look
+from qgs_viewer.pictures import PARTS, attention_parts
+from qgs_viewer.placement import hit, near_ray
+from qgs_viewer.server import stand
+from qgs_viewer.sources import ModelSource, Source
+from qgs_viewer.stage import Stage
+
+MOST_BOXES = 24
+"""Up to so many photos each have a check box; more are named in a line of text."""
+NONE = -1
+"""The number in the field `query` while none is picked."""
+_CAPTIONS = {
+    "content": "content: logits of what patches show",
+    "geometry": "geometry: what rays and anchor add",
+    "result": "result: softmax of the sum",
+}
+
+
+class Panel:
+    """The viewer of one source: its scene, its controls, and what is chosen in them."""
+
+    def __init__(self, server: viser.ViserServer, source: Source) -> None:
+        self.server, self.source = server, source
+        self.stage, self.choice = Stage(server.scene), Choice()
+        self.look: Look = source.look(source.frames)
+        self.choice = Choice(layer=self.look.depth)
+        self._lock, self._quiet = RLock(), False
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
+        stand(server, self.look)
+        self._head()
+        if self.look.queries:
+            self._query()
+        if source.labels:
+            self._inputs()
+        if source.notes:
+            with server.gui.add_folder("remarks", expand_by_default=False):
+                server.gui.add_markdown("\n\n".join(source.notes))
+        self.stage.put(self.look, self.choice, source.cameras())
+        if self.look.queries:
+            server.scene.on_click()(self._clicked)
+
+    def _head(self) -> None:
+        gui, queries = self.server.gui, self.look.queries
+        told = f"**{self.source.title}**\n\n{self.look.gaussians.count:,} Gaussians"
+        if queries:
+            told += f" of {queries:,} queries. Click on one"
+            told += "." if self.look.support(0) is None else ", or on an anchor."
+        gui.add_markdown(told)
+        if queries:
+            names = ("of the scene", "by query")
+            self.colors = gui.add_dropdown("colours", names, initial_value=names[0])
+            self._on(self.colors, lambda: {"by_query": self.colors.value == names[1]})
+        if self.look.views is not None:
+            self.photos = gui.add_checkbox("cameras", True)
+            self._on(self.photos, lambda: {"photos": self.photos.value})
+
+    def _query(self) -> None:
+        gui, depth = self.server.gui, self.look.depth
+        with gui.add_folder("query"):
+            last = self.look.queries - 1
+            hint = f"0 to {last}, or {NONE} for none"
+            self.number = gui.add_number("query", NONE, min=NONE, max=last, step=1, hint=hint)
+            self._on(self.number, self._picked)
+            self.others = gui.add_dropdown("other queries", get_args(Others), initial_value="faint")
+            self._on(self.others, lambda: {"others": self.others.value})
+            hint = "Supports are those after this layer; 0 is the learned start."
+            self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
+            self._on(self.layer, lambda: {"layer": int(self.layer.value)})
+            hint = "Lines to the patches that the query attends to most in this layer."
+            self.patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
+            self._on(self.patches, lambda: {"patches": int(self.patches.value)})
+            if self.look.support(0) is not None:
+                self.anchors = gui.add_checkbox("all anchors", True)
+                self._on(self.anchors, lambda: {"anchors": self.anchors.value})
+            self._said = gui.add_markdown("")
+            blank = np.full((8, 8, 3), 255, np.uint8)
+            add = partial(gui.add_image, blank, visible=False, format="png")
+            self.pictures = {part: add(label=_CAPTIONS[part]) for part in PARTS}
+
+    def _picked(self) -> dict[str, Any]:
+        number = int(self.number.value)
+        return {"query": None if number == NONE else number}
+
+    def _inputs(self) -> None:
+        gui, labels = self.server.gui, self.source.labels
+        with gui.add_folder("input photos"):
+            if len(labels) <= MOST_BOXES:
+                chosen = set(self.source.frames)
+                self.boxes = [gui.add_checkbox(x, f in chosen) for f, x in enumerate(labels)]
+                for box in self.boxes:
+                    box.on_update(self._reframed)
+            else:
+                text = ",".join(map(str, self.source.frames))
+                hint = f"Numbers or file names, commas between; 0 to {len(labels) - 1}."
+                self.frames = gui.add_text("frames", text, hint=hint)
+                self.frames.on_update(self._reframed)
+
+    def _on(self, control: Any, change: Callable[[], dict[str, Any]]) -> None:
+        @control.on_update
+        def _(event: Any) -> None:
+            with self._lock:
+                if not self._quiet:
+                    self.choose(**change())
+
+    def choose(self, **changes: Any) -> None:
+        """Change the choice (see `Choice`) and draw it."""
+        with self._lock, self.server.atomic():
+            self.choice = replace(self.choice, **changes)
+            self.stage.update(self.look, self.choice)
+            self._read()
+
+    def pick(self, query: int | None) -> None:
+        """Pick a query, or none."""
+        with self._silently():
+            self.number.value = NONE if query is None else query
+        self.choose(query=query)
+
+    def take(self, frames: Sequence[int]) -> None:
+        """Reconstruct from these frames. Raises ValueError for frames that do not fit."""
+        with self._lock:
+            self.look = self.source.look(frames)
+            with self.server.atomic():
+                self.stage.put(self.look, self.choice, self.source.cameras())
+                self._read()
+
+    @contextmanager
+    def _silently(self) -> Any:
+        """While controls are set by the program, they do not call back."""
+        with self._lock:
+            self._quiet = True
+            try:
+                yield
+            finally:
+                self._quiet = False
+
+    def _read(self) -> None:
+        """The attention of the picked query, and where it stands."""
+        if not self.look.queries:
+            return
+        query, layer = self.choice.query, self.choice.layer
+        found = {} if query is None else attention_parts(self.look, query, layer)
+        for part, handle in self.pictures.items():
+            handle.visible = part in found
+            if part in found:
+                handle.image = found[part]
+        self._said.content = "" if query is None else told(self.look, query, layer)
+
+    def _reframed(self, event: Any) -> None:
+        with self._lock:
+            if self._quiet:
+                return
+            try:
+                self.take(self._frames())
+            except ValueError as error:
+                if event.client is not None:
+                    event.client.add_notification("Not reconstructed", str(error), color="red")
+
+    def _frames(self) -> list[int]:
+        if len(self.source.labels) <= MOST_BOXES:
+            return [frame for frame, box in enumerate(self.boxes) if box.value]
+        assert isinstance(self.source, ModelSource)
+        return frame_list(self.frames.value, "frames", self.source.scene)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        with self._lock:
+            query = self.under(np.array(event.ray_origin), np.array(event.ray_direction))
+            if query is not None:
+                self.pick(query)
+
+    def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
+        """The query under a ray, by its anchor where that is shown, or by its Gaussians."""
+        found = self.look.support(self.choice.layer) if self.choice.anchors else None
+        if found is not None:
+            radius = self.stage.anchor_radius
+            anchor = near_ray(found.centers[0].numpy(), origin, direction, radius)
+            if anchor is not None:
+                return anchor
+        gaussian = hit(self.look.splats, origin, direction)
+        return None if gaussian is None else self.look.query_of(gaussian)
+
+
+def told(look: Look, query: int, layer: int) -> str:
+    """Where a query's anchor is, how large, how far it moved, and what it reads, in words."""
+    members, lines = look.members(query), [f"**query {query}**, layer {layer}"]
+    lines.append(f"Gaussians {members.start} to {members.stop - 1}")
+    found = look.support(layer)
+    if found is not None:
+        x, y, z = found.centers[0, query].tolist()
+        sizes = found.axes[0, query].norm(dim=0).tolist()
+        shape = f"radius {sizes[0]:.3f}"
+        if max(sizes) > 1.001 * min(sizes):
+            shape = "semi-axes " + ", ".join(f"{size:.3f}" for size in sizes)
+        lines.append(f"anchor at {x:.3f}, {y:.3f}, {z:.3f}; {shape}")
+        if layer and (before := look.support(layer - 1)) is not None:
+            moved = (found.centers[0, query] - before.centers[0, query]).norm()
+            lines.append(f"moved by {float(moved):.3f} in this layer")
+    if layer and look.attention(query, layer) is None:
+        lines.append("the attention of this layer tells nothing of itself")
+    return "\n\n".join(lines)

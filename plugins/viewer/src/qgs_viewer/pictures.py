@@ -1,0 +1,37 @@
+"""What one query reads, drawn onto the input photos."""
+
+import numpy as np
+
+from qgs.drawing.images import Picture, enlarged, rgb_picture, side_by_side
+from qgs.drawing.queries import attention_pictures, patch_maps
+from qgs_viewer.look import Look
+
+SIDE = 192
+"""Pixels on the longer side of each photo."""
+COLUMNS = 2
+PARTS = ("content", "geometry", "result")
+
+
+def attention_parts(look: Look, query: int, layer: int) -> dict[str, Picture]:
+    """Content logits, geometry bias and attention of a query, by PARTS; less those it lacks.
+
+    All input photos in one picture, COLUMNS in a row; means over heads.
+    """
+    weights = look.attention(query, layer)
+    if weights is None or look.views is None or look.inside is None:
+        return {}
+    photos = [enlarged(rgb_picture(image), SIDE) for image in look.views.images[0]]
+    parts = (weights.content, weights.geometry, weights.weights)
+    return {
+        name: _sheet(attention_pictures(photos, patch_maps(part[0, :, 0], look.inside.memory.grid)))
+        for name, part in zip(PARTS, parts, strict=True)
+        if part is not None
+    }
+
+
+def _sheet(pictures: list[Picture]) -> Picture:
+    blank = np.full_like(pictures[0], 255)
+    rows = [pictures[start : start + COLUMNS] for start in range(0, len(pictures), COLUMNS)]
+    columns = min(COLUMNS, len(pictures))
+    rows = [side_by_side([*row, *[blank] * (columns - len(row))]) for row in rows]
+    return np.concatenate(rows, 0)

@@ -1,0 +1,133 @@
+"""Where things are in the shown world: similarity maps, splats, frusta, picking by a ray."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.types import Cameras, Gaussians
+
+LEAST_WEIGHT = 0.02
+"""Blending weight on a clicked ray below which a Gaussian counts as not hit."""
+
+_FLOAT16 = 2.0**15
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The map p -> scale * rotation p + translation of one world into another; float64."""
+
+    rotation: Tensor
+    translation: Tensor
+    scale: float
+
+    @staticmethod
+    def identity() -> "Placement":
+        """The map that changes nothing."""
+        return Placement(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
+
+    @staticmethod
+    def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
+        """From a model's `world`, as of `qgs.data.sampling.own_world`, into the `other` one."""
+        (pose, scale), (other_pose, other_scale) = world, other
+        both = torch.linalg.inv(other_pose.double()) @ pose.double()
+        factor = float(other_scale) / float(scale)
+        return Placement(both[:3, :3], both[:3, 3] * float(other_scale), factor)
+
+    def points(self, points: Tensor) -> Tensor:
+        """Points (..., 3)."""
+        return self.scale * points.detach().cpu().double() @ self.rotation.mT + self.translation
+
+    def vectors(self, columns: Tensor) -> Tensor:
+        """Directions as columns (..., 3, n), with their lengths."""
+        return self.scale * self.rotation @ columns.detach().cpu().double()
+
+
+@dataclass(frozen=True)
+class Splats:
+    """G Gaussians as viewers take them: float32 centers (G, 3), covariances (G, 3, 3), opacities
+    (G, 1), and colors (G, 3) in [0, 1]."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+    @property
+    def magnification(self) -> float:
+        """By what lengths are multiplied so that float16, which viewers get covariances in, holds
+        the largest covariance and, with it, standard deviations 10,000 times smaller."""
+        return float(np.sqrt(_FLOAT16 / max(np.abs(self.covariances).max(), 1e-30)))
+
+
+@full_precision
+def splats(gaussians: Gaussians, placement: Placement) -> Splats:
+    """The Gaussians (1, G) of one scene, placed."""
+    rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))
+    axes_G33 = rotated * gaussians.scales[0].detach().cpu().double()[:, None, :]
+    parts = (
+        placement.points(gaussians.means[0]),
+        axes_G33 @ axes_G33.mT,
+        gaussians.opacities[0, :, None],
+        gaussians.colors[0].clamp(0, 1),
+    )
+    return Splats(*(part.detach().cpu().numpy().astype(np.float32) for part in parts))
+
+
+def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
+    """The Gaussian that weighs most in the colour of a ray; None where all are nearly clear.
+
+    Each counts with its greatest value on the ray, the nearest first, as alpha is blended.
+    """
+    offsets = origin - found.centers.astype(np.float64)
+    least = 1e-12 * np.eye(3)
+    precision = np.linalg.inv(found.covariances.astype(np.float64) + least)
+    across = np.einsum("gij,j->gi", precision, direction)
+    along = np.maximum(across @ direction, 1e-30)
+    depths = -np.einsum("gi,gi->g", across, offsets) / along
+    nearest = offsets + depths[:, None] * direction
+    distances = np.einsum("gi,gij,gj->g", nearest, precision, nearest)
+    alphas = np.where(depths > 0, np.exp(-distances / 2), 0) * found.opacities[:, 0]
+    order = np.argsort(depths)
+    left = np.cumprod(np.concatenate([[1.0], 1 - alphas[order]]))[:-1]
+    weights = alphas[order] * left
+    best = int(weights.argmax())
+    return int(order[best]) if weights[best] >= LEAST_WEIGHT else None
+
+
+@full_precision
+def on_photo(cameras: Cameras, pixels: Tensor, depth: float) -> Tensor:
+    """World points (V, P, 3) at camera-frame z `depth` behind pixels (P, 2) of cameras (V,)."""
+    focal, principal = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
+    flat = (pixels.to(focal) - principal) / focal * depth
+    local = torch.cat([flat, torch.full_like(flat[..., :1], depth)], -1)
+    return local @ cameras.c2w[:, :3, :3].to(local).mT + cameras.c2w[:, None, :3, 3].to(local)
+
+
+def corners(size: tuple[int, int]) -> Tensor:
+    """Pixels (4, 2) of a picture's corners, in order around it. size: H, W."""
+    height, width = size
+    return torch.tensor([[0, 0], [width, 0], [width, height], [0, height]]).double()
+
+
+def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
+    """Pixels (rows * columns, 2) of the patches of one view. grid: views, rows, columns."""
+    _, rows, columns = grid
+    height, width = size
+    y, x = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
+    return torch.stack([x * width / columns, y * height / rows], -1).reshape(-1, 2).double()
+
+
+def near_ray(
+    points: np.ndarray, origin: np.ndarray, direction: np.ndarray, radius: float
+) -> int | None:
+    """The first of the points (N, 3) before a ray's origin within `radius` of it; None without."""
+    offsets = points - origin
+    depths = offsets @ direction
+    distances = np.linalg.norm(offsets - depths[:, None] * direction, axis=1)
+    reached = np.where((depths > 0) & (distances <= radius), depths, np.inf)
+    nearest = int(reached.argmin())
+    return nearest if np.isfinite(reached[nearest]) else None

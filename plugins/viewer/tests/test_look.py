@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+import torch
+from qgs_viewer.choice import FAINT, Choice, anchor_colors, painted, query_color
+from qgs_viewer.panel import told
+from qgs_viewer.pictures import attention_parts
+from small import KINDS, QUERIES, SIDE, model_of, source_of
+
+import qgs
+from qgs.geometry.transforms import to_camera, to_pixels
+
+pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_supports_are_those_of_the_states_of_each_layer(kind: str) -> None:
+    look, model = source_of(kind).look((1, 4)), model_of(kind)
+    assert look.views is not None
+    with torch.no_grad():
+        prediction = model(look.views, layers=range(1, model.depth + 1))
+    states = [model.queries(1), *(layer.state for layer in prediction.layers.values())]
+    for layer, state in enumerate(states):
+        expected, found = model.queries.support(state), look.support(layer)
+        assert (found is None) == (expected is None) == (kind == "tokengs")
+        if found is not None and expected is not None:
+            torch.testing.assert_close(found.centers, expected.centers.double())
+            torch.testing.assert_close(found.axes, expected.axes.double())
+    torch.testing.assert_close(look.gaussians.means, prediction.gaussians.means)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_attention_is_that_of_a_trace(kind: str) -> None:
+    look, model = source_of(kind).look((1, 4)), model_of(kind)
+    with torch.no_grad(), qgs.trace(model, queries=[5]) as record:
+        model(look.views)
+    for layer in range(1, model.depth + 1):
+        found, expected = look.attention(5, layer), record.layers[layer].cross_attention
+        assert found is not None
+        assert expected is not None
+        torch.testing.assert_close(found.weights, expected.weights)
+    assert look.attention(5, 0) is None
+    parts = {"content", "result"} if kind == "tokengs" else {"content", "geometry", "result"}
+    assert attention_parts(look, 5, 1).keys() == parts
+
+
+def test_gaussians_belong_to_queries_in_order() -> None:
+    look = source_of("locus").look((1, 4))
+    each = look.gaussians.count // QUERIES
+    for query in (0, 7, QUERIES - 1):
+        members = look.members(query)
+        assert [look.query_of(g) for g in range(look.gaussians.count)[members]] == [query] * each
+
+
+def test_lines_end_on_the_patches_that_are_read_most() -> None:
+    look = source_of("locus").look((1, 4))
+    assert look.views is not None
+    assert look.inside is not None
+    reading, weights = look.strongest(3, 2, 5, 0.4), look.attention(3, 2)
+    assert reading is not None
+    assert weights is not None
+    shares = weights.weights[0, :, 0].mean(0)
+    assert reading.shares.tolist() == sorted(shares.tolist(), reverse=True)[:5]
+    _, rows, columns = look.inside.memory.grid
+    cameras, patch = look.views.cameras.to(torch.float64), SIDE / columns
+    seen = to_camera(reading.points[None], cameras)[0]
+    for place, token in enumerate(shares.topk(5).indices.tolist()):
+        view, rest = divmod(token, rows * columns)
+        row, column = divmod(rest, columns)
+        pixel = to_pixels(seen[view, place][None], cameras.intrinsics[0, view])[0]
+        middle = torch.tensor([(column + 0.5) * patch, (row + 0.5) * patch]).double()
+        torch.testing.assert_close(pixel, middle, rtol=0, atol=1e-3)
+        assert seen[view, place, 2] == pytest.approx(0.4)
+
+
+def test_lines_start_at_the_anchor_or_amid_the_gaussians() -> None:
+    anchored, plain = (source_of(kind).look((1, 4)) for kind in ("locus", "tokengs"))
+    support = anchored.support(1)
+    assert support is not None
+    torch.testing.assert_close(anchored.hub(3, 1), support.centers[0, 3])
+    mean = plain.gaussians.means[0, plain.members(3)].double().mean(0)
+    torch.testing.assert_close(plain.hub(3, 1), mean)
+
+
+def test_other_inputs_leave_the_scene_where_it_is() -> None:
+    source = source_of("locus")
+    every = source.cameras()
+    assert every is not None
+    for frames in ((1, 4), (4, 1), (0, 2, 5)):
+        look = source.look(frames)
+        assert look.views is not None
+        eyes = look.placement.points(look.views.cameras.c2w[0, :, :3, 3])
+        torch.testing.assert_close(eyes, every.c2w[list(frames), :3, 3], rtol=0, atol=1e-5)
+        turned = look.placement.rotation @ look.views.cameras.c2w[0, :, :3, :3].double()
+        torch.testing.assert_close(turned, every.c2w[list(frames), :3, :3], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"), [((), "choose one at least"), ((9,), "do not exist"), ((1, 1), "twice")]
+)
+def test_frames_that_do_not_fit_are_refused(frames: tuple[int, ...], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        source_of("tokengs").look(frames)
+
+
+def test_a_picked_query_stands_out() -> None:
+    look = source_of("locus").look((1, 4))
+    mine = np.zeros(look.gaussians.count, bool)
+    mine[look.members(4)] = True
+    plain = painted(look, Choice())
+    for others, part in (("faint", FAINT), ("hidden", 0.0), ("shown", 1.0)):
+        shown = painted(look, Choice(query=4, others=others))
+        np.testing.assert_allclose(shown.opacities[~mine], part * plain.opacities[~mine], rtol=1e-6)
+        assert (shown.opacities[mine] >= plain.opacities[mine]).all()
+        np.testing.assert_array_equal(shown.colors[mine], plain.colors[mine])
+    colored = painted(look, Choice(by_query=True))
+    np.testing.assert_allclose(colored.colors[mine] * 255, [query_color(4)] * mine.sum(), atol=0.1)
+
+
+def test_colours_tell_queries_apart() -> None:
+    assert len({query_color(query) for query in range(1024)}) > 900
+    numbers, _ = anchor_colors(QUERIES, Choice(query=4, others="hidden"))
+    assert numbers.tolist() == [4]
+
+
+def test_words_on_a_query() -> None:
+    ball, ellipsoid = (source_of(k).look((1, 4)) for k in ("locus", "ellipsoid"))
+    assert "radius" in told(ball, 2, 1)
+    assert "moved by" in told(ball, 2, 1)
+    assert "moved by" not in told(ball, 2, 0)
+    support = ellipsoid.support(1)
+    assert support is not None
+    lengths = support.axes[0, 2].norm(dim=0)
+    if lengths.max() > 1.001 * lengths.min():
+        assert "semi-axes" in told(ellipsoid, 2, 1)
+    assert "anchor" not in told(source_of("tokengs").look((1, 4)), 2, 1)
