@@ -8,7 +8,6 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
-from zlib import crc32
 
 import numpy as np
 import torch
@@ -33,9 +32,12 @@ from qgs.io.checkpoint import (
     write_tensors,
 )
 from qgs.io.differences import (
+    CONTENTS,
+    contents,
     differing_tensors,
     differing_types,
     nonfinite,
+    refuse_changed,
     shapes_of,
 )
 from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
@@ -46,7 +48,7 @@ FORMAT_VERSION = 1
 """Raised when the format of the file changes."""
 
 _PARTS, _RECIPE = "qgs.state", "qgs.recipe"
-_FORMAT, _VERSION, _TENSORS = "qgs.state_version", "qgs.version", "qgs.contents"
+_FORMAT, _VERSION = "qgs.state_version", "qgs.version"
 
 State: TypeAlias = Mapping[str, Any]
 """Tensors and JSON values by name."""
@@ -85,7 +87,7 @@ def write_state(
                 tensors[f"{part}/{key}"] = tensor.cpu().clone(memory_format=torch.contiguous_format)
     metadata = {
         _PARTS: json.dumps(values),
-        _TENSORS: json.dumps(contents(tensors)),
+        CONTENTS: json.dumps(contents(tensors)),
         _RECIPE: json.dumps(recipe),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
@@ -103,7 +105,7 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
     refuse_newer(metadata, {_FORMAT: FORMAT_VERSION}, _VERSION, path)
     parts, tensors = mapping_in(metadata, _PARTS, path), read_tensors(path)
-    _refuse_others(tensors, metadata, path)
+    refuse_changed(tensors, mapping_in(metadata, CONTENTS, path), path)
     for name, tensor in tensors.items():
         part, slash, key = name.partition("/")
         if not slash or not isinstance(parts.get(part), dict):
@@ -113,24 +115,6 @@ def read_state(path: str | os.PathLike[str]) -> SavedState:
         return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
     except RecipeError as error:
         raise damaged(path, f"its recipe fails here, or needs other plugins: {error}") from error
-
-
-def contents(tensors: Mapping[str, Tensor]) -> dict[str, str]:
-    """What tells tensors on the CPU from others: types, shapes, checksums of their bytes."""
-    sums = {n: crc32(t.reshape(-1).view(torch.uint8).numpy().data) for n, t in tensors.items()}
-    return {n: f"{t.dtype} {list(t.shape)} crc32 {sums[n]:08x}" for n, t in tensors.items()}
-
-
-def _refuse_others(tensors: Mapping[str, Tensor], metadata: Mapping[str, str], path: Any) -> None:
-    """Raise CheckpointError unless `tensors` are those that were written."""
-    found, wanted = contents(tensors), mapping_in(metadata, _TENSORS, path)
-    differing = [
-        f"{name[:200]}: {found.get(name, 'absent')} instead of {str(wanted.get(name))[:200]}"
-        for name in dict.fromkeys([*wanted, *found])
-        if found.get(name) != wanted.get(name)
-    ]
-    if differing:
-        raise damaged(path, f"not the tensors that were written: {listed(differing, between='; ')}")
 
 
 class Saver:

@@ -12,9 +12,10 @@ from qgs.io.checkpoint import (
     load_recipe,
     load_weights,
     read_tensors,
+    refuse_damaged,
     unique_tensors,
 )
-from qgs.io.differences import differing_tensors, options_beside_weights, refuse_broken, shapes_of
+from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
 from qgs.model import QueryGaussianModel
 
 _QUERIES, _ENCODER = "queries.", "encoder."
@@ -37,7 +38,6 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     learned_by = load_recipe(path)
     stored = read_tensors(path)
     learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
-    refuse_broken(learned, f"init_from: {path}")
     options = [
         f"{option}: {theirs} (here {ours})"
         for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()
@@ -57,6 +57,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     resized = model.queries.resized(_of(_QUERIES, learned), generator)
     weights |= {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, str(path))
+    refuse_damaged(stored, path)
     changes = [
         _change(name, learned[name], values)
         for name, values in weights.items()

@@ -18,7 +18,15 @@ from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
 from qgs.data.domain import KEY, Domain
-from qgs.io.differences import differing_tensors, differing_types, refuse_broken, shapes_of
+from qgs.io.differences import (
+    CONTENTS,
+    contents,
+    differing_tensors,
+    differing_types,
+    refuse_broken,
+    refuse_changed,
+    shapes_of,
+)
 from qgs.io.files import replacing
 from qgs.io.metadata import CheckpointError, mapping_in, reading, refuse_newer, stored_recipe
 from qgs.io.models import checkpoint_path
@@ -122,6 +130,7 @@ def write_checkpoint(
     plugins = load_registry(tree["plugins"]).plugins
     metadata = {
         _RECIPE: json.dumps(tree),
+        CONTENTS: json.dumps(contents(tensors)),
         _PLUGINS: json.dumps({name: plugin.version for name, plugin in plugins.items()}),
         _DISTRIBUTIONS: json.dumps({name: used.distribution for name, used in plugins.items()}),
         _CONTRACT: str(CONTRACT_VERSION),
@@ -153,9 +162,21 @@ def load(
             f"{path}: the model of its recipe cannot be built: {error}"
         ) from error
     load_weights(model, tensors, str(path))
-    refuse_broken(tensors, path)
+    refuse_damaged(tensors, path)
     model.trained_on = load_domain(path)
     return (model if device is None else model.to(device)).eval()
+
+
+def refuse_damaged(tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
+    """Raise when the weights `tensors` of the checkpoint at `path` cannot be what was learned.
+
+    ValueError for NaN and infinity, CheckpointError for bytes that were not written so. Files of
+    releases that wrote no checksums pass.
+    """
+    refuse_broken(tensors, path)
+    metadata = _read_metadata(path)
+    if CONTENTS in metadata:
+        refuse_changed(tensors, mapping_in(metadata, CONTENTS, path), path)
 
 
 def load_recipe(path: str | os.PathLike[str]) -> Recipe:

@@ -1,8 +1,10 @@
 """In what two state dicts, or two recipes, differ: the lines that messages list."""
 
+import os
 import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
+from zlib import crc32
 
 import torch
 from torch import Tensor
@@ -10,7 +12,11 @@ from torch import Tensor
 from qgs.composer.recipe import flat
 from qgs.composer.yaml_text import inline
 from qgs.contracts.weights import Shapes
+from qgs.io.metadata import damaged
 from qgs.wording import listed
+
+CONTENTS = "qgs.contents"
+"""Key of the metadata that tell the tensors of a file."""
 
 _WITHOUT_EFFECT_ON_TRAINED = re.compile(
     r"(\b|_)(init|std|layer_scale)(\b|_)|^model\.(supervision|renderer)\."
@@ -33,6 +39,26 @@ def refuse_broken(tensors: Mapping[str, Tensor], origin: object) -> None:
     if broken := nonfinite(tensors.items()):
         fix = "its training had diverged, or the file is damaged: take another"
         raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
+
+
+def contents(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """What tells tensors on the CPU from others: types, shapes, checksums of their bytes."""
+    sums = {n: crc32(t.reshape(-1).view(torch.uint8).numpy().data) for n, t in tensors.items()}
+    return {n: f"{t.dtype} {list(t.shape)} crc32 {sums[n]:08x}" for n, t in tensors.items()}
+
+
+def refuse_changed(
+    tensors: Mapping[str, Tensor], written: Mapping[str, Any], path: str | os.PathLike[str]
+) -> None:
+    """Raise CheckpointError unless the `contents` of `tensors`, read from `path`, are `written`."""
+    found = contents(tensors)
+    differing = [
+        f"{name[:200]}: {found.get(name, 'absent')} instead of {str(written.get(name))[:200]}"
+        for name in dict.fromkeys([*written, *found])
+        if found.get(name) != written.get(name)
+    ]
+    if differing:
+        raise damaged(path, f"not the tensors that were written: {listed(differing, between='; ')}")
 
 
 def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()) -> list[str]:

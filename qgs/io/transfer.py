@@ -17,6 +17,7 @@ from qgs.io.checkpoint import (
     load_extra,
     load_recipe,
     read_tensors,
+    refuse_damaged,
     write_checkpoint,
 )
 from qgs.io.differences import options_beside_weights, refuse_broken, shapes_of
@@ -111,6 +112,7 @@ def export_weights(checkpoint: str | Path, out: str | Path) -> Transfer:
     stored = read_tensors(checkpoint)
     if shapes_of(stored) != names.shapes:
         raise CheckpointError(f"{checkpoint} does not fit the model of its recipe; see qgs.load")
+    refuse_damaged(stored, checkpoint)
     published = names.to_published(stored)
     with replacing(out) as temporary:
         save_file(published, temporary, {"format": "pt"})
@@ -125,6 +127,7 @@ def export_half(checkpoint: str | Path, out: str | Path) -> None:
     """
     out = _new_safetensors(out)
     recipe, stored = load_recipe(checkpoint), read_tensors(checkpoint)
+    refuse_damaged(stored, checkpoint)
     halved = {n: t.half() if t.is_floating_point() else t for n, t in stored.items()}
     broken = [name for name, tensor in halved.items() if not tensor.isfinite().all()]
     if broken:

@@ -20,10 +20,12 @@ import qgs
 from qgs.data.sampling import Batch
 from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
 from qgs.engine import training
-from qgs.engine.checkpoint import contents, read_state
+from qgs.engine.checkpoint import read_state
 from qgs.engine.fit import OutOfMemoryError, explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.io.checkpoint import CheckpointError, load_domain
+from qgs.io.differences import contents
+from qgs.io.transfer import export_half
 from qgs.memory import TooLargeError, _left_by_groups, in_words, refuse_beyond_memory
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -155,14 +157,39 @@ def test_a_run_starts_from_no_weights_that_are_not_finite(
     assert not (tmp_path / "other").exists()
 
 
-def test_a_state_of_which_one_bit_is_another_is_refused(copied: Path, tiny: Tiny) -> None:
-    """What no shape, type or size tells: the run would go on with another weight."""
-    state = copied / "state.safetensors"
-    whole = bytearray(state.read_bytes())
+def flip_a_bit(file: Path) -> str:
+    """What no shape, type or size tells, in the tensors of a file; what is said of it."""
+    whole = bytearray(file.read_bytes())
     whole[-100] ^= 1
-    state.write_bytes(whole)
-    with pytest.raises(CheckpointError, match=f"^{state} is damaged: not the tensors that were"):
+    file.write_bytes(whole)
+    return f"^{file} is damaged: not the tensors that were"
+
+
+def test_a_state_of_which_one_bit_is_another_is_refused(copied: Path, tiny: Tiny) -> None:
+    said = flip_a_bit(copied / "state.safetensors")
+    with pytest.raises(CheckpointError, match=said):
         run(tiny("tokengs", EMA), copied, resume=True)
+
+
+def test_a_checkpoint_of_which_one_bit_is_another_is_refused(
+    copied: Path, tiny: Tiny, tmp_path: Path
+) -> None:
+    file = copied / "checkpoint.safetensors"
+    said = flip_a_bit(file)
+    with pytest.raises(CheckpointError, match=said):
+        qgs.load(file)
+    with pytest.raises(CheckpointError, match=said):
+        run(tiny("tokengs", f"init_from={file}"), tmp_path / "other")
+    with pytest.raises(CheckpointError, match=said):
+        export_half(file, tmp_path / "half.safetensors")
+
+
+def test_a_checkpoint_without_checksums_is_read(copied: Path) -> None:
+    file = copied / "checkpoint.safetensors"
+    with safe_open(file, "pt") as opened:
+        old = {k: v for k, v in opened.metadata().items() if k != "qgs.contents"}
+    save_file(load_file(file), file, old)
+    assert qgs.load(file).depth > 0
 
 
 def test_moments_are_finite_but_squares(copied: Path, tiny: Tiny) -> None:
@@ -209,7 +236,11 @@ def test_moments_of_another_shape_are_refused(copied: Path, tiny: Tiny) -> None:
 
 def test_a_checkpoint_of_other_types_is_refused_and_half_precision_is_widened(copied: Path) -> None:
     file = copied / "checkpoint.safetensors"
-    rewrite(file, lambda t: t.update({WEIGHT: t[WEIGHT].half()}))
+
+    def halve(tensors: dict[str, torch.Tensor]) -> None:
+        tensors[WEIGHT] = tensors[WEIGHT].half()
+
+    rewrite(file, halve, **{"qgs.contents": changed_contents(file, halve)})
     assert qgs.load(file).queries.state_dict()["features"].dtype == torch.float32
     rewrite(file, lambda t: t.update({n: x.float().view(torch.int32) for n, x in t.items()}))
     with pytest.raises(CheckpointError, match=r"type of .*: torch\.int32 in the file"):

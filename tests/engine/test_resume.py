@@ -26,7 +26,6 @@ from qgs.composer import Recipe
 from qgs.engine.checkpoint import (
     OtherRunError,
     RandomStates,
-    contents,
     read_state,
     write_state,
 )
@@ -35,6 +34,7 @@ from qgs.engine.folder import RunFolder
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointError, load_extra
+from qgs.io.differences import contents
 
 
 class Killed(BaseException):
