@@ -47,7 +47,7 @@ def figure(exhibits: Sequence[Exhibit], chosen: dict[str, list[DrawnQuery]]) -> 
     columns = 1 + max(len(chosen_layers(e.look.depth, LAYERS, 0)) for e in exhibits)
     height, width = exhibits[0].sample.inputs.cameras.size
     with paper_style():
-        drawn = new_figure((WIDTH - 0.2) / columns * height / width * len(exhibits) + 0.25)
+        drawn = new_figure((WIDTH - 0.2) / columns * height / width * len(exhibits) + 0.2)
         axes = drawn.subplots(len(exhibits), columns, squeeze=False)
         for line, shown in zip(axes, exhibits, strict=True):
             _row(line, shown, chosen[shown.name])

@@ -74,6 +74,8 @@ def figure(exhibits: Sequence[Exhibit], queries: Mapping[str, DrawnQuery]) -> Fi
         axes = drawn.subplots(rows, len(ratios), width_ratios=ratios, squeeze=False)
         for axis in axes.flat:
             blank_panel(axis)
+        for axis in axes[:, np.array(ratios) == 1].flat:
+            axis.set_box_aspect(height / width)
         lines = iter(axes)
         for shown in exhibits:
             for layer in layers[shown.name]:
@@ -92,7 +94,7 @@ def _row(axes: Sequence[Axes], shown: Exhibit, query: int, layer: int, views: in
         if maps is None:
             if number:
                 middle = {"ha": "center", "va": "center", "transform": places[0].transAxes}
-                places[0].text(1.0, 0.5, "none", color="#7a8088", **middle)
+                places[0].text(1.0, 0.5, "none", in_layout=False, **middle)
             continue
         photos = [enlarged(rgb_picture(image), PHOTO) for image in shown.sample.inputs.images[0]]
         pictures = attention_pictures(photos, maps)

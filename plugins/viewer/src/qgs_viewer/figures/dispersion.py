@@ -1,7 +1,6 @@
 """Figure: how far the Gaussians of a query scatter, scene by scene."""
 
 from collections.abc import Mapping, Sequence
-from os.path import commonprefix
 
 import numpy as np
 import torch
@@ -15,6 +14,8 @@ from qgs.model import QueryGaussianModel
 from qgs_viewer.figures.exhibits import Exhibition
 from qgs_viewer.figures.paper import Made, new_figure, paper_style
 
+FAR_APART = 20
+"""Ratio of the greatest value to the least from which the scale is logarithmic."""
 LONGEST = 40
 """Scenes of which each is named under its bars; of more every n-th."""
 
@@ -26,8 +27,8 @@ def made(show: Exhibition) -> Made:
         f"Dispersion of queries on {len(show.samples)} test scenes: the distance of Gaussians to "
         "the centroid of those of their query, its mean (above; a few far Gaussians rule it) and "
         "its median (below) over all Gaussians of a scene, in units of the models' world; dashed "
-        "the mean over scenes. Small where a query stands for one place. Mind the logarithmic "
-        "scale: lengths of bars mean nothing, their ends do."
+        "the mean over scenes. Small where a query stands for one place. Where the values lie far "
+        "apart the scale is logarithmic: then the ends of bars count, not their lengths."
     )
     return Made(figure(found, scene_labels(show.samples)), caption)
 
@@ -50,7 +51,9 @@ def scene_labels(samples: Sequence[Sample]) -> list[str]:
     names = [sample.scene for sample in samples]
     if len({*names}) == 1:
         return [f"{min(s.input_frames)}–{max(s.input_frames)}" for s in samples]
-    return [name[len(commonprefix(names)) :] for name in names]
+    letters = enumerate(zip(*names, strict=False))
+    shared = next((i for i, found in letters if len({*found}) > 1), 0)
+    return [name[shared:] for name in names]
 
 
 def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence[str]) -> Figure:
@@ -76,7 +79,8 @@ def _bars(axis: Axes, values: Mapping[str, Sequence[float]]) -> None:
         axis.bar(places, found, 0.92 * wide, color=color, label=f"{name}, mean {mean:.3g}")
         axis.axhline(mean, color=color, linestyle=(0, (4, 2)), linewidth=0.9)
     every = [value for found in values.values() for value in found]
-    axis.set(yscale="log", ylim=(min(every) / 3, max(every) * 1.5))
+    if max(every) > FAR_APART * min(every) > 0:
+        axis.set(yscale="log", ylim=(min(every) / 3, max(every) * 1.5))
     axis.tick_params(axis="x", length=0)
     axis.tick_params(axis="y", which="minor", length=0)
     axis.grid(visible=False, axis="x")

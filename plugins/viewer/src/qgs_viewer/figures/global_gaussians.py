@@ -42,10 +42,10 @@ def made(show: Exhibition) -> Made:
     why = "The one that was asked for" if show.query is not None else "The heaviest one well inside"
     caption = (
         f"Scene {show.samples[0].scene} from outside, behind and above the input cameras (drawn as "
-        "frusta), framed anew for each model: left all Gaussians, right those of one query in colour, at no less than half "
-        "opacity, with lines to their centroid, over the scene in pale grey. "
-        f"{why}{' the first target view' * (show.query is None)} is shown. {'; '.join(told)}. "
-        "Lines that leave the panel lead to Gaussians outside it."
+        "frusta), framed anew for each model. Left all Gaussians; right those of one query in "
+        "colour, at no less than half opacity, with lines to their centroid, over the scene in "
+        f"pale grey. {why}{' the first target view' * (show.query is None)} is shown. "
+        f"{'; '.join(told)}. Lines that leave the panel lead to Gaussians outside it."
     )
     return Made(figure(show.exhibits, chosen), caption)
 

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from qgs.drawing.figures import MUTED, hex_color
-from qgs.drawing.queries import DrawnQuery
+from qgs.drawing.queries import DrawnQuery, rendered_weights
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition, NothingToShowError
 from qgs_viewer.figures.layers import chosen_layers
 from qgs_viewer.figures.paper import WIDTH, Made, new_figure, paper_style, row_label
-from qgs_viewer.figures.plan import Plan, draw_ground, plan_of
+from qgs_viewer.figures.plan import SHAPE, Plan, draw_ground, plan_of
 
 QUERIES = 5
 LAYERS = 2
@@ -29,7 +29,8 @@ def made(show: Exhibition) -> Made:
         raise NothingToShowError("the self-attention of these models tells nothing of itself")
     count = QUERIES if show.query is None else 1
     chosen = {e.name: e.notable(count, e.sample.targets.cameras[:, :1], show.query) for e in shown}
-    nodes = "at its anchor before the layer where it has one, else amid its Gaussians"
+    nodes = "at its anchor before the layer where it has one, else amid those of "
+    nodes += "its Gaussians that the inputs see"
     caption = (
         f"Self-attention in scene {show.samples[0].scene} seen from above, input cameras as "
         f"triangles, Gaussians as pale dots in their colours. Every dark dot is a query, {nodes}. "
@@ -50,10 +51,9 @@ def figure(exhibits: Sequence[Exhibit], chosen: Mapping[str, Sequence[DrawnQuery
     rows = max(map(len, layers))
     with paper_style():
         side = min((WIDTH - 0.3) / len(columns), 3.3)
-        plans = {shown.name: plan_of(shown) for shown in exhibits}
-        shapes = [(p.high - p.low)[1] / (p.high - p.low)[0] for p in plans.values()]
-        height = side * min(float(max(shapes)), 1.2) * rows
-        drawn = new_figure(height + 0.3, gap=0.03, width=side * len(columns) + 0.3)
+        plans = {e.name: plan_of(e, nodes_of(e, e.look.depth)) for e in exhibits}
+        height = side / SHAPE * rows
+        drawn = new_figure(height + 0.25, gap=0.03, width=side * len(columns) + 0.3)
         axes = drawn.subplots(rows, len(columns), squeeze=False)
         for column, (shown, part) in enumerate(columns):
             for axis, layer in zip(axes[:, column], layers[column], strict=False):
@@ -80,12 +80,18 @@ def strongest_edges(shown: Exhibit, query: int, layer: int, part: str) -> tuple[
 
 
 def nodes_of(shown: Exhibit, layer: int) -> Tensor:
-    """World points (N, 3) of the queries before a layer; without anchors amid their Gaussians."""
+    """World points (N, 3) of the queries before a layer, float64.
+
+    Without anchors the mean of their Gaussians, weighted by their blending in the input views.
+    """
     support = shown.look.support(layer - 1)
     if support is not None:
         return support.centers[0]
-    means = shown.gaussians.means[0].detach().cpu().double()
-    return means.view(shown.look.queries, -1, 3).median(1).values
+    gaussians, count = shown.gaussians, shown.look.queries
+    weights = rendered_weights(shown.model, gaussians, shown.sample.inputs.cameras)[0]
+    shares = weights.cpu().double().view(count, -1, 1).clamp_min(1e-12)
+    means = gaussians.means[0].detach().cpu().double().view(count, -1, 3)
+    return (means * shares).sum(1) / shares.sum(1)
 
 
 def _parts(shown: Exhibit) -> list[str]:

@@ -45,10 +45,10 @@ def made(show: Exhibition) -> Made:
     caption = (
         f"Novel views of {len(samples)} scenes ({', '.join(s.scene for s in samples)}), each from "
         f"{len(first.input_frames)} photos{f', {INPUTS} of them shown' if more > 0 else ''}. Of "
-        f"each scene the middle target is shown (in the first, frame {target}). Depth: light is "
-        "near, dark is far, one scale in each scene (of its true depth where that is known); grey is "
-        "nothing. Error: mean over channels of "
-        "the absolute difference from the truth, one scale in all; pixels as rendered."
+        f"each scene the middle target is shown (in the first, frame {target}), with PSNR. Depth: "
+        "light is near, dark is far; each map has the range told in it (2nd to 98th percentile, "
+        "units of the models' world); grey is nothing. Error: mean over channels of the absolute "
+        "difference from the truth, one scale in all. Pixels as rendered."
     )
     return Made(figure(show.models, samples, show.depths[:SCENES]), caption)
 
@@ -127,21 +127,24 @@ def _scene(
         picture_panel(block[number % len(block), number // len(block)], picture)
     first = block.shape[1] - 4
     picture_panel(block[0, first], rgb_picture(truth))
-    true = None if depth is None else depth[len(sample.target_frames) // 2].cpu()
-    known = [r.depth[0, 0].cpu() for r in seen.values()] if true is None else [true]
-    near, far = depth_range(torch.cat([values.flatten() for values in known]))
-    if true is not None and len(block) > 1:
-        picture_panel(block[1, first], depth_picture(true, near, far))
-        tag(block[1, first], "true depth")
+    if depth is not None and len(block) > 1:
+        _depth(block[1, first], depth[len(sample.target_frames) // 2], "true, ")
     for line, (name, rendering) in zip(block, seen.items(), strict=True):
         score = Psnr.column.shown(float(psnr(rendering.rgb[0, 0], truth.to(rendering.rgb))))
         picture_panel(line[first + 1], rgb_picture(rendering.rgb[0, 0]))
         tag(line[first + 1], f"{score} {Psnr.column.unit}")
         row_label(line[first + 1], name)
-        picture_panel(line[first + 2], depth_picture(rendering.depth[0, 0], near, far))
+        _depth(line[first + 2], rendering.depth[0, 0])
         error = error_map(rendering.rgb[0, 0], truth)
         picture_panel(line[first + 3], error_picture(error, brightest))
     row_label(block[0, 0], sample.scene)
+
+
+def _depth(axis: Axes, depth: Tensor, words: str = "") -> None:
+    """Depth (1, H, W) in colours of its own range, which is told."""
+    near, far = depth_range(depth)
+    picture_panel(axis, depth_picture(depth, near, far))
+    tag(axis, f"{words}{near:.2g} to {far:.2g}")
 
 
 def _scales(axes: Sequence[Axes], brightest: float) -> None:

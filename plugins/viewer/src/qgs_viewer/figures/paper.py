@@ -12,16 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from qgs.drawing.figures import INK, MUTED, Color, figure_style, hex_color
+from qgs.drawing.figures import INK, figure_style, hex_color
 from qgs.drawing.images import Picture
 from qgs.io.files import replacing
 
 WIDTH = 7.0
 """Inches of a figure across a page of two columns."""
 DPI = 220
-SIDE = 448
+SIDE = 512
 """Pixels on the longer side of pictures that models render for a panel."""
-INK_HEX, MUTED_HEX = hex_color(INK), hex_color(MUTED)
+INK_HEX = hex_color(INK)
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ def blank_panel(axis: Axes) -> None:
     axis.set(xticks=[], yticks=[])
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
+    axis.patch.set_visible(False)
 
 
 def row_label(axis: Axes, text: str) -> None:

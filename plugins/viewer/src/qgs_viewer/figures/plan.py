@@ -12,6 +12,11 @@ from qgs_viewer.figures.exhibits import Exhibit
 from qgs_viewer.figures.overview import seen_points
 from qgs_viewer.figures.paper import INK_HEX
 
+SHAPE = 1.15
+"""Width to height of a plan."""
+MARGIN = 1.2
+OUTSIDE = 0.03
+"""Share of the points that may lie outside of it on either side."""
 OPAQUE = 0.1
 """Opacity from which a Gaussian is drawn."""
 
@@ -38,16 +43,25 @@ def ground(cameras: Cameras) -> Tensor:
 
 
 @torch.no_grad()
-def plan_of(shown: Exhibit) -> Plan:
-    """The plan that holds what the input views show, and the input cameras."""
+def plan_of(shown: Exhibit, more: Tensor | None = None) -> Plan:
+    """The plan of SHAPE that holds what the input views show, their cameras and most of `more`.
+
+    more: world points (P, 3).
+    """
     inputs = shown.sample.inputs.cameras
     axes = ground(inputs)
-    points = seen_points(shown.model, shown.gaussians, inputs).cpu().double() @ axes
+    points = [seen_points(shown.model, shown.gaussians, inputs), *([] if more is None else [more])]
+    ends = [_ends(found.cpu().double() @ axes) for found in points]
     eyes = inputs.c2w[0, :, :3, 3].cpu().double() @ axes
-    low, high = torch.quantile(points, points.new_tensor([0.02, 0.98]), dim=0)
-    low, high = torch.minimum(low, eyes.amin(0)), torch.maximum(high, eyes.amax(0))
-    margin = 0.12 * (high - low).max()
-    return Plan(axes, low - margin, high + margin)
+    corners = torch.cat([eyes, *ends])
+    low, high = corners.amin(0), corners.amax(0)
+    middle, half = (low + high) / 2, (high - low) / 2 * MARGIN
+    half = torch.maximum(half, half.flip(0) * half.new_tensor([SHAPE, 1 / SHAPE]))
+    return Plan(axes, middle - half, middle + half)
+
+
+def _ends(places: Tensor) -> Tensor:
+    return torch.quantile(places, places.new_tensor([OUTSIDE, 1 - OUTSIDE]), dim=0)
 
 
 def draw_ground(axis: Axes, shown: Exhibit, plan: Plan) -> None:
@@ -63,7 +77,8 @@ def draw_ground(axis: Axes, shown: Exhibit, plan: Plan) -> None:
         side = torch.stack([-ahead[1], ahead[0]]) * 0.5
         shape = torch.stack([eye, eye + ahead + side, eye + ahead - side, eye]).T.numpy()
         axis.plot(*shape, color=INK_HEX, linewidth=0.8)
-    axis.set(xlim=(plan.low[0], plan.high[0]), ylim=(plan.low[1], plan.high[1]), aspect="equal")
+    low, high = plan.low.tolist(), plan.high.tolist()
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axis.set(xticks=[], yticks=[])
     axis.spines[:].set_visible(True)
     axis.grid(visible=False)

@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from qgs.drawing.figures import categorical, hex_color
+from qgs.drawing.figures import MUTED, categorical, hex_color
 from qgs_viewer.figures.anchors import support_of
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition
-from qgs_viewer.figures.paper import WIDTH, Made, new_figure, paper_style
+from qgs_viewer.figures.paper import INK_HEX, WIDTH, Made, new_figure, paper_style
 from qgs_viewer.figures.plan import draw_ground, plan_of
 
 BANDS = ((5, 95, 0.18), (25, 75, 0.35))
@@ -24,8 +24,8 @@ def made(show: Exhibition) -> Made:
     exhibits = show.anchored
     caption = (
         f"Refinement of anchors in scene {show.samples[0].scene}. Left: the way of every anchor "
-        "from its learned start (light) to the last layer (dark, dot), seen from above, with input "
-        "cameras as triangles and Gaussians as pale dots. Right: radius after each layer (of an "
+        "from its learned start (circle) to the last layer (dot), darker by layer, from above, "
+        "with input cameras as triangles and Gaussians as pale dots. Right: radius by layer (of an "
         "ellipsoid the geometric mean of its semi-axes), layer 0 the learned start, and how far "
         "each layer moves an anchor; the line is the median over queries, bands hold 50 % and 90 % "
         f"of them. Units of the models' world.{show.without_anchors}"
@@ -50,7 +50,7 @@ def figure(exhibits: Sequence[Exhibit]) -> Figure:
     """A plan of the ways for each model with anchors; radii and steps of all by layer."""
     with paper_style():
         wide = [1.25] * len(exhibits) + [1.0, 1.0]
-        drawn = new_figure(max(2.2, WIDTH / sum(wide) * 1.2), gap=0.05)
+        drawn = new_figure(max(2.1, WIDTH / sum(wide) * 1.05), gap=0.05)
         *plans, radius, step = drawn.subplots(1, len(wide), width_ratios=wide)
         for number, (axis, shown) in enumerate(zip(plans, exhibits, strict=True)):
             _ways(axis, shown)
@@ -87,5 +87,7 @@ def _ways(axis: Axes, shown: Exhibit) -> None:
         drawn = LineCollection(list(found), array=shade, cmap=LAYER_MAP)
         axis.add_collection(drawn)
         drawn.set(linewidth=0.4, zorder=2, clim=(0, 1))
-    axis.scatter(*places[-1].T, s=3, color="#20242a", linewidths=0, zorder=3)
+    start = {"facecolors": "none", "edgecolors": hex_color(MUTED), "linewidths": 0.4}
+    axis.scatter(*places[0].T, s=4, zorder=3, **start)
+    axis.scatter(*places[-1].T, s=3, color=INK_HEX, linewidths=0, zorder=3)
     axis.set_title(f"{shown.name}: ways of the anchors")
