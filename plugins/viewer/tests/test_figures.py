@@ -1,6 +1,7 @@
 """What the figures draw, in numbers, with small untrained models."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,14 @@ def test_values_far_apart_get_a_logarithmic_scale() -> None:
 
 def test_a_label_is_what_tells_a_scene_from_others() -> None:
     assert dispersion.scene_labels([sample_of(), sample_of((0, 5))]) == ["1–4", "0–5"]
+    for names, labels in (
+        (["test/0001", "test/0012"], ["1", "12"]),
+        (["room1", "room12"], ["room1", "room12"]),
+        (["a_x", "a_y"], ["x", "y"]),
+        (["alone"], ["alone"]),
+    ):
+        samples = [replace(sample_of(), scene=name) for name in names]
+        assert dispersion.scene_labels(samples) == labels
 
 
 def test_anchors_are_shown_layer_by_layer_of_models_that_have_them() -> None:
@@ -210,7 +219,7 @@ def test_curves_are_left_out_in_plain_words() -> None:
         curves.made(show)
     known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0])
     first, other = show.exhibits
-    trained = type(first)(first.name, first.look, first.sample, known)
+    trained = replace(first, curves=known)
     made = curves.made(Exhibition([trained, other], show.samples, show.depths))
     np.testing.assert_array_equal(made.figure.axes[1].lines[0].get_ydata(), known.psnr)
     assert "locus: no history.jsonl" in made.caption

@@ -34,7 +34,7 @@ def test_figures_are_written_and_explained(checkpoint: Path, tmp_path: Path) -> 
     }
     listing = (out / "figures.md").read_text()
     assert "![dispersion](dispersion.png)" in listing
-    assert "on 2 test scenes" in listing
+    assert "on 2 test samples" in listing
     sentence = "small: no history.jsonl beside the checkpoint"
     assert sentence in listing
     assert sentence in done.output

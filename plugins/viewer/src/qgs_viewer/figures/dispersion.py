@@ -1,5 +1,6 @@
 """Figure: how far the Gaussians of a query scatter, scene by scene."""
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -11,20 +12,22 @@ from qgs.data.sampling import Sample
 from qgs.drawing.figures import categorical, hex_color
 from qgs.metrics.dispersion import token_dispersion
 from qgs.model import QueryGaussianModel
-from qgs_viewer.figures.exhibits import Exhibition
+from qgs_viewer.figures.exhibits import Exhibition, sample_name
 from qgs_viewer.figures.paper import Made, new_figure, paper_style
 
 FAR_APART = 20
 """Ratio of the greatest value to the least from which the scale is logarithmic."""
 LONGEST = 40
 """Scenes of which each is named under its bars; of more every n-th."""
+LETTERS = 110
+"""Letters that fit below all bars side by side."""
 
 
 def made(show: Exhibition) -> Made:
     """See `figure`."""
     found = {name: dispersions(model, show.samples) for name, model in show.models.items()}
     caption = (
-        f"Dispersion of queries on {len(show.samples)} test scenes: the distance of Gaussians to "
+        f"Dispersion of queries on {len(show.samples)} test samples: the distance of Gaussians to "
         "the centroid of those of their query, its mean (above; a few far Gaussians rule it) and "
         "its median (below) over all Gaussians of a scene, in units of the models' world; dashed "
         "the mean over scenes. Small where a query stands for one place. Where the values lie far "
@@ -47,13 +50,12 @@ def dispersions(model: QueryGaussianModel, samples: Sequence[Sample]) -> dict[st
 
 
 def scene_labels(samples: Sequence[Sample]) -> list[str]:
-    """Names of the scenes without what all begin with, or the input frames of a single scene."""
-    names = [sample.scene for sample in samples]
-    if len({*names}) == 1:
-        return [f"{min(s.input_frames)}–{max(s.input_frames)}" for s in samples]
-    letters = enumerate(zip(*names, strict=False))
-    shared = next((i for i, found in letters if len({*found}) > 1), 0)
-    return [name[shared:] for name in names]
+    """Names of the samples without the words that all begin with, numbers without zeros."""
+    names = [re.findall(r"[^\s/_-]*[\s/_-]*", sample_name(s, samples)) for s in samples]
+    words = enumerate(zip(*names, strict=False))
+    shared = next((place for place, found in words if len({*found}) > 1), 0)
+    rest = ["".join(name[shared:]) for name in names]
+    return [str(int(name)) for name in rest] if all(map(str.isdecimal, rest)) else rest
 
 
 def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence[str]) -> Figure:
@@ -66,8 +68,9 @@ def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence
             _bars(axis, {name: found[kind] for name, found in values.items()})
             axis.set(ylabel=f"{kind}, world units")
         every = -(-len(labels) // LONGEST)
-        axes[-1].set_xticks(np.arange(len(labels))[::every], labels[::every])
-        axes[-1].set(xlabel="test scene", xlim=(-0.6, len(labels) - 0.4))
+        turned = 90 if sum(map(len, labels[::every])) > LETTERS else 0
+        axes[-1].set_xticks(np.arange(len(labels))[::every], labels[::every], rotation=turned)
+        axes[-1].set(xlabel="test scene, or input frames of one", xlim=(-0.6, len(labels) - 0.4))
     return drawn
 
 

@@ -1,7 +1,7 @@
 """What figures are made of: trained models, each with what it makes of one scene; more scenes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -100,20 +100,20 @@ class Exhibition:
         return f" Not shown: {', '.join(left)}, whose queries have no anchors." if left else ""
 
 
+def sample_name(sample: Sample, among: Sequence[Sample]) -> str:
+    """The scene; with the span of its input frames where others are of the same scene."""
+    if [other.scene for other in among].count(sample.scene) == 1:
+        return sample.scene
+    return f"{sample.scene} {min(sample.input_frames)}–{max(sample.input_frames)}"
+
+
 def exhibit(
     name: str, model: QueryGaussianModel, sample: Sample, curves: Curves | None = None
 ) -> Exhibit:
     """`model`, and what it makes of the inputs of `sample`, on the model's device."""
-    device = next(model.parameters()).device
-    frames = sample.input_frames
-    here = Sample(
-        sample.scene,
-        sample.inputs.to(device),
-        sample.targets.to(device),
-        frames,
-        sample.target_frames,
-        sample.names,
-    )
+    device, frames = next(model.parameters()).device, sample.input_frames
+    inputs, targets = sample.inputs.to(device), sample.targets.to(device)
+    here = replace(sample, inputs=inputs, targets=targets)
     labels = [sample.label(frame) for frame in frames]
     with torch.no_grad():
-        return Exhibit(name, look_inside(model.eval(), here.inputs, labels, frames), here, curves)
+        return Exhibit(name, look_inside(model.eval(), inputs, labels, frames), here, curves)

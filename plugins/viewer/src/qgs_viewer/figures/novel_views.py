@@ -15,7 +15,7 @@ from qgs.drawing.images import DEPTH_MAP, Picture, depth_picture, depth_range, r
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Rendering
-from qgs_viewer.figures.exhibits import Exhibition
+from qgs_viewer.figures.exhibits import Exhibition, sample_name
 from qgs_viewer.figures.paper import (
     WIDTH,
     Made,
@@ -43,9 +43,9 @@ def made(show: Exhibition) -> Made:
     target = first.label(_middle(first.target_frames))
     more = len(first.input_frames) - INPUTS
     caption = (
-        f"Novel views of {len(samples)} scenes ({', '.join(s.scene for s in samples)}), each from "
+        f"Novel views of {', '.join(sample_name(s, samples) for s in samples)}, each from "
         f"{len(first.input_frames)} photos{f', {INPUTS} of them shown' if more > 0 else ''}. Of "
-        f"each scene the middle target is shown (in the first, frame {target}), with PSNR. Depth: "
+        f"each the middle target is shown (in the first, frame {target}), with PSNR. Depth: "
         "light is near, dark is far; each map has the range told in it (2nd to 98th percentile, "
         "units of the models' world); grey is nothing. Error: mean over channels of the absolute "
         "difference from the truth, one scale in all. Pixels as rendered."
@@ -76,6 +76,7 @@ def figure(
         for number, (sample, depth) in enumerate(zip(samples, depths, strict=True)):
             block = np.array(panels[number * len(models) : (number + 1) * len(models)])
             _scene(block, sample, depth, *scenes[number], brightest)
+            row_label(block[0, 0], sample_name(sample, samples))
         for axis, title in zip(panels[0][::-1], TITLES, strict=False):
             axis.set_title(title)
         _scales(scales, brightest)
@@ -137,7 +138,6 @@ def _scene(
         _depth(line[first + 2], rendering.depth[0, 0])
         error = error_map(rendering.rgb[0, 0], truth)
         picture_panel(line[first + 3], error_picture(error, brightest))
-    row_label(block[0, 0], sample.scene)
 
 
 def _depth(axis: Axes, depth: Tensor, words: str = "") -> None:

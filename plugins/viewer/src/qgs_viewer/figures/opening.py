@@ -1,7 +1,6 @@
 """From what a user names to an exhibition: models side by side, on the scenes that judge them."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from qgs.cli import contest, trained
 from qgs.data.domain import Domain, verdict
@@ -42,7 +41,7 @@ def open_exhibition(
     if recipe.views.scale == "auto":
         notes.append(trained.AUTO_SCALE)
     depths = [true_depth(source, sample) for sample in samples]
-    return replace(Exhibition(exhibits, samples, depths, query), notes=notes)
+    return Exhibition(exhibits, samples, depths, query, notes)
 
 
 def _first(samples: Sequence[Sample], scene: str | None) -> list[Sample]:
