@@ -19,6 +19,8 @@ FAR_APART = 20
 """Ratio of the greatest value to the least from which the scale is logarithmic."""
 LONGEST = 40
 """Scenes of which each is named under its bars; of more every n-th."""
+FEWEST = 8
+"""Scenes that there is room for, so that the bars of few are not broad."""
 LETTERS = 110
 """Letters that fit below all bars side by side."""
 
@@ -31,7 +33,8 @@ def made(show: Exhibition) -> Made:
         "the centroid of those of their query, its mean (above; a few far Gaussians rule it) and "
         "its median (below) over all Gaussians of a scene, in units of the models' world; dashed "
         "the mean over scenes. Small where a query stands for one place. Where the values lie far "
-        "apart the scale is logarithmic: then the ends of bars count, not their lengths."
+        "apart the scale is logarithmic: then the ends of bars count, not their lengths. Several "
+        "samples of one scene go by their input frames."
     )
     return Made(figure(found, scene_labels(show.samples)), caption)
 
@@ -68,9 +71,10 @@ def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence
             _bars(axis, {name: found[kind] for name, found in values.items()})
             axis.set(ylabel=f"{kind}, world units")
         every = -(-len(labels) // LONGEST)
+        beside = max(0.1, (FEWEST - len(labels)) / 2)
         turned = 90 if sum(map(len, labels[::every])) > LETTERS else 0
         axes[-1].set_xticks(np.arange(len(labels))[::every], labels[::every], rotation=turned)
-        axes[-1].set(xlabel="test scene, or input frames of one", xlim=(-0.6, len(labels) - 0.4))
+        axes[-1].set(xlabel="test scene", xlim=(-0.5 - beside, len(labels) - 0.5 + beside))
     return drawn
 
 

@@ -28,20 +28,21 @@ def open_exhibition(
     recipe = next(iter(trained.recipes_alike(files, photos).values()))
     source = recipe.build_data()
     samples = _first(evaluation_samples(source, recipe.views, recipe.evaluation), scene)
-    exhibits, found, notes = [], Domain(), []
+    exhibits, found, notes = [], Domain(), dict[str, list[str]]()
     found.see(samples[0].inputs.cameras, samples[0].targets.cameras)
     for name, file in files.items():
         model = load(file, device)
         curves = contest.curves_of(RunFolder(file.parent))
         exhibits.append(exhibit(name, model, samples[0], curves if curves.seconds else None))
         if photos is not None and (said := verdict(model.trained_on or Domain(), found)):
-            notes.append(f"{name}: {said}")
+            notes.setdefault(said, []).append(name)
         if query is not None:
             exhibits[-1].notable(1, exhibits[-1].sample.inputs.cameras, query)
+    told = [f"{', '.join(models)}: {said}." for said, models in notes.items()]
     if recipe.views.scale == "auto":
-        notes.append(trained.AUTO_SCALE)
+        told.append(trained.AUTO_SCALE)
     depths = [true_depth(source, sample) for sample in samples]
-    return Exhibition(exhibits, samples, depths, query, notes)
+    return Exhibition(exhibits, samples, depths, query, told)
 
 
 def _first(samples: Sequence[Sample], scene: str | None) -> list[Sample]:
