@@ -32,13 +32,8 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
 
     Raises as `load` and the data do, and ValueError where the recipes do not judge alike.
     """
-    recipes = {name: load_recipe(file) for name, file in files.items()}
+    recipes, entries = recipes_alike(files, photos), []
     trained = {name: load_domain(file) for name, file in files.items()}
-    if photos is not None:
-        recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
-    (first, other), entries = next(iter(recipes.items())), []
-    for name, recipe in recipes.items():
-        contest.refuse_unequal(name, recipe, first, other, contest.JUDGED)
     for name, recipe in recipes.items():
         model = load(files[name], choose_device(device))
         evaluation = evaluate(model, recipe, trained_on=trained[name])
@@ -48,6 +43,20 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
             contest.entry_of(name, recipe, evaluation, model, about(files[name]), curves)
         )
     return entries
+
+
+def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Recipe]:
+    """The recipes of `files`, of `checkpoints`; with the data at `photos` in place of their own.
+
+    Raises as `load_recipe` and the data do, and ValueError where they do not judge alike.
+    """
+    recipes = {name: load_recipe(file) for name, file in files.items()}
+    if photos is not None:
+        recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
+    first, other = next(iter(recipes.items()))
+    for name, recipe in recipes.items():
+        contest.refuse_unequal(name, recipe, first, other, contest.JUDGED)
+    return recipes
 
 
 def remarks(entries: Sequence[contest.Entry]) -> list[str]:

@@ -179,10 +179,14 @@ def _apart(order: Sequence[int], places_N2: Tensor, count: int) -> list[int]:
 
 
 def query_picture(
-    model: QueryGaussianModel, gaussians: Gaussians, chosen: Sequence[DrawnQuery], cameras: Cameras
+    model: QueryGaussianModel,
+    gaussians: Gaussians,
+    chosen: Sequence[DrawnQuery],
+    cameras: Cameras,
+    background: Tensor | None = None,
 ) -> Picture:
     """The Gaussians of `chosen` in colour with lines to centroids, over a grey scene; (1, 1)."""
-    scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
+    scene = washed(rgb_picture(model.render(gaussians, cameras, background).rgb[0, 0]))
     per_query = gaussians.count // model.queries.count
     members = [range(q.index * per_query, (q.index + 1) * per_query) for q in chosen]
     index = [i for member in members for i in member]

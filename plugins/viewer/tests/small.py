@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from functools import cache
 
 import torch
+from qgs_viewer.figures.exhibits import Exhibit, Exhibition, exhibit
 from qgs_viewer.sources import ModelSource
 from torch import Tensor
 
 from qgs.composer import resolve
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.sampling import Sample, make_sample
 from qgs.geometry.poses import look_at
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
@@ -54,3 +57,22 @@ class Walk(Scene):
 
 def source_of(kind: str) -> ModelSource:
     return ModelSource(model_of(kind), Walk(), VIEWS, (1, 4), f"{kind}: walk")
+
+
+def sample_of(inputs: Sequence[int] = (1, 4)) -> Sample:
+    """The walk as a model sees it: frames 2 and 3 from others."""
+    return make_sample(Walk(), tuple(inputs), (2, 3), VIEWS, mirror=False)
+
+
+@cache
+def exhibit_of(kind: str) -> Exhibit:
+    """Of the small model with refinements that move anchors, as trained ones do."""
+    model, random = deepcopy(model_of(kind)), torch.Generator().manual_seed(2)
+    for parameter in model.refinements.parameters():
+        parameter.data += 0.03 * torch.randn(parameter.shape, generator=random)
+    return exhibit(kind, model, sample_of())
+
+
+def exhibition_of(*kinds: str, query: int | None = None) -> Exhibition:
+    samples = [sample_of(), sample_of((0, 5))]
+    return Exhibition([exhibit_of(kind) for kind in kinds], samples, [None, None], query)

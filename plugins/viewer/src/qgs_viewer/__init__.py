@@ -1,1 +1,1 @@
-"""An interactive scene in the browser: Gaussians, photos, queries and what they read."""
+"""Reconstructions to look at: a scene in the browser with its queries, and figures for papers."""

@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from qgs.analysis.trace import Trace, trace
+from qgs.analysis.trace import LayerTrace, Trace, trace
 from qgs.contracts import AttentionWeights
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
@@ -78,14 +78,20 @@ class Look:
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
         """What a query reads in a layer, (1, h, 1, M); None if it tells nothing, or in layer 0."""
-        if self.inside is None or layer == 0:
-            return None
+        return self._traced(query, layer).cross_attention if self.inside and layer else None
+
+    def self_attention(self, query: int, layer: int) -> AttentionWeights | None:
+        """The queries that a query reads in a layer, (1, h, 1, N); None as for `attention`."""
+        return self._traced(query, layer).self_attention if self.inside and layer else None
+
+    def _traced(self, query: int, layer: int) -> LayerTrace:
+        assert self.inside is not None
         if query not in self._traces:
             model, memory = self.inside.model, self.inside.memory
             with torch.no_grad(), trace(model, queries=[query]) as record:
                 model.predict(memory, self.inside.states[0])
             self._traces[query] = record
-        return self._traces[query].layers[layer].cross_attention
+        return self._traces[query].layers[layer]
 
     def hub(self, query: int, layer: int) -> Tensor:
         """Where lines of a query start, (3,): its support's centre, or its Gaussians' mean."""

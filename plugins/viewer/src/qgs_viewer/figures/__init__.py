@@ -1,0 +1,1 @@
+"""Figures as papers show them: one module each, whose `figure` draws and needs no command."""

@@ -1,0 +1,58 @@
+"""`qgs figures`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from qgs.cli.options import Device
+
+app = typer.Typer(help="Figures for a paper.")
+
+
+@app.command()
+def figures(
+    runs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
+        ),
+    ],
+    photos: Annotated[
+        str | None, typer.Option(help="Folder of photos and cameras; default: the recipe's data.")
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="Scene of the figures of one scene; default: the first.")
+    ] = None,
+    query: Annotated[
+        int | None,
+        typer.Option(min=0, help="Query of the figures of one query; default: a notable one."),
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Make this figure; repeatable.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder; default: figures, figures-2, ...")
+    ] = None,
+    device: Device = "auto",
+) -> None:
+    """Figures of trained models side by side, as PDF and PNG, with figures.md that explains them.
+
+    Gaussians of a query in the whole scene, novel views with depth and error, anchors and supports,
+    cross- and self-attention, dispersion by scene, refinement by layer, training curves.
+    """
+    from qgs.cli.demo import new_folder
+    from qgs.engine.distributed import choose_device
+    from qgs_viewer.figures.gallery import refuse_unknown, write_all
+    from qgs_viewer.figures.opening import open_exhibition
+
+    refuse_unknown(only or ())
+    folder, console = new_folder(out, "figures"), Console()
+    show = open_exhibition(runs, photos, scene, query, choose_device(device))
+    for sentence in show.notes:
+        console.print(sentence, soft_wrap=True, highlight=False, markup=False)
+    for line in write_all(show, folder, only or ()):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,119 @@
+"""What figures are made of: trained models, each with what it makes of one scene; more scenes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from qgs.data.sampling import Sample
+from qgs.drawing.figures import Curves, categorical
+from qgs.drawing.queries import DrawnQuery, notable_queries, rendered_weights
+from qgs.metrics.dispersion import token_dispersion
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Gaussians
+from qgs_viewer.look import Look, look_inside
+
+
+class NothingToShowError(ValueError):
+    """A figure that these models have nothing for; the message says why."""
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A model by name, and its look at the inputs of `sample`, in the model's own world.
+
+    curves: of its training, where known.
+    """
+
+    name: str
+    look: Look
+    sample: Sample
+    curves: Curves | None = None
+
+    @property
+    def model(self) -> QueryGaussianModel:
+        """The model."""
+        assert self.look.inside is not None
+        return self.look.inside.model
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """What it makes of the inputs."""
+        return self.look.gaussians
+
+    @property
+    def dispersions(self) -> Tensor:
+        """Mean distance of each query's Gaussians to their centroid, (N,), model's units."""
+        each = self.gaussians.count // self.look.queries
+        return token_dispersion(self.gaussians.means, each)[0].view(-1, each).mean(1).cpu()
+
+    def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
+        """`query`, or the `count` most notable ones in the first of cameras (1, V).
+
+        Raises ValueError for a query that does not exist.
+        """
+        if query is None:
+            return notable_queries(self.model, self.gaussians, cameras, count)
+        if not 0 <= query < self.look.queries:
+            last = self.look.queries - 1
+            raise ValueError(f"{self.name} has no query {query}; its queries are 0 to {last}")
+        members = self.look.members(query)
+        weights = rendered_weights(self.model, self.gaussians, cameras)[0, members]
+        spread = float(self.dispersions[query])
+        return [DrawnQuery(query, categorical(0), float(weights.sum()), spread)]
+
+
+@dataclass(frozen=True)
+class Exhibition:
+    """Models on the same scenes; the exhibits look at the first of `samples`.
+
+    depths: for each sample the true depth (T, 1, H, W) of its targets in the models' units, where
+    known. query: the one that figures of single queries show; None lets each model's most notable
+    ones be chosen. notes: what is to be said of models and scenes.
+    """
+
+    exhibits: Sequence[Exhibit]
+    samples: Sequence[Sample]
+    depths: Sequence[Tensor | None]
+    query: int | None = None
+    notes: Sequence[str] = ()
+
+    @property
+    def models(self) -> Mapping[str, QueryGaussianModel]:
+        """The models by name."""
+        return {exhibit.name: exhibit.model for exhibit in self.exhibits}
+
+    @property
+    def anchored(self) -> Sequence[Exhibit]:
+        """The exhibits whose queries have a place. Raises NothingToShowError if there is none."""
+        found = [e for e in self.exhibits if e.look.support(0) is not None]
+        if not found:
+            names = ", ".join(self.models)
+            raise NothingToShowError(f"{names}: the queries have no anchors, so none are shown")
+        return found
+
+    @property
+    def without_anchors(self) -> str:
+        """The models that `anchored` leaves out, as a sentence; "" for none."""
+        left = [e.name for e in self.exhibits if e.look.support(0) is None]
+        return f" Not shown: {', '.join(left)}, whose queries have no anchors." if left else ""
+
+
+def sample_name(sample: Sample, among: Sequence[Sample]) -> str:
+    """The scene; with the span of its input frames where others are of the same scene."""
+    if [other.scene for other in among].count(sample.scene) == 1:
+        return sample.scene
+    return f"{sample.scene} {min(sample.input_frames)}–{max(sample.input_frames)}"
+
+
+def exhibit(
+    name: str, model: QueryGaussianModel, sample: Sample, curves: Curves | None = None
+) -> Exhibit:
+    """`model`, and what it makes of the inputs of `sample`, on the model's device."""
+    device, frames = next(model.parameters()).device, sample.input_frames
+    inputs, targets = sample.inputs.to(device), sample.targets.to(device)
+    here = replace(sample, inputs=inputs, targets=targets)
+    labels = [sample.label(frame) for frame in frames]
+    with torch.no_grad():
+        return Exhibit(name, look_inside(model.eval(), inputs, labels, frames), here, curves)

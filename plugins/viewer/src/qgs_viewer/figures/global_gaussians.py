@@ -1,0 +1,96 @@
+"""Figure: a whole scene from outside, and in it all Gaussians of one query."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from qgs.drawing.images import rgb_picture
+from qgs.drawing.queries import DrawnQuery, query_picture
+from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.types import Cameras
+from qgs_viewer.figures.exhibits import Exhibit, Exhibition
+from qgs_viewer.figures.overview import overview, seen_points
+from qgs_viewer.figures.paper import (
+    INK_HEX,
+    SIDE,
+    WIDTH,
+    Made,
+    new_figure,
+    paper_style,
+    picture_panel,
+    row_label,
+    tag,
+)
+from qgs_viewer.placement import corners, on_photo
+
+SHAPE = (3, 4)
+"""Height to width of a panel."""
+FRUSTUM = 0.12
+"""Length of a drawn input camera, of the median distance to what it sees."""
+
+
+def made(show: Exhibition) -> Made:
+    """See `figure`."""
+    chosen = drawn_queries(show.exhibits, show.query)
+    told = [
+        f"{name}: query {query.index}, whose Gaussians lie {query.spread:.3g} from their centroid "
+        "in the mean"
+        for name, query in chosen.items()
+    ]
+    why = "The one that was asked for" if show.query is not None else "The heaviest one well inside"
+    caption = (
+        f"Scene {show.samples[0].scene} from outside, behind and above the input cameras (drawn as "
+        "frusta), framed anew for each model. Left all Gaussians; right those of one query in "
+        "colour, at no less than half opacity, with lines to their centroid, over the scene in "
+        f"pale grey. {why}{' the first target view' * (show.query is None)} is shown. "
+        f"{'; '.join(told)}. Lines that leave the panel lead to Gaussians outside it."
+    )
+    return Made(figure(show.exhibits, chosen), caption)
+
+
+def drawn_queries(exhibits: Sequence[Exhibit], query: int | None) -> dict[str, DrawnQuery]:
+    """Of each model by name `query`, or the most notable one of the first target view."""
+    return {e.name: e.notable(1, e.sample.targets.cameras[:, :1], query)[0] for e in exhibits}
+
+
+@torch.no_grad()
+def figure(exhibits: Sequence[Exhibit], chosen: Mapping[str, DrawnQuery]) -> Figure:
+    """A row for each model, from outside what it made: the scene, the Gaussians of its query."""
+    with paper_style():
+        each = (WIDTH - 0.2) / 2 * SHAPE[0] / SHAPE[1]
+        drawn = new_figure(each * len(exhibits) + 0.25)
+        axes = drawn.subplots(len(exhibits), 2, squeeze=False)
+        for line, shown in zip(axes, exhibits, strict=True):
+            _row(line, shown, chosen[shown.name])
+        axes[0, 0].set_title("all Gaussians, seen from outside")
+        axes[0, 1].set_title("Gaussians of one query")
+    return drawn
+
+
+def _row(axes: Sequence[Axes], shown: Exhibit, query: DrawnQuery) -> None:
+    model, gaussians, inputs = shown.model, shown.gaussians, shown.sample.inputs.cameras
+    points = seen_points(model, gaussians, inputs)
+    camera = overview(inputs, points, (SIDE * SHAPE[0] // SHAPE[1], SIDE))
+    length = FRUSTUM * float((points - inputs.c2w[0, 0, :3, 3]).norm(dim=-1).median())
+    white = torch.ones(3)
+    picture_panel(axes[0], rgb_picture(model.render(gaussians, camera, white).rgb[0, 0]))
+    picture_panel(axes[1], query_picture(model, gaussians, [query], camera, white))
+    tag(axes[1], f"query {query.index}: mean distance to centroid {query.spread:.3g}")
+    row_label(axes[0], shown.name)
+    for axis in axes:
+        _frusta(axis, inputs, camera, length)
+
+
+def _frusta(axis: Axes, inputs: Cameras, camera: Cameras, length: float) -> None:
+    """Input cameras as wire frames of `length`, seen by `camera`."""
+    flat = Cameras(inputs.c2w[0], inputs.intrinsics[0], inputs.size)
+    rims = on_photo(flat, corners(inputs.size), length)
+    for eye, rim in zip(flat.c2w[:, :3, 3], rims, strict=True):
+        local = to_camera(torch.cat([eye[None], rim.to(eye)])[None], camera)[0, 0]
+        apex, *ring = to_pixels(local, camera.intrinsics[0, 0]).cpu().numpy() - 0.5
+        for one, other in zip(ring, [*ring[1:], ring[0]], strict=True):
+            for line in ((one, other), (apex, one)):
+                x, y = zip(*line, strict=True)
+                axis.plot(x, y, color=INK_HEX, linewidth=0.7, scalex=False, scaley=False)

@@ -1,0 +1,99 @@
+"""The look of figures in papers: sizes, type, pictures as panels, and how they are written."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from qgs.drawing.figures import INK, figure_style, hex_color
+from qgs.drawing.images import Picture
+from qgs.io.files import replacing
+
+WIDTH = 7.0
+"""Inches of a figure across a page of two columns."""
+DPI = 220
+SIDE = 512
+"""Pixels on the longer side of pictures that models render for a panel."""
+INK_HEX = hex_color(INK)
+
+
+@dataclass(frozen=True)
+class Made:
+    """A figure with its caption, in plain sentences."""
+
+    figure: Figure
+    caption: str
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Matplotlib settings while a figure is drawn and while it is written."""
+    sizes: dict[Any, Any] = {
+        "font.size": 8,
+        "axes.titlesize": 8,
+        "axes.labelsize": 8,
+        "xtick.labelsize": 7,
+        "ytick.labelsize": 7,
+        "legend.fontsize": 7.5,
+        "axes.linewidth": 0.6,
+        "lines.linewidth": 1.2,
+        "pdf.fonttype": 42,
+    }
+    with figure_style(), rc_context(sizes):
+        yield
+
+
+def new_figure(height: float, gap: float = 0.02, width: float = WIDTH) -> Figure:
+    """An empty figure, inches, whose panels stand `gap` inches apart at least."""
+    figure = Figure(figsize=(width, height))
+    figure.set_layout_engine(ConstrainedLayoutEngine(w_pad=gap, h_pad=gap, wspace=0, hspace=0))
+    return figure
+
+
+def picture_panel(axis: Axes, picture: Picture, title: str = "") -> None:
+    """A picture without frame and ticks, its pixels as they are."""
+    axis.imshow(picture, interpolation="nearest", aspect="equal")
+    blank_panel(axis)
+    if title:
+        axis.set_title(title, pad=2.5)
+
+
+def blank_panel(axis: Axes) -> None:
+    """A panel without frame, ticks and grid."""
+    axis.set(xticks=[], yticks=[])
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
+    axis.patch.set_visible(False)
+
+
+def row_label(axis: Axes, text: str) -> None:
+    """What a row of panels shows, at its left."""
+    axis.set_ylabel(text, labelpad=2.5)
+
+
+def tag(axis: Axes, text: str) -> None:
+    """A few words in the lower left corner of a picture."""
+    box = {"facecolor": INK_HEX, "alpha": 0.65, "edgecolor": "none", "pad": 1.5}
+    place = {"transform": axis.transAxes, "ha": "left", "va": "bottom"}
+    axis.text(0.03, 0.03, text, color="white", fontsize=6.5, bbox=box, **place)
+
+
+def write_figure(figure: Figure, folder: Path, name: str) -> None:
+    """NAME.pdf with text as text, and NAME.png; the same figure gives the same bytes."""
+    settings: dict[str, dict[str, Any]] = {
+        "pdf": {"metadata": {"CreationDate": None}},
+        "png": {},
+    }
+    for kind, more in settings.items():
+        buffer = BytesIO()
+        with paper_style():
+            figure.savefig(buffer, format=kind, dpi=DPI, **more)
+        with replacing(folder / f"{name}.{kind}") as temporary:
+            temporary.write_bytes(buffer.getvalue())

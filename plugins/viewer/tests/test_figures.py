@@ -1,0 +1,247 @@
+"""What the figures draw, in numbers, with small untrained models."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from PIL import Image
+from qgs_viewer.figures import (
+    anchors,
+    attention,
+    curves,
+    dispersion,
+    global_gaussians,
+    graph,
+    novel_views,
+    refinement,
+)
+from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
+from qgs_viewer.figures.layers import chosen_layers
+from qgs_viewer.figures.overview import overview, seen_points
+from qgs_viewer.figures.paper import DPI, WIDTH, new_figure, write_figure
+from qgs_viewer.figures.plan import plan_of
+from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
+
+import qgs
+from qgs.contracts import MetricInput
+from qgs.drawing.figures import Curves
+from qgs.drawing.images import rgb_picture
+from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.metrics import Dispersion
+
+PAIR = ("tokengs", "locus")
+
+
+def pictures(axes: list[Axes]) -> list[np.ndarray]:
+    """What the panels show that show a picture."""
+    return [np.asarray(axis.images[0].get_array()) for axis in axes if axis.images]
+
+
+def words(axes: list[Axes]) -> list[str]:
+    return [text.get_text() for axis in axes for text in axis.texts]
+
+
+def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
+    show = exhibition_of(*PAIR)
+    axes = novel_views.made(show).figure.axes
+    sample, model = show.samples[0], exhibit_of("locus").model
+    with torch.no_grad():
+        camera = sample.targets.cameras[:, 1:2]
+        image = model.render(model(sample.inputs).gaussians, camera).rgb[0, 0]
+    truth = sample.targets.images[0, 1]
+    score = -10 * math.log10(float((image.clamp(0, 1) - truth).square().mean()))
+    assert f"{score:.2f} dB" in words(axes)
+    shown = pictures(axes)
+    error = (image - truth).abs().mean(0)
+    for expected in (truth, image, sample.inputs.images[0, 1]):
+        assert any(np.array_equal(rgb_picture(expected), found) for found in shown)
+    torch.testing.assert_close(novel_views.error_map(image, truth), error)
+
+
+def test_an_error_is_bright_where_it_is_great() -> None:
+    error = torch.tensor([[0.0, 0.1, 0.2, 0.4]])
+    lightness = novel_views.error_picture(error, 0.2).sum(-1)[0]
+    assert lightness[0] < lightness[1] < lightness[2] == lightness[3]
+
+
+def test_bars_are_the_metric_of_each_scene() -> None:
+    show = exhibition_of(*PAIR)
+    (mean, median) = dispersion.made(show).figure.axes
+    metric = Dispersion(Dispersion.Config())
+    for number, model in enumerate(show.models.values()):
+        for axis, name in ((mean, "mean"), (median, "median")):
+            expected = []
+            for sample in show.samples:
+                with torch.no_grad():
+                    gaussians = model(sample.inputs).gaussians
+                each, views = gaussians.count // QUERIES, sample.targets
+                given = MetricInput(views.images, views, gaussians, each)
+                expected.append(float(metric(given)[name].mean()))
+            bars = axis.containers[number]
+            np.testing.assert_allclose([b.get_height() for b in bars], expected, rtol=1e-5)
+            line = axis.lines[number].get_ydata()
+            np.testing.assert_allclose(line, np.mean(expected), rtol=1e-5)
+
+
+def test_values_far_apart_get_a_logarithmic_scale() -> None:
+    near, far = ({"a": {"mean": [1.0, 2.0]}, "b": {"mean": [high, 3.0]}} for high in (5.0, 500.0))
+    scales = [dispersion.figure(found, ["x", "y"]).axes[0].get_yscale() for found in (near, far)]
+    assert scales == ["linear", "log"]
+
+
+def test_a_label_is_what_tells_a_scene_from_others() -> None:
+    assert dispersion.scene_labels([sample_of(), sample_of((0, 5))]) == ["1–4", "0–5"]
+    for names, labels in (
+        (["test/0001", "test/0012"], ["1", "12"]),
+        (["room1", "room12"], ["room1", "room12"]),
+        (["a_x", "a_y"], ["x", "y"]),
+        (["alone"], ["alone"]),
+    ):
+        samples = [replace(sample_of(), scene=name) for name in names]
+        assert dispersion.scene_labels(samples) == labels
+
+
+def test_anchors_are_shown_layer_by_layer_of_models_that_have_them() -> None:
+    made = anchors.made(exhibition_of(*PAIR))
+    axes = made.figure.axes
+    layers = chosen_layers(exhibit_of("locus").look.depth, anchors.LAYERS, 0)
+    titles = [axis.get_title(loc="left") for axis in axes]
+    assert titles == ["learned start", *(f"after layer {n}" for n in layers[1:]), titles[-1]]
+    assert "Not shown: tokengs" in made.caption
+    assert len(pictures(axes)) == len(axes) == len(layers) + 1
+    with pytest.raises(NothingToShowError, match="tokengs: the queries have no anchors"):
+        anchors.made(exhibition_of("tokengs"))
+
+
+def test_attention_is_that_of_a_trace_and_its_anchor_lies_where_it_was() -> None:
+    shown, (query, layer) = exhibit_of("locus"), (5, 2)
+    with torch.no_grad(), qgs.trace(shown.model, [layer], [query]) as record:
+        shown.model(shown.sample.inputs)
+    traced = record.layers[layer].cross_attention
+    assert traced is not None
+    assert record.grid is not None
+    for part in attention.PARTS:
+        found = attention.part_maps(shown, shown.look.attention(query, layer), part)
+        expected = getattr(traced, part)[0, :, 0].mean(0).view(record.grid)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    axes = attention.made(exhibition_of(*PAIR, query=query)).figure.axes
+    assert words(axes) == ["none"] * len(chosen_layers(shown.look.depth, attention.LAYERS))
+    dots = [line for axis in axes for line in axis.lines if line.get_marker() == "o"]
+    drawn = np.array([np.concatenate([d.get_xdata(), d.get_ydata()]) for d in dots])
+    camera = shown.sample.inputs.cameras[:, :1].to(torch.float64)
+    for chosen in chosen_layers(shown.look.depth, attention.LAYERS):
+        support = shown.look.support(chosen - 1)
+        assert support is not None
+        local = to_camera(support.centers[:, [query]], camera)[0, 0]
+        pixel = to_pixels(local, camera.intrinsics[0, 0])[0] * attention.PHOTO / SIDE - 0.5
+        there = (np.abs(drawn - pixel.numpy()) < 1e-2).all(1)
+        assert there.sum() == len(attention.PARTS)
+
+
+@pytest.mark.parametrize("kind", PAIR)
+def test_edges_lead_to_the_queries_that_are_read_most(kind: str) -> None:
+    shown, (query, layer) = exhibit_of(kind), (5, exhibit_of(kind).look.depth)
+    with torch.no_grad(), qgs.trace(shown.model, [layer], [query]) as record:
+        shown.model(shown.sample.inputs)
+    traced = record.layers[layer].self_attention
+    assert traced is not None
+    shares = traced.weights[0, :, 0].mean(0)
+    order = [i for i in shares.argsort(descending=True).tolist() if i != query][: graph.EDGES]
+    found, relative = graph.strongest_edges(shown, query, layer, "weights")
+    assert found.tolist() == order
+    torch.testing.assert_close(relative, shares[order] / shares[order[0]], rtol=1e-4, atol=1e-6)
+    axis = graph.made(exhibition_of(kind, query=query)).figure.axes[-1]
+    (edges,) = (c for c in axis.collections if isinstance(c, LineCollection))
+    nodes = graph.nodes_of(shown, layer)
+    places = plan_of(shown, graph.nodes_of(shown, shown.look.depth)).of(nodes).numpy()
+    expected = [[places[query], places[other]] for other in order]
+    np.testing.assert_allclose(edges.get_segments(), expected, atol=1e-9)
+
+
+def test_nodes_are_anchors_or_amid_the_gaussians_that_are_seen() -> None:
+    anchored, plain = exhibit_of("locus"), exhibit_of("tokengs")
+    support = anchored.look.support(1)
+    assert support is not None
+    torch.testing.assert_close(graph.nodes_of(anchored, 2), support.centers[0])
+    members = plain.gaussians.means[0].view(QUERIES, -1, 3).double()
+    nodes = graph.nodes_of(plain, 2)
+    assert ((nodes >= members.amin(1) - 1e-9) & (nodes <= members.amax(1) + 1e-9)).all()
+
+
+@pytest.mark.parametrize("kind", ["locus", "ellipsoid"])
+def test_radii_and_steps_are_those_of_the_states(kind: str) -> None:
+    shown = exhibit_of(kind)
+    for layer, found in enumerate(refinement.radii(shown)):
+        support = shown.look.support(layer)
+        assert support is not None
+        expected = support.axes[0].norm(dim=-2).prod(-1) ** (1 / 3)
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+    _, radius, step = refinement.made(exhibition_of("tokengs", kind)).figure.axes
+    np.testing.assert_allclose(
+        radius.lines[0].get_ydata(), np.median(refinement.radii(shown), 1), rtol=1e-6
+    )
+    first = (refinement.ways(shown)[1] - refinement.ways(shown)[0]).norm(dim=-1)
+    assert step.lines[0].get_ydata()[0] == pytest.approx(float(first.quantile(0.5)), rel=1e-6)
+
+
+def test_the_overview_stands_behind_and_above_and_sees_the_scene() -> None:
+    shown, inputs = exhibit_of("locus"), sample_of().inputs.cameras
+    points = seen_points(shown.model, shown.gaussians, inputs)
+    camera = overview(inputs, points, (300, 400))
+    local = to_camera(points[None], camera)[0, 0]
+    pixels = to_pixels(local, camera.intrinsics[0, 0])
+    inside = ((pixels > 0) & (pixels < torch.tensor([400, 300]))).all(-1) & (local[:, 2] > 0)
+    assert inside.float().mean() > 0.85
+    eye = to_camera(camera.c2w[:, 0, :3, 3][None].view(1, 1, 3), inputs)[0, :, 0]
+    assert (eye[:, 1] < 0).all()
+    assert (eye[:, 2] < 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gaussians_of_the_query_that_was_asked_for(kind: str) -> None:
+    made = global_gaussians.made(exhibition_of(kind, query=7))
+    means = exhibit_of(kind).gaussians.means[0].view(QUERIES, -1, 3)[7]
+    distance = float((means - means.mean(0)).norm(dim=-1).mean())
+    said = f"query 7: mean distance to centroid {distance:.3g}"
+    assert said in words(made.figure.axes)
+    with pytest.raises(ValueError, match=f"{kind} has no query {QUERIES}; its queries are 0 to"):
+        global_gaussians.made(exhibition_of(kind, query=QUERIES))
+
+
+def test_curves_are_left_out_in_plain_words() -> None:
+    show = exhibition_of(*PAIR)
+    with pytest.raises(NothingToShowError, match=r"tokengs, locus: no history\.jsonl"):
+        curves.made(show)
+    known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0])
+    first, other = show.exhibits
+    trained = replace(first, curves=known)
+    made = curves.made(Exhibition([trained, other], show.samples, show.depths))
+    np.testing.assert_array_equal(made.figure.axes[1].lines[0].get_ydata(), known.psnr)
+    assert "locus: no history.jsonl" in made.caption
+
+
+@pytest.mark.parametrize(
+    ("depth", "most", "first", "expected"),
+    [(12, 3, 1, [1, 7, 12]), (4, 4, 0, [0, 1, 3, 4]), (1, 3, 1, [1]), (2, 3, 1, [1, 2])],
+)
+def test_layers_are_spread_ends_included(
+    depth: int, most: int, first: int, expected: list[int]
+) -> None:
+    assert chosen_layers(depth, most, first) == expected
+
+
+def test_files_are_of_the_width_of_a_page_with_text_and_the_same_each_time(tmp_path: Path) -> None:
+    figure = new_figure(1.0)
+    figure.subplots().set_title("a title")
+    for name in ("a", "b"):
+        write_figure(figure, tmp_path, name)
+    for kind in ("pdf", "png"):
+        assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+    assert b"/FontFile2" in (tmp_path / "a.pdf").read_bytes()
+    assert b"/Type3" not in (tmp_path / "a.pdf").read_bytes()
+    assert Image.open(tmp_path / "a.png").width == round(WIDTH * DPI)

@@ -1,0 +1,79 @@
+"""`qgs figures`, on a small model with rooms of its own, and on the models in the box."""
+
+from pathlib import Path
+
+import pytest
+from commands import run_qgs
+from PIL import Image
+from qgs_viewer.figures.gallery import FIGURES
+
+import qgs
+from qgs.composer import resolve
+
+SMALL = ["model.queries.count=12", "model.decoder.depth=2", "model.supervision.layers=[1,2]"]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained LocusGS with two test rooms."""
+    file = tmp_path_factory.mktemp("model") / "small.safetensors"
+    data = ["data.test_scenes=2", "evaluation.scenes=2"]
+    qgs.save(resolve("recipes/tiny/locus.yaml", [*SMALL, *data]).build_model(), file)
+    return file
+
+
+def test_figures_are_written_and_explained(checkpoint: Path, tmp_path: Path) -> None:
+    out = tmp_path / "figures"
+    only = [word for name in ("dispersion", "curves") for word in ("--only", name)]
+    done = run_qgs("figures", checkpoint, "--out", out, "--device", "cpu", *only)
+    assert done.exit_code == 0, done.output
+    assert {file.name for file in out.iterdir()} == {
+        "dispersion.pdf",
+        "dispersion.png",
+        "figures.md",
+    }
+    listing = (out / "figures.md").read_text()
+    assert "![dispersion](dispersion.png)" in listing
+    assert "on 2 test samples" in listing
+    sentence = "small: no history.jsonl beside the checkpoint"
+    assert sentence in listing
+    assert sentence in done.output
+    again = run_qgs("figures", checkpoint, "--out", out)
+    assert "is not empty; choose another --out" in str(again.exception)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--only", "nothing"], "--only: no figure nothing; there are global_gaussians"),
+        (["--scene", "kitchen"], "--scene: 'kitchen' is not judged; scenes are test/000000"),
+        (["--query", "12"], "small has no query 12; its queries are 0 to 11"),
+    ],
+)
+def test_what_there_is_not_is_told(
+    checkpoint: Path, tmp_path: Path, options: list[str], said: str
+) -> None:
+    done = run_qgs("figures", checkpoint, "--out", tmp_path / "out", *options)
+    assert isinstance(done.exception, ValueError)
+    assert said in str(done.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_scene_that_was_asked_for_comes_first(checkpoint: Path) -> None:
+    from qgs_viewer.figures.opening import open_exhibition
+
+    show = open_exhibition([str(checkpoint)], scene="test/000001")
+    assert [sample.scene for sample in show.samples] == ["test/000001", "test/000000"]
+    assert show.exhibits[0].sample.scene == "test/000001"
+
+
+@pytest.mark.slow
+def test_all_figures_of_the_models_in_the_box(tmp_path: Path) -> None:
+    done = run_qgs("figures", "rooms/tokengs-64", "rooms/locus-64", "--out", tmp_path / "figures")
+    assert done.exit_code == 0, done.output
+    made = {file.stem for file in (tmp_path / "figures").glob("*.pdf")}
+    assert made == {*FIGURES} - {"curves"}
+    for name in made:
+        pixels = Image.open(tmp_path / "figures" / f"{name}.png").convert("L")
+        assert pixels.width > 1400
+        assert len(set(pixels.resize((64, 64)).tobytes())) > 20
