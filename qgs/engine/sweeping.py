@@ -25,7 +25,8 @@ _OPACITY, _PIXELS = 0.5, 2.0  # of the Gaussians; their standard deviation in pi
 def swept(views: Views, count: int, size: float, generator: torch.Generator) -> Gaussians:
     """Gaussians (1, count) at pixels drawn from the photos `views` (1, V), of their colours.
 
-    size: about the distance of the scene from the cameras. With one photo all get this depth.
+    size: about the distance of the scene from the cameras, and the depth of a pixel that no other
+    photo shows.
     """
     (height, width), device = views.cameras.size, views.images.device
     of_photo = height * width
@@ -85,7 +86,7 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
         found = F.grid_sample(
             views.images[:, other], at.flatten(0, 1)[None], "bilinear", "border", False
         )
-        odd = (found.view(*own.shape, -1) - own[..., None]).abs().mean(0).clamp_max(_MOST_ODD)
+        odd = (found.view(*own.shape, _DEPTHS) - own[..., None]).abs().mean(0).clamp_max(_MOST_ODD)
         costs.append(torch.where(seen, odd, _MOST_ODD / 2).mean(1))
     best = torch.stack(costs).topk((len(costs) + 1) // 2, 0, largest=False).values.mean(0)
     return tried[(best + _NO_EVIDENCE * logs.abs()).argmin(-1)]
