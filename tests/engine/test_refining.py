@@ -18,7 +18,9 @@ from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
-RATES = dict.fromkeys(("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2)
+RATES: dict[str, float] = dict.fromkeys(
+    ("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2
+)
 
 
 @pytest.fixture(autouse=True)
