@@ -1,4 +1,9 @@
-"""Refinement: Gaussians of one scene, optimised on its photos as 3D Gaussian splatting does."""
+"""Refinement: Gaussians of one scene, optimised on its photos as 3D Gaussian splatting does.
+
+Half of them make room for Gaussians on what the photos show, whose depth is found by matching. A
+model that does not know such scenes puts things where there is nothing, and nothing where there are
+things; steps of an optimiser are too short to bring them there.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,6 +17,7 @@ from torch import Tensor, nn
 
 from qgs.engine.distributed import StopRequest, stop_requests
 from qgs.engine.growth import Leaves, refuse_too_many
+from qgs.engine.sweeping import swept
 from qgs.engine.tracking import TrainingProgress
 from qgs.losses.photometric import mean_squared_error, mean_ssim
 from qgs.metrics.images import psnr
@@ -68,10 +74,11 @@ def refine(
 
     seconds: of optimisation, counted after the first step, in which kernels compile. count:
     Gaussians wanted at the end, as many as given by default; more grow within the first part of the
-    time, of fewer the most opaque are kept. compared: photos (1, W) for the curve, never optimised
-    on. renderer: `qgs/auto` by default. console: where progress is shown; nowhere by default.
-    The first Ctrl-C finishes the step and returns what there is. Any world will do: its size is
-    measured by the distance of the Gaussians from the cameras.
+    time. Half of those at the start are the most opaque of the given ones; the others stand where
+    the photos agree, and finding them counts. compared: photos (1, W) for the curve, never
+    optimised on. renderer: `qgs/auto` by default. console: where progress is shown; nowhere by
+    default. The first Ctrl-C finishes the step and returns what there is. Any world will do: its
+    size is measured by the distance of the Gaussians from the cameras.
 
     Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite;
     TooLargeError for more of them than memory holds.
@@ -95,26 +102,29 @@ class _Run:
     def __init__(
         self, gaussians: Gaussians, views: Views, seconds: float, wanted: int, renderer: nn.Module
     ) -> None:
-        self.renderer, self.wanted = renderer, wanted
-        if wanted < gaussians.count:
-            gaussians = gaussians.most_opaque(wanted)
-        self.start, eyes = gaussians.count, views.cameras.c2w[0, :, :3, 3]
-        distances = torch.cdist(gaussians.means[0], eyes)
-        self.size = float(distances.median().clamp_min(1e-6))  # of the scene, in its units
-        self.rates = {**_RATES, "means": _RATES["means"] * self.size}
-        self.leaves = Leaves(gaussians, self.rates)
+        self.renderer, self.wanted, self.given = renderer, wanted, gaussians
+        self.generator, began = torch.Generator().manual_seed(0), perf_counter()
         side = min(views.cameras.size)
         levels = [level for level in _LEVELS if level[0] == 1 or side // level[0] >= _LEAST_SIDE]
         self.levels = [(resized(views, part), end) for part, end in levels]
-        self.seconds, self.step, self.spent, self.grown = seconds, 0, 0.0, 0
-        self.generator = torch.Generator().manual_seed(0)
+        self.start = min(wanted, gaussians.count)
+        gaussians = half_swept(gaussians, self.levels[0][0], self.start, self.generator)
+        self.size = distance(gaussians, views)
+        self.rates = {**_RATES, "means": _RATES["means"] * self.size}
+        self.leaves = Leaves(gaussians, self.rates)
+        self.seconds, self.step, self.grown = seconds, 0, 0
+        self.spent = perf_counter() - began
         self.order: list[int] = []
 
     def curve(
         self, compared: Views | None, progress: TrainingProgress, stop: StopRequest
     ) -> Iterator[CurvePoint]:
         """Optimise until the time is used or a stop is asked for; points of the curve between."""
-        due = 0.0
+        if compared is not None:
+            yield CurvePoint(
+                0.0, 0, self.given.count, mean_psnr(self.given, compared, self.renderer)
+            )
+        due = self.seconds / _POINTS
         while self.spent < self.seconds and not stop:
             if compared is not None and self.spent >= due:
                 due = (self.spent // (self.seconds / _POINTS) + 1) * self.seconds / _POINTS
@@ -165,6 +175,28 @@ class _Run:
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
             self.leaves.grow(now, self.generator)
+
+
+def half_swept(
+    gaussians: Gaussians, views: Views, count: int, generator: torch.Generator
+) -> Gaussians:
+    """The most opaque Gaussians (1, G), half of `count`, and as many where the photos agree.
+
+    With one photo, which agrees with none, `count` of the most opaque.
+    """
+    new = count // 2 if views.images.shape[1] > 1 else 0
+    kept = gaussians.most_opaque(count - new)
+    if not new:
+        return kept
+    others = swept(views, new, distance(gaussians, views), generator)
+    pairs = zip(vars(kept).values(), vars(others).values(), strict=True)
+    return Gaussians(*(torch.cat(pair, 1) for pair in pairs))
+
+
+def distance(gaussians: Gaussians, views: Views) -> float:
+    """Median distance of Gaussians (1, G) from the cameras of `views` (1, V), above 0."""
+    distances = torch.cdist(gaussians.means[0], views.cameras.c2w[0, :, :3, 3])
+    return float(distances.median().clamp_min(1e-6))
 
 
 def resized(views: Views, part: int) -> Views:

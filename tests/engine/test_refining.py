@@ -18,7 +18,9 @@ from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
-RATES = dict.fromkeys(("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2)
+RATES: dict[str, float] = dict.fromkeys(
+    ("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2
+)
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +71,7 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene: tuple[Views, Vie
     photos, compared = scene
     start = cloud(40, seed=1)
     result = qgs.refine(start, photos, 150, compared=compared)
-    assert result.steps == 151  # the first one, in which kernels compile, is not counted
+    assert result.steps == 150  # the first, in which kernels compile, is not counted; the sweep is
     assert result.curve[0].psnr == pytest.approx(mean_psnr(start, compared, RENDERER), abs=0.3)
     assert result.curve[-1].psnr > result.curve[0].psnr + 6
     final = mean_psnr(result.gaussians, compared, RENDERER)
@@ -94,9 +96,9 @@ def test_there_are_as_many_as_wanted(scene: tuple[Views, Views], wanted: int) ->
     result = qgs.refine(start, scene[0], 200, count=wanted)
     assert result.gaussians.count == wanted
     if wanted < 30:
-        two_steps = qgs.refine(start, scene[0], 1e-9, count=wanted).gaussians.opacities
-        kept = start.opacities.topk(wanted).values
-        torch.testing.assert_close(two_steps, kept, atol=0.06, rtol=0)
+        two_steps = qgs.refine(start, scene[0], 1.5, count=wanted).gaussians.opacities
+        kept = start.opacities.topk(wanted // 2).values
+        torch.testing.assert_close(two_steps[:, : wanted // 2], kept, atol=0.06, rtol=0)
 
 
 def test_an_interrupt_keeps_what_there_is(
@@ -105,7 +107,7 @@ def test_an_interrupt_keeps_what_there_is(
     clock(lambda now: os.kill(os.getpid(), signal.SIGINT) if now == 11 else None)
     result = qgs.refine(cloud(30), scene[0], 1000)
     assert result.stopped_by == "SIGINT"
-    assert result.steps == 7  # that of the twelfth reading is finished
+    assert result.steps == 6  # that of the twelfth reading is finished
     assert result.gaussians.count == 30
 
 

@@ -32,7 +32,7 @@ Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in fe
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation | rendering
 Objective (both papers): photometric | visibility | visibility of anchors | over layers |
     weight decay | schedule | token tuning | refinement |
-    splitting a Gaussian | growing queries
+    depth of a pixel | splitting a Gaussian | growing queries
 Evaluation: PSNR | SSIM | LPIPS | token dispersion
 """
 

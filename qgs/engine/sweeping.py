@@ -1,0 +1,101 @@
+"""Gaussians on what photos show, at depths where other photos show the same: a plane sweep.
+
+Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with patches along rays.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.types import Cameras, Gaussians, Views
+
+_DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0  # how many are tried, and between which, of the size
+_OTHERS = 6  # photos that a pixel is compared with; of these, the half that fits best counts
+_APART, _TURNED = 0.06, 10.0  # best distance of their cameras, of the size; weight of 1 - cosine
+_PATCH = 1  # pixels about a pixel that are compared too
+_MOST_ODD = 0.3  # of a difference of colours, at most; half of it where a photo does not see it
+_NO_EVIDENCE = 1e-4  # per e-fold of depth away from the size: decides where no photo does
+_AT_ONCE = 1024  # pixels, so that memory stays within 0.3 GB
+_OPACITY, _PIXELS = 0.5, 2.0  # of the Gaussians; their standard deviation in pixels
+
+
+@torch.no_grad()
+def swept(views: Views, count: int, size: float, generator: torch.Generator) -> Gaussians:
+    """Gaussians (1, count) at pixels drawn from the photos `views` (1, V), of their colours.
+
+    size: about the distance of the scene from the cameras, and the depth of a pixel that no other
+    photo shows.
+    """
+    (height, width), device = views.cameras.size, views.images.device
+    of_photo = height * width
+    drawn = torch.randint(views.images.shape[1] * of_photo, (count,), generator=generator)
+    drawn = drawn.sort().values
+    parts = [
+        _on_photo(views, photo, pixels.to(device), size)
+        for photo, start in enumerate(range(0, views.images.shape[1] * of_photo, of_photo))
+        for pixels in (drawn[(drawn >= start) & (drawn < start + of_photo)] - start).split(_AT_ONCE)
+    ]
+    means, scales, colors = (torch.cat(part)[None] for part in zip(*parts, strict=True))
+    quats = torch.tensor([1.0, 0, 0, 0], device=device).expand(1, count, 4)
+    return Gaussians(means, scales, quats, torch.full_like(means[..., 0], _OPACITY), colors)
+
+
+def _on_photo(
+    views: Views, photo: int, pixels: Tensor, size: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Means, scales and colors (n, 3) at `pixels` (n,), counted by rows, of one photo."""
+    cameras, width = views.cameras, views.cameras.size[1]
+    rows, columns = pixels // width, pixels % width
+    pose = cameras.c2w[0, photo]
+    depths = _depths(views, photo, rows, columns, size)
+    rays = _rays(cameras, photo, rows, columns)
+    means = pose[:3, 3] + rays * depths[:, None]
+    scales = (_PIXELS * depths / cameras.intrinsics[0, photo, 0])[:, None].expand(-1, 3)
+    return means, scales, views.images[0, photo][:, rows, columns].T
+
+
+def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
+    """World directions (..., 3) of pixels (...), of depth 1 before the camera."""
+    fx, fy, cx, cy = cameras.intrinsics[0, photo]
+    x, y = (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy
+    return torch.stack([x, y, torch.ones_like(x)], -1) @ cameras.c2w[0, photo, :3, :3].T
+
+
+def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
+    """Depth (n,) of pixels (n,) of one photo at which the others look most alike."""
+    cameras, (height, width) = views.cameras, views.cameras.size
+    logs = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _DEPTHS, device=rows.device)
+    tried, others = size * logs.exp(), _others(cameras, photo, size)
+    steps = torch.arange(-_PATCH, _PATCH + 1, device=rows.device)
+    rows, columns = (x.flatten(1) for x in torch.broadcast_tensors(
+        (rows[:, None, None] + steps[:, None]).clamp(0, height - 1),
+        (columns[:, None, None] + steps).clamp(0, width - 1),
+    ))  # fmt: skip
+    pose, own = cameras.c2w[0, photo], views.images[0, photo][:, rows, columns]
+    points = pose[:3, 3] + _rays(cameras, photo, rows, columns)[:, :, None] * tried[:, None]
+    costs = []  # (n, depths) of every other photo
+    for other in others:
+        w2c, (fx, fy, cx, cy) = cameras.w2c[0, other], cameras.intrinsics[0, other]
+        x, y, z = (points @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
+        ahead = z.clamp_min(1e-3 * size)
+        at = torch.stack([fx * x / ahead + cx, fy * y / ahead + cy], -1)
+        at = 2 * at / at.new_tensor([width, height]) - 1
+        seen = (z >= ahead) & (at.abs() < 1).all(-1)
+        found = F.grid_sample(
+            views.images[:, other], at.flatten(0, 1)[None], "bilinear", "border", False
+        )
+        odd = (found.view(*own.shape, _DEPTHS) - own[..., None]).abs().mean(0).clamp_max(_MOST_ODD)
+        costs.append(torch.where(seen, odd, _MOST_ODD / 2).mean(1))
+    best = torch.stack(costs).topk((len(costs) + 1) // 2, 0, largest=False).values.mean(0)
+    return tried[(best + _NO_EVIDENCE * logs.abs()).argmin(-1)]
+
+
+def _others(cameras: Cameras, photo: int, size: float) -> list[int]:
+    """Photos that see what `photo` sees, from a little beside it; itself where it is alone."""
+    eyes, axes = cameras.c2w[0, :, :3, 3], cameras.c2w[0, :, :3, 2]
+    apart = (eyes - eyes[photo]).norm(dim=-1) / size
+    unlike = (apart.clamp_min(1e-6) / _APART).log().abs() + _TURNED * (1 - axes @ axes[photo])
+    unlike[photo] = math.inf
+    return unlike.topk(min(_OTHERS, max(len(eyes) - 1, 1)), largest=False).indices.tolist()
