@@ -28,12 +28,14 @@ def scene_html(
     """A page on which `look` can be turned: Gaussians, photos, anchors, and a picked query.
 
     choice: what is shown of it; by default the scene with the anchors of the last layer. start:
-    whose first view is taken, by default its own. Some 0.8 MB for viser's own code, and about 40
-    bytes more a Gaussian.
+    whose first view and size of photos are taken, by default its own. Some 0.8 MB for viser's own
+    code, and about 40 bytes more a Gaussian.
     """
+    start = start or look
     with quiet_server() as server:
-        stand(server, start or look)
-        Stage(server.scene).put(look, choice or Choice(layer=look.depth))
+        stand(server, start)
+        choice = choice or Choice(layer=look.depth)
+        Stage(server.scene).put(look, choice, unit=distance_to(start))
         page = server.get_scene_serializer().as_html(dark)
     return page.replace("<head>", f"<head>{_WORKERS}", 1)
 
