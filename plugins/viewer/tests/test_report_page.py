@@ -113,8 +113,8 @@ def _slide(page: Page, folder: Path) -> None:
     assert 20 < value < 60
     mixed, cut = drawn(page, folder, "mixed")[window], int(truth.shape[1] * value / 100)
     assert np.abs(truth - render).mean() > 10
-    np.testing.assert_array_equal(mixed[:, : cut - 8], truth[:, : cut - 8])
-    np.testing.assert_array_equal(mixed[:, cut + 8 :], render[:, cut + 8 :])
+    np.testing.assert_allclose(mixed[:, : cut - 8], truth[:, : cut - 8], atol=3)
+    np.testing.assert_allclose(mixed[:, cut + 8 :], render[:, cut + 8 :], atol=3)
 
 
 def _zoom(page: Page) -> None:
@@ -129,7 +129,8 @@ def _zoom(page: Page) -> None:
     assert page.evaluate("document.querySelector('#zoom img').clientHeight") > 400
     page.key("Escape", 27)
     assert not page.evaluate(opened)
-    assert page.evaluate("document.activeElement.alt").startswith("tokengs, render")
+    back = "document.activeElement.alt?.startsWith('tokengs, render')"
+    page.until("the focus on the picture that was seen last", back, 10)
     page.evaluate("document.querySelector('.inputs img').click()")
     assert page.evaluate(opened)
     page.evaluate("document.getElementById('zoom').click()")
