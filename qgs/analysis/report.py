@@ -1,7 +1,8 @@
 """report.html: what was trained and how it compares, in one self-contained page."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from typing import Any
 
 import torch
@@ -12,13 +13,16 @@ from qgs.analysis.reconstruction import orbit_path
 from qgs.analysis.trace import trace
 from qgs.contracts import Column
 from qgs.data.sampling import Sample
+from qgs.data.scenes import warn_once
 from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
 from qgs.drawing.images import (
     Picture,
+    checked,
     data_uri,
     depth_picture,
     depth_range,
     enlarged,
+    error_picture,
     finer,
     rgb_picture,
     side_by_side,
@@ -77,6 +81,8 @@ class Report:
     commands: Mapping[str, str] = field(default_factory=dict)
 
 
+GROUP = "qgs.report"
+"""Group of entry points NAME = "module:function", each a maker of a section, as `orbit` is."""
 SIDE = 256  # pixels on the longer side of pictures that models render for show
 QUERIES = 5
 ANCHORS = 12
@@ -88,11 +94,20 @@ Shown = Sequence[tuple[Contender, Prediction]]
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture, or the frames of an animation. legend: queries in it, in their colours."""
+    """A picture, or the frames of an animation. legend: queries in it, in their colours.
+
+    page: HTML that a reader can open in its place, in a frame of its own. It needs no network, is
+    dark where `prefers-color-scheme` is, and has no access to the report. Raises ValueError.
+    """
 
     image: Picture | list[Picture]
     caption: str = ""
     legend: Sequence[DrawnQuery] = ()
+    page: str = ""
+
+    def __post_init__(self) -> None:
+        for picture in self.image if isinstance(self.image, list) else [self.image]:
+            checked(picture)
 
 
 @dataclass(frozen=True)
@@ -111,15 +126,37 @@ def report_html(report: Report) -> str:
     first = report.samples[0]
     shown = [(c, c.model(first.inputs)) for c in report.contenders]
     # A new section of figures is a function that returns a ReportSection, and its name here.
-    makers = (orbit, queries, anchors, attention, training_curves)
-    sections = [section for make in makers if (section := make(shown, first)).figures]
+    makers = (queries, anchors, attention, training_curves)
+    own = [make(shown, first) for make in makers]
+    sections = [orbit(shown, first), *offered_sections(shown, first), *own]
     scenes = [
-        scene_columns(report.contenders, sample, depth)
+        pictured_scene(report.contenders, sample, depth)
         for sample, depth in zip(report.samples, report.depths, strict=True)
     ]
     environment = page_environment(uri=data_uri, hex=hex_color)
     template = environment.get_template("report.html")
+    sections = [section for section in sections if section.figures]
     return template.render(report=report, scenes=scenes, sections=sections)
+
+
+def offered_sections(shown: Shown, sample: Sample) -> Iterator[ReportSection]:
+    """Sections of installed distributions, in order of their names; what fails is said and left."""
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+        try:
+            section = entry.load()(shown, sample)
+            if not isinstance(section, ReportSection):
+                raise TypeError(f"it gives {type(section).__name__}, not a ReportSection")
+            tiles = [tile for tiles in section.figures.values() for tile in tiles]
+            if wrong := [type(tile).__name__ for tile in tiles if not isinstance(tile, Tile)]:
+                raise TypeError(f"it has {wrong[0]} among its figures, not a Tile")
+        except (Exception, SystemExit) as error:
+            release = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "no distribution"
+            warn_once(
+                f"the report does without the section `{entry.name}` of {release}, `{entry.value}`"
+                f" fails: {type(error).__name__}: {error}; update {release}, or uninstall it"
+            )
+        else:
+            yield section
 
 
 def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:
@@ -135,28 +172,44 @@ def page_environment(*packages: str, **filters: Callable[..., str]) -> Environme
     return environment
 
 
-def scene_columns(
+def pictured_scene(
     contenders: Sequence[Contender], sample: Sample, depth: Tensor | None
 ) -> dict[str, Any]:
-    """Name, inputs and columns of pictures of a scene. depth: the true one (T, 1, H, W)."""
+    """Name, inputs and pictures of a scene by kind and column. depth: the true one (T, 1, H, W).
+
+    most: the error that is brightest, the same for all.
+    """
     shown = sample.targets.select(slice(TARGETS))
-    frames = [f"frame {sample.label(f)}" for f in (*sample.input_frames, *sample.target_frames)]
-    inputs = len(sample.input_frames)
-    truth = shown.images[0]
-    columns = {"Truth": _photos(truth, frames[inputs:])}
-    depths = {} if depth is None else {"Truth, depth": depth[:TARGETS]}
+    inputs, truth = sample.input_frames, shown.images[0]
+    frames = [f"frame {sample.label(f)}" for f in (*inputs, *sample.target_frames)]
+    colors = {"Truth": _photos(truth, frames[len(inputs) :])}
+    depths = {} if depth is None else {"Truth": depth[:TARGETS]}
+    errors = {}
     for contender in contenders:
         gaussians = contender.model(sample.inputs).gaussians
         rendering = contender.model.render(gaussians, shown.cameras)
         scores = psnr(rendering.rgb[0], truth).tolist()
         quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
-        columns[contender.name] = _photos(rendering.rgb[0], quality)
-        depths[f"{contender.name}, depth"] = rendering.depth[0]
+        colors[contender.name] = _photos(rendering.rgb[0], quality)
+        errors[contender.name] = (rendering.rgb[0].clamp(0, 1) - truth).abs().mean(1, keepdim=True)
+        depths[contender.name] = rendering.depth[0]
     near, far = depth_range(torch.cat(list(depths.values())))
-    for name, maps in depths.items():
-        columns[name] = [Tile(depth_picture(depth, near, far)) for depth in maps]
-    photos = _photos(sample.inputs.images[0], frames[:inputs])
-    return {"name": sample.scene, "inputs": photos, "columns": columns}
+    most = depth_range(torch.cat(list(errors.values())))[1]
+    kinds = {
+        "Render": colors,
+        "Error": {n: [Tile(error_picture(e, most)) for e in maps] for n, maps in errors.items()},
+        "Depth": {
+            n: [Tile(depth_picture(d, near, far)) for d in maps] for n, maps in depths.items()
+        },
+    }
+    span = f"{min(inputs)} to {max(inputs)}" if len(inputs) > 1 else str(*inputs)
+    return {
+        "name": sample.scene,
+        "frames": f"frame{'s' if len(inputs) > 1 else ''} {span}",
+        "inputs": _photos(sample.inputs.images[0], frames[: len(inputs)]),
+        "kinds": kinds,
+        "most": most,
+    }
 
 
 def _photos(images: Tensor, captions: Sequence[str]) -> list[Tile]:

@@ -26,7 +26,7 @@ from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
 from qgs.wording import short_names
 
-PICTURED_SCENES = 3
+PICTURED_SCENES = 6
 NEXT = {
     "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
     "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "makes a sharp scene of them",

@@ -15,7 +15,8 @@ from qgs.types import Cameras
 
 Picture = np.ndarray  # uint8 (H, W, 3)
 NOTHING = (232, 233, 235)  # where there is nothing to show: no depth, no attention
-DEPTH_MAP = "viridis_r"
+DEPTH_MAP, ERROR_MAP = "viridis_r", "inferno"
+EXACT = 128  # pixels on the longer side up to which photos in pages are not compressed with loss
 
 
 def rgb_picture(image: Tensor) -> Picture:
@@ -26,17 +27,25 @@ def rgb_picture(image: Tensor) -> Picture:
 
 def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
     """Depth (1, H, W) from near (light) to far (dark); pixels without depth (0) are grey."""
-    from matplotlib import colormaps
-
-    values = depth.detach().float().cpu().numpy()[0]
-    shade = np.clip((values - near) / max(far - near, 1e-12), 0, 1)
-    picture = (colormaps[DEPTH_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
-    picture[values <= 0] = NOTHING
+    picture = _shaded(depth, near, far, DEPTH_MAP)
+    picture[depth.detach()[0].cpu().numpy() <= 0] = NOTHING
     return picture
 
 
+def error_picture(error: Tensor, most: float) -> Picture:
+    """Error (1, H, W) from none (black) to `most` and above (light yellow)."""
+    return _shaded(error, 0.0, most, ERROR_MAP)
+
+
+def _shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
+    from matplotlib import colormaps
+
+    shade = (values.detach().float().cpu().numpy()[0] - low) / max(high - low, 1e-12)
+    return (colormaps[colors](shade.clip(0, 1))[..., :3] * 255).round().astype(np.uint8)
+
+
 def depth_range(depths: Tensor) -> tuple[float, float]:
-    """The 2nd and 98th percentile of all depths that are not 0, for a scale that pictures share."""
+    """The 2nd and 98th percentile of all values that are not 0, for a scale that pictures share."""
     seen = depths.detach()[depths.detach() > 0].float()
     if seen.numel() == 0:
         return 0.0, 1.0
@@ -55,7 +64,7 @@ def side_by_side(pictures: list[Picture], gap: int = 4) -> Picture:
 def png_bytes(picture: Picture) -> bytes:
     """A uint8 (H, W, 3) picture as the bytes of a PNG file."""
     buffer = BytesIO()
-    _checked(picture).save(buffer, format="PNG", optimize=True)
+    checked(picture).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 
@@ -70,26 +79,28 @@ def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: fl
     sizes = {frame.shape for frame in frames}
     if len(sizes) != 1:
         raise ValueError(f"a GIF needs frames of one size, got {sorted(sizes) or 'none'}")
-    sample = _checked(np.concatenate(frames[:: max(1, len(frames) // 8)]))
+    sample = checked(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
-    images = [_checked(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    images = [checked(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
     options = {"duration": round(1000 / frames_per_second), "loop": 0}
     with replacing(path) as temporary:
         images[0].save(temporary, "GIF", save_all=True, append_images=images[1:], **options)
 
 
-def data_uri(image: Picture | list[Picture]) -> str:
-    """A picture as PNG, frames as an endless WebP animation."""
-    if not isinstance(image, list):
-        return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
+def data_uri(image: Picture | list[Picture], photo: bool = False) -> str:
+    """A picture as PNG, a large `photo` as WebP, frames as an endless WebP animation."""
+    frames = image if isinstance(image, list) else [image]
+    if len(frames) == 1 and not (photo and max(frames[0].shape) > EXACT):
+        return "data:image/png;base64," + base64.b64encode(png_bytes(frames[0])).decode()
     buffer = BytesIO()
-    first, *rest = map(_checked, image)
-    options = {"duration": 90, "loop": 0, "quality": 80, "method": 2}  # milliseconds a frame
+    first, *rest = map(checked, frames)
+    options = {"duration": 90, "loop": 0, "quality": 90 if photo else 80, "method": 2}  # ms
     first.save(buffer, format="WEBP", save_all=True, append_images=rest, **options)
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def _checked(picture: Picture) -> Image.Image:
+def checked(picture: Picture) -> Image.Image:
+    """The picture for Pillow. Raises ValueError for what is none."""
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise ValueError(
             f"a picture must be uint8 (H, W, 3), got {picture.dtype} {tuple(picture.shape)}"

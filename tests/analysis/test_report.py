@@ -1,13 +1,19 @@
 import re
+from html.parser import HTMLParser
+from importlib.metadata import entry_points
 
+import numpy as np
 import pytest
+import torch
 from commands import MODEL
 
-from qgs.analysis.report import Contender, Report, report_html
+from qgs.analysis.report import GROUP, Contender, Report, report_html
 from qgs.composer import resolve
 from qgs.contracts import Column
 from qgs.data.evaluation import evaluation_samples, true_depth
+from qgs.data.scenes import warn_once
 from qgs.drawing.figures import Curves
+from qgs.drawing.images import EXACT, data_uri, error_picture
 
 PLAIN = {
     "recipe": 1,
@@ -21,6 +27,15 @@ PLAIN = {
     "views": {"inputs": 2, "targets": 2, "gap": [3, 4], "scale_factor": 0.4},
     "evaluation": {"scenes": 2},
 }
+
+
+@pytest.fixture(autouse=True)
+def _only_sections_of_the_test(monkeypatch):
+    """Whether the viewer is installed makes no difference."""
+    monkeypatch.setattr(
+        "qgs.analysis.report.entry_points",
+        lambda group: [e for e in entry_points(group=group) if e.module.startswith("_test_")],
+    )
 
 
 def anchored() -> dict:
@@ -83,7 +98,7 @@ def test_queries_without_a_place_have_no_anchor_section():
     assert "Where queries look" not in page
     assert "geometry bias</figcaption>" not in page
     assert "content logits" in page
-    assert "Truth, depth" in page
+    assert 'alt="Truth, depth"' in page
     assert page.count('src="data:image/webp;base64,') == 1
     assert page.count("<h2>") == 7
     assert '<td class="best">12.34</td>' in page
@@ -99,7 +114,119 @@ def test_queries_without_a_place_have_no_anchor_section():
 
 def test_names_cannot_break_the_page():
     page = page_of(PLAIN, "<script>alert(1)</script>")
-    assert "<script>" not in page
+    assert "<script>alert" not in page
+    assert page.count("<script>") == 1
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+
+
+class Elements(HTMLParser):
+    """Start tags of a page, in order, with their attributes."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str]]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, {name: value or "" for name, value in attrs}))
+
+    def of(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for found, attributes in self.found if found == tag]
+
+
+def test_every_scene_can_be_chosen_and_is_there_without_choosing():
+    plain = Elements(page_of(PLAIN, "plain"))
+    scenes = PLAIN["evaluation"]["scenes"]
+    radios = [found for found in plain.of("input") if found["type"] == "radio"]
+    assert len(radios) == len(plain.of("article")) == scenes
+    assert [found["for"] for found in plain.of("label")] == [found["id"] for found in radios]
+    assert [("checked" in found) for found in radios] == [True] + [False] * (scenes - 1)
+    alone = Elements(page_of({**PLAIN, "evaluation": {"scenes": 1}}, "plain"))
+    assert len(alone.of("article")) == 1
+    assert not alone.of("label"), "one scene needs no choice"
+
+
+def test_pictures_are_in_the_page_and_have_words():
+    plain = Elements(page_of(PLAIN, "plain"))
+    pictures = plain.of("img")
+    zoomed = [picture for picture in pictures if "src" not in picture]
+    assert len(zoomed) == 1, "only the one that shows others in large is empty"
+    for picture in pictures:
+        assert picture.get("src", "data:").startswith("data:")
+    wordless = [picture for picture in pictures if not picture["alt"] and picture not in zoomed]
+    assert len(wordless) == PLAIN["evaluation"]["scenes"], "thumbnails beside their names"
+    alts = {picture["alt"] for picture in pictures}
+    assert {"plain, error", "plain, depth", "Truth, depth"} <= alts
+    sliders = [found for found in plain.of("input") if found["type"] == "range"]
+    assert len(sliders) == PLAIN["evaluation"]["scenes"]
+    assert all("plain" in found["aria-label"] for found in sliders)
+    for _, attributes in plain.found:
+        outward = {*attributes} & {"src", "srcset", "data", "poster", "action"}
+        assert all(attributes[name].startswith("data:") for name in outward)
+    assert all(link["href"].startswith("https://example.org/") for link in plain.of("a"))
+    assert not plain.of("link")
+
+
+OFFERED = """
+import numpy as np
+from qgs.analysis.report import ReportSection, Tile
+
+GREY = np.full((4, 6, 3), 128, np.uint8)
+
+PAGE = '<p title="a">&lt;</p>'
+
+def plugin(shown, sample):
+    names = [f"{c.name}: {p.gaussians.count} of {sample.scene}" for c, p in shown]
+    return ReportSection("Mine <b>", "", {"": [Tile(GREY, names[0], page=PAGE)]})
+"""
+
+
+def test_a_distribution_adds_a_section_with_a_page(install):
+    install("qgs-mine", "mine", OFFERED, group=GROUP)
+    page = page_of(PLAIN, "plain")
+    assert "<h2>Mine &lt;b&gt;</h2>" in page
+    assert "plain: 32 of test/000000" in page
+    found = Elements(page)
+    pages = [button["data-page"] for button in found.of("button") if "data-page" in button]
+    assert pages == ['<p title="a">&lt;</p>']
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("import nothing_of_this_name", "ModuleNotFoundError: No module named"),
+        ("other = 1", "AttributeError"),
+        ("plugin = 3", "TypeError: 'int' object is not callable"),
+        ("def plugin(shown, sample):\n    return 'text'", "it gives str, not a ReportSection"),
+        (OFFERED.replace("[Tile(", "['text', Tile("), "has str among its figures, not a Tile"),
+        (OFFERED.replace("Tile(GREY,", "Tile(GREY / 2,"), "must be uint8 (H, W, 3), got float64"),
+        ("def plugin(shown, sample):\n    raise SystemExit('gone')", "SystemExit: gone"),
+    ],
+)
+def test_a_section_that_fails_is_said_and_left_out(install, caplog, source, told):
+    install("qgs-broken", "broken", source, group=GROUP)
+    warn_once.cache_clear()
+    page = page_of(PLAIN, "plain")
+    assert "<h2>A walk through the reconstruction</h2>" in page
+    assert "Mine" not in page
+    (message,) = (r.message for r in caplog.records if "does without" in r.message)
+    assert "the section `broken` of qgs-broken 1.2" in message
+    assert told in message
+    assert message.endswith("update qgs-broken 1.2, or uninstall it")
+
+
+def test_large_photos_are_compressed_and_small_ones_exact():
+    for side, kind in ((EXACT, "png"), (EXACT + 1, "webp")):
+        assert data_uri(np.zeros((side, 9, 3), np.uint8), photo=True).startswith(
+            f"data:image/{kind}"
+        )
+    assert data_uri(np.zeros((EXACT + 1, 9, 3), np.uint8)).startswith("data:image/png")
+
+
+def test_errors_are_dark_where_there_is_none():
+    picture = error_picture(torch.tensor([[[0.0, 0.1, 0.2, 0.9]]]), 0.2)[0].astype(int)
+    light = picture.sum(-1)
+    assert light[0] < 10 < light[1] < light[2] == light[3]
 
 
 def test_true_depth_is_in_the_units_of_the_sample():

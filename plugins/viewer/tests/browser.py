@@ -22,27 +22,52 @@ _FLAGS = (
 
 
 class Page:
-    """One page of the browser. requests: URLs that it asked for. errors: of its console."""
+    """One page of the browser. requests: URLs that it asked for. errors: of its console.
+
+    targets: kinds of what else it holds, frames and workers, once they are followed.
+    """
 
     def __init__(self, socket: Any) -> None:
         self._socket, self._number = socket, 0
         self.requests: list[str] = []
         self.errors: list[str] = []
+        self.targets: list[str] = []
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
+        number = self._send(method, params)
         while True:
             message = json.loads(self._socket.recv(timeout=120))
-            if message.get("id") == self._number:
+            if message.get("id") == number:
                 assert "error" not in message, message
                 return message["result"]
             self._note(message)
 
+    def _send(self, method: str, params: dict[str, Any], **to: str) -> int:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": params, **to}
+        self._socket.send(json.dumps(message))
+        return self._number
+
+    def follow_frames(self) -> None:
+        """Note requests and errors of sandboxed frames and of workers too."""
+        self.call(
+            "Target.setAutoAttach", autoAttach=True, waitForDebuggerOnStart=True, flatten=True
+        )
+
+    def _follow(self, session: str) -> None:
+        for domain in ("Runtime", "Network", "Log"):
+            self._send(f"{domain}.enable", {}, sessionId=session)
+        within = {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}
+        self._send("Target.setAutoAttach", within, sessionId=session)
+        self._send("Runtime.runIfWaitingForDebugger", {}, sessionId=session)
+
     def _note(self, message: dict[str, Any]) -> None:
         method, params = message.get("method"), message.get("params", {})
+        if method == "Target.attachedToTarget":
+            self.targets.append(params["targetInfo"]["type"])
+            self._follow(params["sessionId"])
         if method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
         if method == "Network.webSocketCreated":

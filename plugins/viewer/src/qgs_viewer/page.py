@@ -1,18 +1,58 @@
 """The scene as one HTML page that needs no network: for reports, mails, talks."""
 
+from collections.abc import Iterable, Mapping
+
+from qgs.analysis.report import page_environment
 from qgs_viewer.choice import Choice
 from qgs_viewer.look import Look
 from qgs_viewer.server import quiet_server, stand
-from qgs_viewer.stage import Stage
+from qgs_viewer.stage import Stage, distance_to
+
+_DATA = '__VISER_EMBED_DATA__="'
+# Pages of file://, and frames in them, may not have workers of blobs, which Chromium tells only
+# after the worker was made. viser makes another one where that fails at once; without a worker
+# it never sorts Gaussians anew.
+_WORKERS = """<script>
+if (origin === "null") window.Worker = class extends Worker {
+  constructor(url, options) {
+    if (String(url).startsWith("blob:")) throw new Error("no workers of blobs here");
+    super(url, options);
+  }
+};
+</script>"""
 
 
-def scene_html(look: Look, choice: Choice | None = None, *, dark: bool = False) -> str:
+def scene_html(
+    look: Look, choice: Choice | None = None, *, dark: bool = False, start: Look | None = None
+) -> str:
     """A page on which `look` can be turned: Gaussians, photos, anchors, and a picked query.
 
-    choice: what is shown of it; by default the scene with the anchors of the last layer. Some
-    0.7 MB for viser's own code, and about 25 bytes more a Gaussian.
+    choice: what is shown of it; by default the scene with the anchors of the last layer. start:
+    whose first view and size of photos are taken, by default its own. Some 0.8 MB for viser's own
+    code, and about 40 bytes more a Gaussian.
     """
+    start = start or look
     with quiet_server() as server:
-        stand(server, look)
-        Stage(server.scene).put(look, choice or Choice(layer=look.depth))
-        return server.get_scene_serializer().as_html(dark)
+        stand(server, start)
+        choice = choice or Choice(layer=look.depth)
+        Stage(server.scene).put(look, choice, unit=distance_to(start))
+        page = server.get_scene_serializer().as_html(dark)
+    return page.replace("<head>", f"<head>{_WORKERS}", 1)
+
+
+def scenes_html(looks: Mapping[str, Look]) -> str:
+    """A page of scenes side by side, by name, all seen from `shared_start` at first.
+
+    It holds viser's code once, and is dark where the page or the system around it is.
+    """
+    start = shared_start(looks.values())
+    pages = [scene_html(look, start=start).partition(_DATA) for look in looks.values()]
+    data, ends = zip(*(rest.split('"', 1) for _, _, rest in pages), strict=True)
+    shell = (pages[0][0] + _DATA, '"' + ends[0])
+    template = page_environment("qgs_viewer").get_template("scenes.html")
+    return template.render(shell=shell, scenes=[*zip(looks, data, strict=True)])
+
+
+def shared_start(looks: Iterable[Look]) -> Look:
+    """Whose first view shows all of `looks` well: the one that is nearest to its cameras."""
+    return min(looks, key=distance_to)

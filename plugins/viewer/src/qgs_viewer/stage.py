@@ -36,9 +36,14 @@ class Stage:
         self._gaussians: viser.GaussianSplatHandle | None = None
         scene.set_up_direction("-y")
 
-    def put(self, look: Look, choice: Choice, every: Cameras | None = None) -> None:
-        """Draw a look that was not there before. every: cameras of all frames, drawn thin."""
-        self.unit = distance_to(look)
+    def put(
+        self, look: Look, choice: Choice, every: Cameras | None = None, unit: float | None = None
+    ) -> None:
+        """Draw a look that was not there before. every: cameras of all frames, drawn thin.
+
+        unit: what photos and anchors are sized by, by default `distance_to` the look.
+        """
+        self.unit = unit or distance_to(look)
         self._draw_photos(look, every)
         self.update(look, choice)
 

@@ -1,0 +1,48 @@
+"""The section of report.html in which a reader turns the scene."""
+
+import torch
+
+from qgs.analysis.report import ReportSection, Shown, Tile
+from qgs.data.sampling import Sample
+from qgs.drawing.images import rgb_picture, side_by_side
+from qgs.geometry.poses import look_at
+from qgs.types import Cameras
+from qgs_viewer.look import Look, look_inside
+from qgs_viewer.page import scenes_html, shared_start
+from qgs_viewer.server import FIELD_OF_VIEW, first_eye
+
+_SIZE = 240, 320  # of each scene's picture, H, W
+
+
+def scene_section(shown: Shown, sample: Sample) -> ReportSection:
+    """What every model makes of `sample`, side by side, as it can be turned."""
+    labels = [sample.label(frame) for frame in sample.input_frames]
+    looks = {
+        contender.name: look_inside(contender.model, sample.inputs, labels, sample.input_frames)
+        for contender, _ in shown
+    }
+    camera = _first_camera(shared_start(looks.values()))
+    pictures = [
+        rgb_picture(contender.model.render(prediction.gaussians, camera).rgb[0, 0])
+        for contender, prediction in shown
+    ]
+    names = ", ".join(looks)
+    tile = Tile(side_by_side(pictures), names, page=scenes_html(looks))
+    return ReportSection(
+        "The scene, to turn",
+        "The Gaussians of the first scene above in 3D, with the input photos where they were "
+        "taken, and the anchors of the last layer as dots where there are any. Drag to turn, "
+        "scroll to come closer; W, A, S, D, Q and E walk.",
+        {"": [tile]},
+        width=600,
+    )
+
+
+def _first_camera(look: Look) -> Cameras:
+    """The viewer's first view of a look that is placed in the model's world, (1, 1)."""
+    eye, target = (torch.from_numpy(point).double() for point in first_eye(look))
+    pose = look_at(eye, target - eye, torch.tensor([0.0, 1.0, 0.0]).double())
+    height, width = _SIZE
+    focal = height / 2 / torch.tan(torch.tensor(FIELD_OF_VIEW / 2)).item()
+    lens = torch.tensor([focal, focal, width / 2, height / 2])
+    return Cameras(pose[None, None].float(), lens[None, None], _SIZE)
