@@ -71,6 +71,7 @@ class QueryGaussianModel(nn.Module):
     refinements: one per decoder layer, at `refinement_of`; layers may share a module.
     recipe: the resolved recipe this model was composed from, None for one built by hand.
     trained_on: what its checkpoint tells of the views that it was trained on, None if nothing.
+    loaded_from: its checkpoint as `qgs.load` takes it, a path in full; "" if it was not loaded.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class QueryGaussianModel(nn.Module):
         self.renderer = renderer
         self.recipe = recipe
         self.trained_on: Domain | None = None
+        self.loaded_from = ""
         self._warned = False
 
     def __repr__(self) -> str:

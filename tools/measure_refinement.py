@@ -21,7 +21,6 @@ import torch
 import qgs
 from qgs.analysis.reconstruction import choose_sample
 from qgs.analysis.scenes import chosen_scene
-from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import Scene
 from qgs.data.sampling import Sample, training_frames, views_in
 from qgs.engine.folder import checkpoint_of
@@ -51,8 +50,7 @@ def opened(recipe, name: str, split: str, size: tuple[int, int] | None) -> tuple
         views = {"views_per_scene": ROOM_VIEWS}
         finer = type(data)(data.config.model_copy(update=views))
         return finer.scenes(split)[0], recipe.views.scale
-    sources = load_sound_plugins()[0].components("data")
-    return chosen_scene(recipe, name, size, None, sources)[0], "auto"
+    return chosen_scene(recipe, name, size, None)[0], "auto"
 
 
 def room_frames(inputs: int) -> tuple[list[int], list[int]]:

@@ -173,8 +173,7 @@ class Reconstruction:
 
     prediction: None where the Gaussians were tuned or refined. world: reference pose (4, 4) and
     scale, as of `own_world`. tuning: of tokens, refinement: of Gaussians; None without. remarks:
-    sentences on the photos and what came of them. checkpoint: of the model, as `qgs.load` takes it;
-    "" where it is not known.
+    sentences on the photos and what came of them.
     """
 
     model: QueryGaussianModel
@@ -187,7 +186,6 @@ class Reconstruction:
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
     remarks: Sequence[str] = ()
-    checkpoint: str = ""
 
     @property
     def worse_than_nearest(self) -> str:
@@ -238,10 +236,12 @@ def reconstruct(
     tuning: Mapping[str, Any] | None = None,
     refinement: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
-    """Gaussians of `sample`, rendered from its views.
+    """Gaussians of `sample`, rendered from its views, on the model's device.
 
     seen: in training. tuned: given Gaussians, by the tuning or the refinement that is recorded.
     """
+    device = next(model.parameters()).device
+    sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     prediction: Prediction | None = model(sample.inputs) if tuned is None else None
     gaussians = tuned if prediction is None else prediction.gaussians
     assert gaussians is not None
@@ -366,7 +366,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": reconstruction.sample.scene,
-        "model": reconstruction.checkpoint,
+        "model": reconstruction.model.loaded_from,
         "tuning": reconstruction.tuning,
         "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,

@@ -198,9 +198,7 @@ def pictured_scene(
     kinds = {
         "Render": colors,
         "Error": {n: [Tile(error_picture(e, most)) for e in maps] for n, maps in errors.items()},
-        "Depth": {
-            n: [Tile(depth_picture(d, near, far)) for d in maps] for n, maps in depths.items()
-        },
+        "Depth": {n: [Tile(depth_picture(d, near, far)) for d in m] for n, m in depths.items()},
     }
     span = f"{min(inputs)} to {max(inputs)}" if len(inputs) > 1 else str(*inputs)
     return {

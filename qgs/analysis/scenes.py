@@ -1,6 +1,6 @@
 """A user's photos, or views made in Python, as one scene; and its reconstruction in one call."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 
@@ -38,7 +38,7 @@ def read_photos(
     those of `qgs reconstruct`. Raises FileNotFoundError, ValueError, and TooLargeError for more
     photos than fit into memory.
     """
-    sources, path = _sources(), fspath(folder)
+    sources, path = installed_sources(), fspath(folder)
     found = named_scene(open_for(path, size, None, sources)[0], path, scene)
     if size is None and (stored := found.stored_size(0)):
         found = named_scene(open_for(path, stored, None, sources)[0], path, scene)
@@ -84,12 +84,10 @@ def reconstruct(
         found, seen = GivenScene(photos), ()
         frames = range(len(found)) if frames is None and inputs is None else frames
     else:
-        found, seen = chosen_scene(recipe, fspath(photos), size, scene, _sources())
+        found, seen = chosen_scene(recipe, fspath(photos), size, scene)
     wanted = None if frames is None else frame_list(frames, "frames", found)
     against = None if compare is None else frame_list(compare, "compare", found)
     sample, world = choose_sample(found, recipe.views, inputs, wanted, against)
-    device = next(model.parameters()).device
-    sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     training = model.training
     try:
         result = reconstruct_sample(model.eval(), sample, world, seen)
@@ -128,7 +126,7 @@ class GivenScene(Scene):
         return None if self.views.masks is None else self.views.masks[0, list(frames)].float()
 
 
-def _sources() -> dict[str, type[Component]]:
+def installed_sources() -> dict[str, type[Component]]:
     """All installed sources of data, by PLUGIN/NAME; a warning names plugins left out."""
     registry, broken = load_sound_plugins()
     for problem in broken:
@@ -141,20 +139,18 @@ def chosen_scene(
     path: str,
     size: Size | None,
     name: str | None,
-    sources: Mapping[str, type[Component]],
 ) -> tuple[Scene, Sequence[int]]:
     """The scene called `name` at `path`, or the only one, and the frames a model was trained on.
 
-    size: (H, W) of its images, the recipe's by default. sources: that may open `path`, by
-    PLUGIN/NAME. Raises as `named_scene`, and ValueError for a recipe without data, which has no
-    image size, when none is given.
+    size: (H, W) of its images, the recipe's by default. Raises as `named_scene`, and ValueError for
+    a recipe without data, which has no image size, when none is given.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
             "the checkpoint's recipe has no data, so its image size is not known; give it, "
             "such as --size 256x256 (in Python size=(256, 256))"
         )
-    source, is_training_data = open_for(path, size, recipe.data_config, sources)
+    source, is_training_data = open_for(path, size, recipe.data_config, installed_sources())
     scene = named_scene(source, path, name)
     seen = is_training_data and scene.name in source.names("train")
     return scene, training_frames(scene) if seen else ()

@@ -99,37 +99,26 @@ def reconstruct(
     from qgs.analysis.reconstruction import reconstruct as run
     from qgs.analysis.scenes import chosen_scene, frame_list
     from qgs.composer import resolve
-    from qgs.composer.registry import load_sound_plugins
     from qgs.engine.distributed import choose_device
-    from qgs.engine.folder import checkpoint_of
     from qgs.engine.growth import refuse_too_many
-    from qgs.io.checkpoint import load, load_recipe
+    from qgs.io.checkpoint import load
 
     refuse_too_many(gaussians or 0)
     console = Console()
-    file, device = checkpoint_of(checkpoint), choose_device(device)
-    model, recipe = load(file, device), load_recipe(file)
-    if overrides:
-        recipe = resolve(recipe.tree, overrides)
-    registry, broken = load_sound_plugins()
-    for problem in broken:
-        console.print(f"left out: {problem}", highlight=False, markup=False, soft_wrap=True)
-    sources = registry.components("data")
-    scene, seen = chosen_scene(recipe, photos, pixels, scene_name, sources)
+    model = load(checkpoint, choose_device(device))
+    recipe = resolve(model.recipe or {}, overrides or ())
+    scene, seen = chosen_scene(recipe, photos, pixels, scene_name)
     named = {"--frames": frames, "--holdout": holdout}.items()
     wanted = [None if text is None else frame_list(text, name, scene) for name, text in named]
     sample, world = choose_sample(scene, recipe.views, inputs, *wanted)
-    sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     tuned, record = tuned_tokens(model, recipe, sample, tune, console) if tune else (None, None)
     result = run(model, sample, world, seen, tuned, record)
-    named = str(file.resolve()) if Path(checkpoint).exists() else checkpoint
-    remarks = remarks_on(result, scene, model, recipe.views)
-    result = replace(result, remarks=remarks, checkpoint=named)
+    result = replace(result, remarks=remarks_on(result, scene, model, recipe.views))
     show(result, "feed-forward" if refine else "", console)
     paths = write_reconstruction(model, result, out)
     if refine:
         if fine is not None:
-            scene, seen = chosen_scene(recipe, photos, fine, scene_name, sources)
+            scene, seen = chosen_scene(recipe, photos, fine, scene_name)
         better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
         show(better, "refined", console)
         paths += write_reconstruction(model, better, out / "refined")
@@ -143,8 +132,8 @@ def tuned_tokens(
     """Gaussians of tokens that are tuned on the inputs of `sample`, and a record of that."""
     from qgs.engine.tuning import tune, tuning_loss
 
-    rate = recipe.evaluation.tuning_rate
-    tuning = tune(model, sample.inputs, tuning_loss(recipe), steps, rate)
+    rate, inputs = recipe.evaluation.tuning_rate, sample.inputs.to(next(model.parameters()).device)
+    tuning = tune(model, inputs, tuning_loss(recipe), steps, rate)
     before, after = tuning.losses[0], tuning.losses[-1]
     losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
     console.print(f"{steps} steps of token tuning: {losses}", highlight=False)

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from qgs.analysis.scenes import installed_sources
 from qgs.cli import contest
 from qgs.composer import Recipe, resolve
-from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import SceneSource
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
@@ -84,8 +84,7 @@ def _on_photos(recipe: Recipe, photos: str) -> Recipe:
 
     Data that it was not trained on has a unit of its own, so a constant `views.scale` becomes auto.
     """
-    registry, _ = load_sound_plugins()
-    sources = registry.components("data")
+    sources = installed_sources()
     source, own = open_for(photos, None, recipe.data_config, sources)
     views = {} if own or recipe.views.scale != "constant" else {"scale": "auto"}
     kind = next(name for name, component in sources.items() if component is type(source))

@@ -121,9 +121,8 @@ class _Run:
     ) -> Iterator[CurvePoint]:
         """Optimise until the time is used or a stop is asked for; points of the curve between."""
         if compared is not None:
-            yield CurvePoint(
-                0.0, 0, self.given.count, mean_psnr(self.given, compared, self.renderer)
-            )
+            quality = mean_psnr(self.given, compared, self.renderer)
+            yield CurvePoint(0.0, 0, self.given.count, quality)
         due = self.seconds / _POINTS
         while self.spent < self.seconds and not stop:
             if compared is not None and self.spent >= due:
@@ -194,9 +193,9 @@ def half_swept(
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:
-    """Median distance of Gaussians (1, G) from the cameras of `views` (1, V), above 0."""
+    """Median distance of Gaussians (1, G) from the nearest camera of `views` (1, V), above 0."""
     distances = torch.cdist(gaussians.means[0], views.cameras.c2w[0, :, :3, 3])
-    return float(distances.median().clamp_min(1e-6))
+    return float(distances.amin(1).median().clamp_min(1e-6))
 
 
 def resized(views: Views, part: int) -> Views:

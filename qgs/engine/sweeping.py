@@ -69,10 +69,9 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
     logs = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _DEPTHS, device=rows.device)
     tried, others = size * logs.exp(), _others(cameras, photo, size)
     steps = torch.arange(-_PATCH, _PATCH + 1, device=rows.device)
-    rows, columns = (x.flatten(1) for x in torch.broadcast_tensors(
-        (rows[:, None, None] + steps[:, None]).clamp(0, height - 1),
-        (columns[:, None, None] + steps).clamp(0, width - 1),
-    ))  # fmt: skip
+    down, right = (x.reshape(-1) for x in torch.meshgrid(steps, steps, indexing="ij"))
+    rows = (rows[:, None] + down).clamp(0, height - 1)
+    columns = (columns[:, None] + right).clamp(0, width - 1)
     pose, own = cameras.c2w[0, photo], views.images[0, photo][:, rows, columns]
     points = pose[:3, 3] + _rays(cameras, photo, rows, columns)[:, :, None] * tried[:, None]
     costs = []  # (n, depths) of every other photo
@@ -83,9 +82,8 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
         at = torch.stack([fx * x / ahead + cx, fy * y / ahead + cy], -1)
         at = 2 * at / at.new_tensor([width, height]) - 1
         seen = (z >= ahead) & (at.abs() < 1).all(-1)
-        found = F.grid_sample(
-            views.images[:, other], at.flatten(0, 1)[None], "bilinear", "border", False
-        )
+        flat = at.flatten(0, 1)[None]
+        found = F.grid_sample(views.images[:, other], flat, "bilinear", "border", False)
         odd = (found.view(*own.shape, _DEPTHS) - own[..., None]).abs().mean(0).clamp_max(_MOST_ODD)
         costs.append(torch.where(seen, odd, _MOST_ODD / 2).mean(1))
     best = torch.stack(costs).topk((len(costs) + 1) // 2, 0, largest=False).values.mean(0)

@@ -152,7 +152,7 @@ def load(
     which names the releases that wrote the file where a plugin is missing or another release of it
     cannot stand for it.
     """
-    path = checkpoint_path(path)
+    name, path = os.fspath(path), checkpoint_path(path)
     recipe, tensors = load_recipe(path), read_tensors(path)
     try:
         _refuse_misfit(recipe.build_model("meta"), tensors, str(path))  # takes no memory
@@ -164,6 +164,7 @@ def load(
     load_weights(model, tensors, str(path))
     refuse_damaged(tensors, path)
     model.trained_on = load_domain(path)
+    model.loaded_from = str(path.resolve()) if Path(name).expanduser().exists() else name
     return (model if device is None else model.to(device)).eval()
 
 

@@ -66,7 +66,8 @@ def test_a_folder_is_reconstructed_as_by_the_command(model, photos, tmp_path):
         "reconstruct", tmp_path / "model.safetensors", photos, "--out", tmp_path / "a", *options
     )
     assert done.exception is None
-    result = model.reconstruct(photos, frames=[1, "5.png"], overrides=["views.scale=auto"])
+    loaded = qgs.load(tmp_path / "model.safetensors")
+    result = loaded.reconstruct(photos, frames=[1, "5.png"], overrides=["views.scale=auto"])
     result.save(tmp_path / "b")
     assert (tmp_path / "b/gaussians.ply").read_bytes() == (
         tmp_path / "a/gaussians.ply"

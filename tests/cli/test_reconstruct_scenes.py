@@ -16,11 +16,9 @@ from upath import UPath
 import qgs
 from qgs.analysis.scenes import chosen_scene
 from qgs.composer import resolve
-from qgs.composer.registry import load_registry
 from qgs.data import PhotosSource
 
 SIZE = (16, 16)
-SOURCES = load_registry(()).components("data")
 
 
 def recipe(**data):
@@ -29,7 +27,7 @@ def recipe(**data):
 
 
 def chosen(trained, path, size=None, name=None):
-    return chosen_scene(trained, str(path), size, name, SOURCES)
+    return chosen_scene(trained, str(path), size, name)
 
 
 @pytest.fixture

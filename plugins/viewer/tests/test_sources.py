@@ -1,6 +1,5 @@
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,11 @@ from qgs.io.ply import load_ply
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `qgs reconstruct` leaves, by a model whose checkpoint lies beside it."""
-    folder, model = tmp_path_factory.mktemp("finished"), model_of("locus")
-    qgs.save(model, folder / "model.safetensors")
+    folder = tmp_path_factory.mktemp("finished")
+    qgs.save(model_of("locus"), folder / "model.safetensors")
+    model = qgs.load(folder / "model.safetensors")
     sample, world = choose_sample(Walk(), VIEWS, 2, (1, 4), (2, 3))
     result = reconstruct(model, sample, world)
-    result = replace(result, checkpoint=str(folder / "model.safetensors"))
     write_reconstruction(model, result, folder / "scene")
     return folder
 

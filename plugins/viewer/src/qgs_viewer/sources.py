@@ -11,7 +11,6 @@ from torch import Tensor
 from qgs.analysis.reconstruction import choose_frames, choose_sample
 from qgs.analysis.scenes import chosen_scene, frame_list
 from qgs.composer import Recipe, resolve
-from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
@@ -190,9 +189,7 @@ def _of_model(name: str, wanted: Wanted) -> Source:
 def _scene(recipe: Recipe, wanted: Wanted) -> Scene:
     """The scene at --photos, or the first test scene of the recipe's data, or the named one."""
     if wanted.photos is not None:
-        registry, _ = load_sound_plugins()
-        sources = registry.components("data")
-        return chosen_scene(recipe, wanted.photos, wanted.size, wanted.scene, sources)[0]
+        return chosen_scene(recipe, wanted.photos, wanted.size, wanted.scene)[0]
     if recipe.data_config is None:
         raise ValueError("the checkpoint's recipe has no data: name a folder of photos after it")
     data = recipe.build_data()
