@@ -13,7 +13,7 @@ from PIL import Image
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
 from browser import CHROMIUM, Page, chromium
-from qgs_viewer.section import scene_section
+from qgs_viewer.section import scene_section, self_attention_section
 from small import VIEWS, Walk, model_of
 
 from qgs.analysis.report import GROUP, Contender, Report, report_html
@@ -45,9 +45,25 @@ def page_of_two_scenes() -> str:
     return report_html(report)
 
 
-def test_the_viewer_offers_its_section() -> None:
-    (entry,) = (e for e in entry_points(group=GROUP) if e.module.startswith("qgs_viewer"))
-    assert entry.load() is scene_section
+def test_the_viewer_offers_its_sections() -> None:
+    found = {e.name: e.load() for e in entry_points(group=GROUP) if e.module.startswith("qgs_view")}
+    assert found == {"scene": scene_section, "self_attention": self_attention_section}
+
+
+def test_self_attention_is_shown_of_models_that_tell_it() -> None:
+    sample = sample_of(1, 2)
+    shown = [(one, one.model(sample.inputs)) for one in contenders()]
+    (tile,) = self_attention_section(shown, sample).figures[""]
+    (single,) = self_attention_section(shown[:1], sample).figures[""]
+    assert np.asarray(tile.image).shape[1] > 1.5 * np.asarray(single.image).shape[1]
+    silent = contenders()[:1]
+    for layer in silent[0].model.decoder:
+        layer.self_attention.explain = lambda *parts: None
+    try:
+        assert not self_attention_section([(silent[0], shown[0][1])], sample).figures
+    finally:
+        for layer in silent[0].model.decoder:
+            del layer.self_attention.explain
 
 
 def test_the_section_has_all_models_and_the_code_of_the_viewer_once() -> None:

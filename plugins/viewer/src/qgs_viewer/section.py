@@ -1,12 +1,15 @@
-"""The section of report.html in which a reader turns the scene."""
+"""Sections of report.html: the scene to turn, and which queries read which."""
 
 import torch
 
 from qgs.analysis.report import ReportSection, Shown, Tile
 from qgs.data.sampling import Sample
+from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import rgb_picture, side_by_side
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras
+from qgs_viewer.figures import graph
+from qgs_viewer.figures.exhibits import exhibit
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.page import scenes_html, shared_start
 from qgs_viewer.server import FIELD_OF_VIEW, first_eye
@@ -34,6 +37,23 @@ def scene_section(shown: Shown, sample: Sample) -> ReportSection:
         "taken, and the anchors of the last layer as dots where there are any. Drag to turn, "
         "scroll to come closer; W, A, S, D, Q and E walk.",
         {"": [tile]},
+        width=600,
+    )
+
+
+def self_attention_section(shown: Shown, sample: Sample) -> ReportSection:
+    """Self-attention of some queries as a graph, first and last layer, of models that tell it."""
+    exhibits = [exhibit(contender.name, contender.model, sample) for contender, _ in shown]
+    told = [e for e in exhibits if e.look.self_attention(0, e.look.depth) is not None]
+    view = sample.targets.cameras[:, :1]
+    chosen = {e.name: e.notable(graph.QUERIES, view) for e in told}
+    tiles = [Tile(figure_picture(graph.figure(told, chosen), dpi=144))] if told else []
+    return ReportSection(
+        "Which queries read which",
+        f"The first scene from above, input cameras as triangles. Every dark dot is a query: its "
+        f"anchor before the layer, or where it has none, the place of what it adds to the photos. "
+        f"Lines lead from {graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
+        {"": tiles} if tiles else {},
         width=600,
     )
 
