@@ -304,8 +304,8 @@ class Gaussians(TensorContainer):
         return map_tensors(lambda x: x[index], self)
 
     def most_opaque(self, count: int) -> Self:
-        """The `count` most opaque of each scene, all where there are fewer, opaque ones first."""
-        chosen = self.opacities.topk(min(count, self.count), -1).indices
+        """The `count` most opaque of each scene, all where there are fewer, in their order."""
+        chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
         parts = {name: getattr(self, name) for name in ("means", "scales", "quats", "colors")}
         wide = {
             k: x.gather(-2, chosen[..., None].expand(*chosen.shape, x.shape[-1]))

@@ -22,7 +22,7 @@ def convert(
     from qgs.io.splat import save_splat
 
     writers = {".ply": save_ply, ".splat": save_splat}
-    if out.suffix not in writers:
+    if (suffix := out.suffix.lower()) not in writers:
         raise ValueError(
             f"{out} must end in .ply or .splat; for .spz, .sog and others give the PLY to "
             "PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT.sog`"
@@ -30,7 +30,7 @@ def convert(
     if out.exists():
         raise FileExistsError(f"{out} exists; choose another file, or delete it yourself")
     gaussians = load_ply(source)
-    kept = gaussians.most_opaque(gaussians.count if count is None else count)
-    writers[out.suffix](kept, out)
+    kept = gaussians if count is None else gaussians.most_opaque(count)
+    writers[suffix](kept, out)
     size = f"{out.stat().st_size / 1e6:.2f} MB"
     typer.echo(f"wrote {out}: {kept.count:,} of {gaussians.count:,} Gaussians, {size}")
