@@ -1,0 +1,37 @@
+"""The notebook runs top to bottom, and can be read without running it."""
+
+import json
+import re
+from typing import Any
+
+import pytest
+from guide_pages import DOCS
+from run_notebook import run
+
+FILE = DOCS / "tour.ipynb"
+
+
+def outputs(notebook: dict[str, Any]) -> list[list[str]]:
+    """For each cell of code the kinds of its outputs."""
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    return [[m for o in c["outputs"] for m in o.get("data", [o["output_type"]])] for c in cells]
+
+
+def test_what_the_notebook_shows_is_stored() -> None:
+    text = FILE.read_text(encoding="utf-8")
+    shown = outputs(json.loads(text))
+    assert all(shown)
+    assert sum("image/png" in kinds for kinds in shown) >= 6
+    assert sum("text/html" in kinds for kinds in shown) == 2
+    assert len(text) < 1_000_000
+    assert not re.search(r'[" ]/(?:work|home|root|Users)/', text)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_shows_what_is_stored() -> None:
+    stored = json.loads(FILE.read_text(encoding="utf-8"))
+    before = outputs(stored)
+    names = run(stored)
+    assert outputs(stored) == before
+    assert names["done"].steps > 1
+    assert (names["run"] / "room.ply").is_file()
