@@ -24,8 +24,8 @@ from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views, map_tensors
 
-_RATES = {"means": 7e-3, "log_scales": 4e-2, "quats": 1e-2}  # of means: of the scene's size
-_RATES |= {"opacity_logits": 0.1, "color_logits": 5e-2}
+_RATES = {"means": 3.5e-3, "log_scales": 2e-2, "quats": 5e-3}  # of means: of the scene's size
+_RATES |= {"opacity_logits": 0.05, "color_logits": 2.5e-2}
 _LAST, _LAST_OF_MEANS = 0.1, 0.01  # of the rates, at the end
 _SSIM = 0.25  # weight beside the mean squared error
 _SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos
