@@ -118,6 +118,11 @@ def test_a_ply_shows_gaussians_alone(finished: Path) -> None:
     assert found.gaussians.count == load_ply(finished / "scene/gaussians.ply").count
 
 
+def test_a_scene_that_the_data_lack_is_told(finished: Path) -> None:
+    with pytest.raises(ValueError, match="the data of the recipe holds no scene 'nowhere'"):
+        open_source(str(finished / "model.safetensors"), Wanted(scene="nowhere"))
+
+
 def test_options_that_say_nothing_to_a_ply_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`PHOTOS`, `--set` do not apply to a PLY file"):
         open_source(str(tmp_path / "a.ply"), Wanted(photos="x", overrides=["views.scale=auto"]))

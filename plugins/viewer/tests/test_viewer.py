@@ -215,6 +215,9 @@ def test_read_patches_stand_before_their_photos(server, panel) -> None:
     marks = server.scene.get_handle_by_name("/patches")
     assert len(marks.points) == panel.choice.patches
     assert len(np.unique(marks.colors, axis=0)) > 1
+    points = np.array(marks.points)
+    apart = np.linalg.norm(points[:, None] - points, axis=-1)
+    assert marks.point_size < np.min(apart[apart > 1e-6]) < 4 * marks.point_size
     cameras, depth = panel.look.views.cameras[0], panel.stage.photo_depth
     local = (
         torch.linalg.inv(cameras.c2w.double())

@@ -135,7 +135,10 @@ class Panel:
         self.number.value = NONE if query is None else query  # calls back
 
     def take(self, frames: Sequence[int]) -> None:
-        """Reconstruct from these frames. Raises ValueError for frames that do not fit."""
+        """Reconstruct from these frames, unless they are shown.
+
+        Raises ValueError for frames that do not fit, and OSError as photos do.
+        """
         with self._lock:
             if tuple(frames) == tuple(self.look.frames):
                 return

@@ -163,7 +163,7 @@ class Stage:
         self._lines("/reading", lines, colors[:, None].repeat(2, 1), 2.0)
         self.scene.add_point_cloud(
             "/patches", reading.points.float().numpy(), colors,
-            point_size=2 * self.anchor_radius, point_shape="square", precision="float32",
+            point_size=reading.side / 2, point_shape="square", precision="float32",
         )  # fmt: skip
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
