@@ -217,7 +217,7 @@ def test_read_patches_stand_before_their_photos(server, panel) -> None:
     assert len(np.unique(marks.colors, axis=0)) > 1
     points = np.array(marks.points)
     apart = np.linalg.norm(points[:, None] - points, axis=-1)
-    assert marks.point_size < np.min(apart[apart > 1e-6]) < 4 * marks.point_size
+    assert 2 * marks.point_size < np.min(apart[apart > 1e-6]) < 8 * marks.point_size
     cameras, depth = panel.look.views.cameras[0], panel.stage.photo_depth
     local = (
         torch.linalg.inv(cameras.c2w.double())

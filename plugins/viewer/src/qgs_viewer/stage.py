@@ -79,8 +79,8 @@ class Stage:
 
     @property
     def anchor_radius(self) -> float:
-        """Half the size of an anchor's dot, shown world."""
-        return 0.005 * self.unit
+        """Half the width of an anchor's dot, shown world; viser's `point_size` is such a half."""
+        return 0.01 * self.unit
 
     def _draw_photos(self, look: Look, every: Cameras | None) -> None:
         self.scene.remove_by_name(_VIEWS)
@@ -116,7 +116,7 @@ class Stage:
         numbers, colors = anchor_colors(look.queries, choice)
         self.scene.add_point_cloud(
             "/anchors", found.centers[0].float().numpy()[numbers], colors,
-            point_size=2 * self.anchor_radius, point_shape="circle", precision="float32",
+            point_size=self.anchor_radius, point_shape="circle", precision="float32",
         )  # fmt: skip
 
     def _draw_support(self, look: Look, choice: Choice) -> None:
@@ -145,7 +145,8 @@ class Stage:
     def _draw_reading(self, look: Look, choice: Choice) -> None:
         """Lines from where the query was when it read to the patches that it read most.
 
-        A square marks each, a little nearer to the camera than the photo, which would hide it.
+        A square of half its width marks each, a little nearer to the camera than the photo, which
+        would hide it.
         """
         reading = None
         if choice.query is not None and choice.layer and choice.patches:
@@ -163,7 +164,7 @@ class Stage:
         self._lines("/reading", lines, colors[:, None].repeat(2, 1), 2.0)
         self.scene.add_point_cloud(
             "/patches", reading.points.float().numpy(), colors,
-            point_size=reading.side / 2, point_shape="square", precision="float32",
+            point_size=reading.side / 4, point_shape="square", precision="float32",
         )  # fmt: skip
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
