@@ -50,12 +50,15 @@ def network(page: Page, own: str) -> list[str]:
 @pytest.mark.parametrize("model", MODELS)
 def test_the_viewer(model: str, tmp_path: Path) -> None:
     source = open_source(model, Wanted())
+    source.title = "<b id=named>*name*</b> 1. [x](y)"
     with quiet_server() as server, chromium(tmp_path / "profile") as page:
         panel = Panel(server, source)
         address = f"127.0.0.1:{server.get_port()}"
         page.open(f"http://{address}")
         page.until("the canvas", "!!document.querySelector('canvas')")
         opened = drawn(page, tmp_path, "opened")
+        page.until("its name", f"document.body.innerText.includes({source.title!r})")
+        assert page.evaluate("document.querySelector('#named')") is None
 
         for x, y in (
             (620, 380),

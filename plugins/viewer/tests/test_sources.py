@@ -3,12 +3,17 @@ import shutil
 from pathlib import Path
 
 import pytest
-from qgs_viewer.sources import FixedSource, ModelSource, Wanted, open_source
-from small import VIEWS, Walk, model_of
+import torch
+from qgs_viewer.files import FinishedScene
+from qgs_viewer.sources import FixedSource, ModelSource, Wanted, _difference, open_source
+from small import QUERIES, VIEWS, Walk, model_of
 
 import qgs
 from qgs.analysis.reconstruction import choose_sample, reconstruct, write_reconstruction
+from qgs.composer import resolve
+from qgs.contracts import ViewsConfig
 from qgs.io.ply import load_ply
+from qgs.model import QueryGaussianModel
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +28,31 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+BY_DISTANCE = VIEWS.model_copy(update={"scale": "distance", "scale_factor": 0.7})
+
+
+def finished_by_distance(folder: Path, views: ViewsConfig) -> QueryGaussianModel:
+    """A model of a recipe with BY_DISTANCE, and in folder/scene what it made of frames 1 and 4.
+
+    views: how they were brought into its world.
+    """
+    torch.manual_seed(0)
+    changes = [f"model.queries.count={QUERIES}", "views.scale=distance", "views.scale_factor=0.7"]
+    qgs.save(
+        resolve("recipes/tiny/locus.yaml", changes).build_model().eval(),
+        folder / "model.safetensors",
+    )
+    model = qgs.load(folder / "model.safetensors")
+    sample, world = choose_sample(Walk(), views, 2, (1, 4), (0, 2, 3, 5))
+    write_reconstruction(model, reconstruct(model, sample, world), folder / "scene")
+    return model
+
+
 def test_a_finished_reconstruction_has_its_queries(finished: Path) -> None:
     source = open_source(str(finished / "scene"), Wanted())
     assert isinstance(source, ModelSource)
     assert (list(source.frames), source.notes) == ([0, 1], ())
-    assert source.labels[0] == "0 (photos/01.png)"
+    assert list(source.labels) == [f"photos/0{frame}.png" for frame in (1, 4, 2, 3)]
     look, ply = source.look(source.frames), load_ply(finished / "scene/gaussians.ply")
     assert look.support(1) is not None
     spread = (ply.means - ply.means.mean(1, keepdim=True)).norm(dim=-1).mean()
@@ -49,7 +74,7 @@ def changed_copy(finished: Path, tmp_path: Path, **record: object) -> Path:
     [
         ({"model": ""}, "does not tell its model"),
         ({"tuning": {"steps": 3}}, "tuned or refined"),
-        ({"model": "gone/model.safetensors"}, "is not there"),
+        ({"model": "gone/model.safetensors"}, "no checkpoint at gone/model.safetensors"),
     ],
 )
 def test_without_its_model_it_is_shown_as_it_is(
@@ -93,6 +118,62 @@ def test_a_ply_shows_gaussians_alone(finished: Path) -> None:
     assert found.gaussians.count == load_ply(finished / "scene/gaussians.ply").count
 
 
+def test_a_scene_that_the_data_lack_is_told(finished: Path) -> None:
+    with pytest.raises(ValueError, match="the data of the recipe holds no scene 'nowhere'"):
+        open_source(str(finished / "model.safetensors"), Wanted(scene="nowhere"))
+
+
 def test_options_that_say_nothing_to_a_ply_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="a PLY file, to which photos, frames says nothing"):
-        open_source(str(tmp_path / "a.ply"), Wanted(photos="x", frames="1"))
+    with pytest.raises(ValueError, match="`PHOTOS`, `--set` do not apply to a PLY file"):
+        open_source(str(tmp_path / "a.ply"), Wanted(photos="x", overrides=["views.scale=auto"]))
+    with pytest.raises(ValueError, match=r"`--size` does not apply .* leave it out"):
+        open_source(str(tmp_path / "a.ply"), Wanted(size=(64, 64)))
+
+
+def test_changed_inputs_have_the_scale_of_their_own_distance(tmp_path: Path) -> None:
+    model = finished_by_distance(tmp_path, BY_DISTANCE)
+    source = open_source(str(tmp_path / "scene"), Wanted())
+    assert isinstance(source, ModelSource)
+    frames = [source.labels.index(f"photos/0{frame}.png") for frame in (1, 2)]
+    seen = source.look(frames).views
+    true = ModelSource(model, Walk(), BY_DISTANCE, (1, 4), "of the photos").look((1, 2)).views
+    assert seen is not None
+    assert true is not None
+    torch.testing.assert_close(seen.cameras.c2w, true.cameras.c2w, atol=1e-4, rtol=1e-4)
+
+
+def test_a_scale_that_was_overridden_is_kept(tmp_path: Path) -> None:
+    finished_by_distance(tmp_path, VIEWS)
+    assert isinstance(open_source(str(tmp_path / "scene"), Wanted()), ModelSource)
+
+
+def test_a_model_is_not_fetched_on_the_word_of_a_file(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("qgs_viewer.sources.checkpoint_of", asked.append)
+    url = "https://example.org/model.safetensors"
+    source = open_source(str(changed_copy(finished, tmp_path, model=url)), Wanted())
+    assert f"`qgs view {url} PHOTOS`" in source.notes[0]
+    assert asked == []
+
+
+def test_a_model_that_cannot_be_read_leaves_the_gaussians(finished: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(b"no checkpoint")
+    source = open_source(str(changed_copy(finished, tmp_path, model=str(broken))), Wanted())
+    assert isinstance(source, FixedSource)
+    assert "broken.safetensors" in source.notes[0]
+
+
+def test_what_differs_is_told_in_words() -> None:
+    means = torch.rand(1, 20, 3)
+    assert _difference(means, means) == ""
+    assert _difference(means[:, :10], means) == "10 instead of 20"
+    assert "differ" in _difference(means + 1, means)
+    assert "differ" in _difference(means * float("nan"), means)
+
+
+def test_cameras_without_a_photo_have_their_number_in_the_scene(tmp_path: Path) -> None:
+    scene = FinishedScene("walk", tmp_path, [{"frame": 7, "kind": "input"}])
+    assert scene.label(0) == "frame 7"

@@ -60,6 +60,107 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel) -> Non
     assert nodes(server) == {*BASE, "/anchors"}
 
 
+def test_numbers_that_no_query_has_change_nothing(panel) -> None:
+    panel.number.value = QUERIES - 1
+    for typed in (QUERIES, 300, -7):
+        panel.number.value = typed
+        assert panel.choice.query == QUERIES - 1
+    panel.pick(2)
+    assert (panel.choice.query, panel.number.value) == (2, 2)
+
+
+def test_a_choice_that_cannot_be_drawn_is_not_kept(panel, monkeypatch) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("not drawn")
+
+    panel.pick(3)
+    monkeypatch.setattr("qgs_viewer.stage.painted", fails)
+    with pytest.raises(RuntimeError, match="not drawn"):
+        panel.choose(query=4)
+    assert panel.choice.query == 3
+
+
+def test_gaussians_are_painted_anew_only_where_their_paint_changes(panel, monkeypatch) -> None:
+    from qgs_viewer import stage
+
+    drawn: list[str] = []
+    update, paint = panel.stage.update, stage.painted
+    monkeypatch.setattr(panel.stage, "update", lambda *a: (drawn.append("stage"), update(*a)))
+    monkeypatch.setattr(stage, "painted", lambda *a: (drawn.append("paint"), paint(*a))[1])
+    panel.pick(3)
+    panel.choose(others="shown", by_query=True)
+    assert drawn == 2 * ["stage", "paint"]
+    panel.choose(layer=1, patches=5, anchors=False, photos=False)
+    panel.choose(layer=1)
+    assert drawn[4:] == ["stage"]
+    panel.boxes[0].value = True
+    assert drawn[5:] == ["stage", "paint"]
+
+
+def test_text_is_shown_as_it_is(server) -> None:
+    from html import unescape
+
+    from qgs_viewer.panel import Panel, plain
+
+    text = "<script>alert(1)</script> *a* _b_ [c](d) `e` {f} # ~~g~~ | \\ &lt;"
+    assert re.sub(r"&#\d+;", "", plain(text)).replace(" ", "").isalnum()
+    assert unescape(plain(text)) == text
+    assert plain("1. a\n\n    b") == "1&#46; a b"
+    server.gui.reset()
+    source = source_of("locus")
+    source.title, source.notes = f"title {text}", (f"note {text}",)
+    Panel(server, source)
+    contents = [
+        handle.content
+        for handle in all_handles(server.gui)
+        if isinstance(handle, viser.GuiMarkdownHandle)
+    ]
+    assert sum("title " in content or "note " in content for content in contents) == 2
+    assert "<script" not in "".join(contents)
+
+
+def all_handles(gui: "viser.GuiApi") -> Iterator[object]:
+    waiting = list(gui._container_handle_from_uuid["root"]._children.values())
+    while waiting:
+        handle = waiting.pop()
+        yield handle
+        waiting += getattr(handle, "_children", {}).values()
+
+
+def test_many_photos_are_named_and_taken_by_a_button(server, monkeypatch) -> None:
+    from qgs_viewer import panel as module
+
+    monkeypatch.setattr(module, "MOST_BOXES", 3)
+    server.gui.reset()
+    panel = module.Panel(server, source_of("locus"))
+    (button,) = [h for h in all_handles(server.gui) if isinstance(h, viser.GuiButtonHandle)]
+    before = panel.look
+    panel.frames.value = "0,4"
+    assert panel.look is before
+    button.value = True
+    assert panel.look.frames == (0, 4)
+    after = panel.look
+    button.value = True
+    assert panel.look is after
+
+
+@pytest.mark.parametrize("error", [ValueError("too few"), OSError("no photo")])
+def test_what_is_refused_is_told_and_taken_back(panel, monkeypatch, error: Exception) -> None:
+    from types import SimpleNamespace
+
+    def fails(frames: object) -> None:
+        raise error
+
+    told: list[str] = []
+    client = SimpleNamespace(add_notification=lambda _, text, color: told.append(text))
+    monkeypatch.setattr(panel.source, "look", fails)
+    for frame in (0, 1):
+        panel.boxes[frame]._impl.value = frame == 0  # as messages of a browser set it
+    panel._reframed(SimpleNamespace(client=client))
+    assert told == [str(error)]
+    assert [frame for frame, box in enumerate(panel.boxes) if box.value] == [1, 4]
+
+
 @pytest.mark.parametrize("panel", ["tokengs"], indirect=True)
 def test_a_model_without_anchors_has_the_rest(server, panel) -> None:
     panel.pick(3)
@@ -77,6 +178,7 @@ def test_other_inputs_make_another_scene_at_once(server, panel) -> None:
     for box in panel.boxes:
         box.value = False
     assert panel.look.frames == (4,)  # none at all is refused: the last scene stays
+    assert [box.value for box in panel.boxes] == [frame == 4 for frame in range(6)]
     assert nodes(server) >= {"/views/0"}
     assert "/views/1" not in nodes(server)
 
@@ -96,6 +198,37 @@ def test_a_click_picks_by_anchor_or_by_gaussian(panel) -> None:
     way = panel.look.splats.centers[gaussian] - eye
     assert panel.under(eye, way / np.linalg.norm(way)) is not None
     assert panel.under(eye, np.array([0.0, 0.0, -1.0])) is None
+
+
+def test_what_is_hidden_is_not_picked(panel) -> None:
+    support = panel.look.support(panel.look.depth)
+    eye = np.array([0.0, 0.0, -3.0])
+    ways = [support.centers[0, query].numpy() - eye for query in range(QUERIES)]
+    panel.choose(query=5, others="hidden")
+    picked = {panel.under(eye, way / np.linalg.norm(way)) for way in ways}
+    assert picked <= {5, None}
+    assert 5 in picked
+
+
+def test_read_patches_stand_before_their_photos(server, panel) -> None:
+    panel.pick(3)
+    marks = server.scene.get_handle_by_name("/patches")
+    assert len(marks.points) == panel.choice.patches
+    assert len(np.unique(marks.colors, axis=0)) > 1
+    points = np.array(marks.points)
+    apart = np.linalg.norm(points[:, None] - points, axis=-1)
+    assert 2 * marks.point_size < np.min(apart[apart > 1e-6]) < 8 * marks.point_size
+    cameras, depth = panel.look.views.cameras[0], panel.stage.photo_depth
+    local = (
+        torch.linalg.inv(cameras.c2w.double())
+        @ torch.cat(
+            [torch.from_numpy(np.array(marks.points)).double(), torch.ones(len(marks.points), 1)], 1
+        ).mT
+    )
+    before = local[:, 2]  # depths (V, k): each patch is on one of the photos
+    assert (((before > 0.9 * depth) & (before < depth)).any(0)).all()
+    panel.choose(patches=0)
+    assert server.scene.get_handle_by_name("/patches") is None
 
 
 def test_controls_say_what_was_chosen(server, panel) -> None:

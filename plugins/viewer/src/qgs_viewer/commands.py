@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import webbrowser
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -42,12 +44,17 @@ def view(
         typer.Option("--set", help="Override of `views`, such as views.scale=auto; repeatable."),
     ] = None,
     html: Annotated[
-        Path | None, typer.Option(help="Write the scene as one HTML page instead of serving it.")
+        Path | None, typer.Option(help="Write the scene as one new HTML page; serve nothing.")
     ] = None,
     host: Annotated[
         str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see it.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one.")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port, or the next free one.")] = (
+        8080
+    ),
+    show: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
+    ] = True,
     device: Device = "auto",
 ) -> None:
     """Turn a reconstruction, pick a query, see its anchor layer by layer and what it reads."""
@@ -56,18 +63,22 @@ def view(
     pixels = parse_size(size)
 
     from qgs.engine.distributed import choose_device
+    from qgs.io.files import refuse_existing, write_text
     from qgs_viewer.sources import Wanted, open_source
 
+    if html is not None:
+        refuse_existing(html)
     console = Console()
     wanted = Wanted(photos, scene, frames, inputs, pixels, overrides or (), choose_device(device))
     opened = open_source(source, wanted)
     for note in opened.notes:
         console.print(note, soft_wrap=True, highlight=False, markup=False)
     if html is not None:
-        from qgs.io.files import write_text
         from qgs_viewer.page import scene_html
 
-        write_text(html, scene_html(opened.look(opened.frames)))
+        page = scene_html(opened.look(opened.frames))
+        refuse_existing(html)
+        write_text(html, page)
         console.print(f"wrote {html}", soft_wrap=True)
         return
 
@@ -77,7 +88,22 @@ def view(
     with quiet_server(host, port, opened.title) as server:
         Panel(server, opened)
         name = "localhost" if host in {"127.0.0.1", "0.0.0.0"} else host
-        where = f"http://{name}:{server.get_port()}"
-        console.print(f"{opened.title}: {where} (Ctrl-C ends it)", soft_wrap=True, highlight=False)
+        port = server.get_port()
+        where = f"http://{name}:{port}"
+        others = f", for other machines http://{_own_address()}:{port}" if host == "0.0.0.0" else ""
+        text = f"{opened.title}: {where}{others} (Ctrl-C ends it)"
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        if show:
+            webbrowser.open(where)
         with suppress(KeyboardInterrupt):
             server.sleep_forever()
+
+
+def _own_address() -> str:
+    """The address that this machine has for others; its name where no network is up."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: it only chooses the way out
+        except OSError:
+            return socket.gethostname()
+        return str(probe.getsockname()[0])

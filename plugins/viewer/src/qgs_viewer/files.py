@@ -59,6 +59,11 @@ class FinishedScene(Scene):
             pictures.append(torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255)
         return torch.stack(pictures)
 
+    def label(self, frame: int) -> str:
+        """The photo's file, or its number in the scene, not its place in cameras.json."""
+        view = self._views[frame]
+        return str(view.get("photo") or f"frame {view['frame']}")
+
     def frame_name(self, frame: int) -> str:
         """The photo's file, or its number in the scene."""
         view = self._views[frame]

@@ -113,15 +113,21 @@ class Look:
         points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
         shares = weights.weights[0, :, 0].float().mean(0).cpu()
         strongest = shares.topk(min(count, len(shares)))
-        return Reading(self.placement.points(points.cpu()[strongest.indices]), strongest.values)
+        side = depth * cameras.size[1] / grid[2] / float(cameras.intrinsics[0, 0])
+        read = self.placement.points(points.cpu()[strongest.indices])
+        return Reading(read, strongest.values, side)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Patches that a query reads: points (k, 3) in the shown world, shares (k,) of attention."""
+    """Patches that a query reads: points (k, 3) in the shown world, shares (k,) of attention.
+
+    side: width of a patch there.
+    """
 
     points: Tensor
     shares: Tensor
+    side: float
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """The controls beside the scene: what is shown, which query, which input photos."""
 
+import re
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from threading import RLock
@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from qgs.analysis.scenes import frame_list
-from qgs_viewer.choice import Choice, Others
+from qgs_viewer.choice import Choice, Others, anchor_colors, painted
 from qgs_viewer.look import Look
 from qgs_viewer.pictures import PARTS, attention_parts
 from qgs_viewer.placement import hit, near_ray
@@ -35,10 +35,10 @@ class Panel:
 
     def __init__(self, server: viser.ViserServer, source: Source) -> None:
         self.server, self.source = server, source
-        self.stage, self.choice = Stage(server.scene), Choice()
+        self.stage = Stage(server.scene)
         self.look: Look = source.look(source.frames)
         self.choice = Choice(layer=self.look.depth)
-        self._lock, self._quiet = RLock(), False
+        self._lock, self._resetting = RLock(), False
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         stand(server, self.look)
@@ -49,14 +49,14 @@ class Panel:
             self._inputs()
         if source.notes:
             with server.gui.add_folder("remarks", expand_by_default=False):
-                server.gui.add_markdown("\n\n".join(source.notes))
+                server.gui.add_markdown("\n\n".join(map(plain, source.notes)))
         self.stage.put(self.look, self.choice, source.cameras())
         if self.look.queries:
             server.scene.on_click()(self._clicked)
 
     def _head(self) -> None:
         gui, queries = self.server.gui, self.look.queries
-        told = f"**{self.source.title}**\n\n{self.look.gaussians.count:,} Gaussians"
+        told = f"**{plain(self.source.title)}**\n\n{self.look.gaussians.count:,} Gaussians"
         if queries:
             told += f" of {queries:,} queries. Click on one"
             told += "." if self.look.support(0) is None else ", or on an anchor."
@@ -93,8 +93,11 @@ class Panel:
             self.pictures = {part: add(label=_CAPTIONS[part]) for part in PARTS}
 
     def _picked(self) -> dict[str, Any]:
+        """What is typed arrives key by key: numbers that no query has change nothing."""
         number = int(self.number.value)
-        return {"query": None if number == NONE else number}
+        if number == NONE:
+            return {"query": None}
+        return {"query": number} if 0 <= number < self.look.queries else {}
 
     def _inputs(self) -> None:
         gui, labels = self.server.gui, self.source.labels
@@ -108,67 +111,74 @@ class Panel:
                 text = ",".join(map(str, self.source.frames))
                 hint = f"Numbers or file names, commas between; 0 to {len(labels) - 1}."
                 self.frames = gui.add_text("frames", text, hint=hint)
-                self.frames.on_update(self._reframed)
+                gui.add_button("Reconstruct").on_click(self._reframed)
 
     def _on(self, control: Any, change: Callable[[], dict[str, Any]]) -> None:
         @control.on_update
         def _(event: Any) -> None:
             with self._lock:
-                if not self._quiet:
-                    self.choose(**change())
+                self.choose(**change())
 
     def choose(self, **changes: Any) -> None:
         """Change the choice (see `Choice`) and draw it."""
-        with self._lock, self.server.atomic():
-            self.choice = replace(self.choice, **changes)
-            self.stage.update(self.look, self.choice)
-            self._read()
+        with self._lock:
+            choice = replace(self.choice, **changes)
+            if choice == self.choice:
+                return
+            with self.server.atomic():
+                self.stage.update(self.look, choice)
+                self._read(self.look, choice)
+            self.choice = choice
 
     def pick(self, query: int | None) -> None:
         """Pick a query, or none."""
-        with self._silently():
-            self.number.value = NONE if query is None else query
-        self.choose(query=query)
+        self.number.value = NONE if query is None else query  # calls back
 
     def take(self, frames: Sequence[int]) -> None:
-        """Reconstruct from these frames. Raises ValueError for frames that do not fit."""
+        """Reconstruct from these frames, unless they are shown.
+
+        Raises ValueError for frames that do not fit, and OSError as photos do.
+        """
         with self._lock:
-            self.look = self.source.look(frames)
+            if tuple(frames) == tuple(self.look.frames):
+                return
+            look = self.source.look(frames)
             with self.server.atomic():
-                self.stage.put(self.look, self.choice, self.source.cameras())
-                self._read()
+                self.stage.put(look, self.choice, self.source.cameras())
+                self._read(look, self.choice)
+            self.look = look
 
-    @contextmanager
-    def _silently(self) -> Any:
-        """While controls are set by the program, they do not call back."""
-        with self._lock:
-            self._quiet = True
-            try:
-                yield
-            finally:
-                self._quiet = False
-
-    def _read(self) -> None:
+    def _read(self, look: Look, choice: Choice) -> None:
         """The attention of the picked query, and where it stands."""
-        if not self.look.queries:
+        if not look.queries:
             return
-        query, layer = self.choice.query, self.choice.layer
-        found = {} if query is None else attention_parts(self.look, query, layer)
+        query, layer = choice.query, choice.layer
+        found = {} if query is None else attention_parts(look, query, layer)
         for part, handle in self.pictures.items():
             handle.visible = part in found
             if part in found:
                 handle.image = found[part]
-        self._said.content = "" if query is None else told(self.look, query, layer)
+        self._said.content = "" if query is None else told(look, query, layer)
 
     def _reframed(self, event: Any) -> None:
         with self._lock:
-            if self._quiet:
+            if self._resetting:
                 return
             try:
                 self.take(self._frames())
-            except ValueError as error:
+            except (ValueError, OSError) as error:
+                self._reset_boxes()
                 if event.client is not None:
                     event.client.add_notification("Not reconstructed", str(error), color="red")
+
+    def _reset_boxes(self) -> None:
+        """Check boxes say again what is shown; what was typed stays, to be mended."""
+        if len(self.source.labels) > MOST_BOXES:
+            return
+        self._resetting = True
+        for frame, box in enumerate(self.boxes):
+            box.value = frame in self.look.frames
+        self._resetting = False
 
     def _frames(self) -> list[int]:
         if len(self.source.labels) <= MOST_BOXES:
@@ -183,15 +193,21 @@ class Panel:
                 self.pick(query)
 
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
-        """The query under a ray, by its anchor where that is shown, or by its Gaussians."""
+        """The query under a ray of what is shown: by its anchor, or by its Gaussians."""
         found = self.look.support(self.choice.layer) if self.choice.anchors else None
         if found is not None:
-            radius = self.stage.anchor_radius
-            anchor = near_ray(found.centers[0].numpy(), origin, direction, radius)
+            numbers, _ = anchor_colors(self.look.queries, self.choice)
+            centers = found.centers[0].numpy()[numbers]
+            anchor = near_ray(centers, origin, direction, self.stage.anchor_radius)
             if anchor is not None:
-                return anchor
-        gaussian = hit(self.look.splats, origin, direction)
+                return int(numbers[anchor])
+        gaussian = hit(painted(self.look, self.choice), origin, direction)
         return None if gaussian is None else self.look.query_of(gaussian)
+
+
+def plain(text: str) -> str:
+    """`text` as Markdown that shows it as it is: no HTML, no formats, one line."""
+    return re.sub(r"[^\w\s]|_", lambda sign: f"&#{ord(sign[0])};", " ".join(text.split()))
 
 
 def told(look: Look, query: int, layer: int) -> str:
@@ -210,5 +226,5 @@ def told(look: Look, query: int, layer: int) -> str:
             moved = (found.centers[0, query] - before.centers[0, query]).norm()
             lines.append(f"moved by {float(moved):.3f} in this layer")
     if layer and look.attention(query, layer) is None:
-        lines.append("the attention of this layer tells nothing of itself")
+        lines.append("this component does not report its attention")
     return "\n\n".join(lines)

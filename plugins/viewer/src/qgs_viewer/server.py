@@ -1,4 +1,4 @@
-"""A server of viser that says nothing itself, and where it first stands in a scene."""
+"""A viser server that prints nothing, and where its viewers first stand in a scene."""
 
 import io
 from collections.abc import Iterator
@@ -6,6 +6,7 @@ from contextlib import contextmanager, redirect_stdout
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 import viser
 
 from qgs_viewer.look import Look
@@ -13,6 +14,8 @@ from qgs_viewer.stage import distance_to
 
 FIELD_OF_VIEW = 0.95
 """Of the viewer's window, vertical, radians."""
+SHORT = 0.3
+"""Length of the mean of unit vectors below which they have no direction in common."""
 
 
 @contextmanager
@@ -32,20 +35,38 @@ def quiet_server(
 def stand(server: viser.ViserServer, look: Look) -> None:
     """New viewers stand behind and above the input cameras, or before a scene without cameras."""
     eye, target = first_eye(look)
+    up = up_of(look).numpy()
+    server.scene.set_up_direction(up)
     server.initial_camera.position, server.initial_camera.look_at = eye, target
-    server.initial_camera.up, server.initial_camera.fov = (0.0, -1.0, 0.0), FIELD_OF_VIEW
+    server.initial_camera.up, server.initial_camera.fov = up, FIELD_OF_VIEW
+
+
+def up_of(look: Look) -> torch.Tensor:
+    """Up for the input cameras together, unit (3,), shown world; -y without cameras."""
+    if look.views is None:
+        return torch.tensor([0.0, -1.0, 0.0]).double()
+    down = look.views.cameras.c2w[0, :, :3, 1].cpu().double()
+    mean = down.mean(0)
+    mean = mean if mean.norm() >= SHORT else down[0]
+    return -(look.placement.rotation @ F.normalize(mean, dim=0))
 
 
 def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
-    """Where the viewer stands at first and what it looks at, both (3,), shown world."""
+    """Where the viewer stands at first and what it looks at, both (3,), shown world.
+
+    Behind cameras that look the same way; outside of those that stand around something.
+    """
     middle = look.placement.points(look.gaussians.means[0]).median(0).values
     unit = distance_to(look)
     if look.views is None:
         return (middle - torch.tensor([0.0, 0.0, 2.5 * unit])).numpy(), middle.numpy()
-    c2w = look.views.cameras.c2w[0]
-    eye = look.placement.points(c2w[:, :3, 3]).mean(0)
-    forward = look.placement.rotation @ c2w[:, :3, 2].mean(0).cpu().double()
-    aside = look.placement.rotation @ c2w[0, :3, 0].cpu().double()
-    up = -(look.placement.rotation @ c2w[0, :3, 1].cpu().double())
+    c2w, up = look.views.cameras.c2w[0].cpu().double(), up_of(look)
+    eyes = look.placement.points(c2w[:, :3, 3])
+    eye, forward = eyes.mean(0), look.placement.rotation @ c2w[:, :3, 2].mean(0)
+    if forward.norm() < SHORT:
+        away = 1.5 * max(float((eyes - middle).norm(dim=-1).max()), unit)
+        ahead = look.placement.rotation @ c2w[0, :3, 2]
+        return (middle + away * (0.3 * up - ahead)).numpy(), middle.numpy()
+    aside = look.placement.rotation @ c2w[0, :3, 0]
     place = eye - 0.3 * unit * forward + 0.2 * unit * aside + 0.2 * unit * up
     return place.numpy(), (eye + unit * forward).numpy()

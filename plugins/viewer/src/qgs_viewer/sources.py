@@ -1,5 +1,6 @@
 """From what a user names to something that gives looks: a PLY, a reconstruction, a model."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,18 +10,19 @@ import torch
 from torch import Tensor
 
 from qgs.analysis.reconstruction import choose_frames, choose_sample
-from qgs.analysis.scenes import chosen_scene, frame_list
+from qgs.analysis.scenes import chosen_scene, frame_list, named_scene
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
 from qgs.data.sampling import own_world, views_in
 from qgs.engine.folder import checkpoint_of
+from qgs.geometry.poses import relative_to, scaled
 from qgs.io.checkpoint import load, load_recipe
 from qgs.io.ply import load_ply
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
-from qgs_viewer.files import CAMERAS, PLY, read_finished
+from qgs_viewer.files import CAMERAS, PLY, Finished, read_finished
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.placement import Placement
 
@@ -95,8 +97,7 @@ class ModelSource(Source):
         """Of all frames of the scene."""
         reference, scale = self.world
         own = self.scene.cameras
-        c2w = torch.linalg.inv(reference.double()) @ own.c2w.double()
-        c2w[:, :3, 3] *= float(scale)
+        c2w = scaled(relative_to(reference.double(), own.c2w.double()), scale.double())
         return Cameras(c2w, own.intrinsics.double(), own.size)
 
 
@@ -113,20 +114,25 @@ class Wanted:
     device: str = "cpu"
 
 
+_OPTIONS = {"photos": "PHOTOS", "overrides": "--set"}
+
+
 def open_source(name: str, wanted: Wanted) -> Source:
     """What `name` stands for: a PLY, a reconstruction's folder, a run folder or a model.
 
-    Raises ValueError for options that say nothing to it, and as the readers do.
+    Raises ValueError for options that do not apply to it, and as the readers do.
     """
     path = Path(name).expanduser()
     finished = path.is_dir() and (path / CAMERAS).is_file() and (path / PLY).is_file()
     if not finished and path.suffix.lower() != ".ply":
         return _of_model(name, wanted)
     if given := [field for field, value in vars(replace(wanted, device="")).items() if value]:
-        what = "a finished reconstruction" if finished else "a PLY file"
+        what = "what `qgs reconstruct` wrote" if finished else "a PLY file"
+        options = ", ".join(f"`{_OPTIONS.get(field, f'--{field}')}`" for field in given)
+        does, them = ("does", "it") if len(given) == 1 else ("do", "them")
         raise ValueError(
-            f"{name} is {what}, to which {', '.join(given)} says nothing: leave it out, or name "
-            "the model instead"
+            f"{options} {does} not apply to {what}, {name}: leave {them} out, or name the model "
+            "instead"
         )
     return _of_finished(path, wanted.device) if finished else _of_ply(path)
 
@@ -145,30 +151,51 @@ def _of_finished(folder: Path, device: str) -> Source:
     if not found.model:
         why = "It was tuned or refined, or does not tell its model: its queries are not known."
         return FixedSource(plain, title, (why,))
+    if "://" in found.model:
+        note = (
+            f"Its model is at {found.model}, which is fetched only where you name it, so its "
+            f"queries are not shown: view the model with `qgs view {found.model} PHOTOS`."
+        )
+        return FixedSource(plain, title, (note,))
     try:
         file = checkpoint_of(found.model)
-    except FileNotFoundError as error:
-        note = f"Its model is not there, so its queries are not shown: {error}"
+        model, recipe = load(file, device), load_recipe(file)
+        fixed = _finished_views(found, recipe.views)
+        source = ModelSource(model, found.scene, fixed, found.inputs, title)
+        means = source.look(found.inputs).gaussians.means
+    except (ValueError, OSError) as error:
+        note = f"Its model cannot be used, so its queries are not shown: {error}"
         return FixedSource(plain, title, (note,))
-    model, recipe = load(file, device), load_recipe(file)
-    fixed = recipe.views.model_copy(update={"scale": "constant", "scale_factor": 1.0})
-    source = ModelSource(model, found.scene, fixed, found.inputs, title)
-    far = _difference(source.look(found.inputs).gaussians.means, found.gaussians.means)
-    if far > SAME:
+    if differs := _difference(means, found.gaussians.means):
         note = (
-            f"{found.model} makes other Gaussians of these photos today (means differ by "
-            f"{far:.0%} of the scene), so its queries are not shown."
+            f"{found.model} makes other Gaussians of these photos today ({differs}), so its "
+            "queries are not shown."
         )
         return FixedSource(plain, title, (note,))
     return source
 
 
-def _difference(means: Tensor, others: Tensor) -> float:
+def _finished_views(found: Finished, views: ViewsConfig) -> ViewsConfig:
+    """How inputs come from the world of a reconstruction, which is scaled, into the model's.
+
+    `constant` and `auto` have one factor for all inputs, now 1; `distance` has one for each choice
+    of inputs. Where it gives another than 1 for the first ones, `--set views.scale` overrode it.
+    """
+    if views.scale == "distance":
+        _, factor = own_world(found.scene, tuple(found.inputs), views)
+        if math.isclose(float(factor), 1, rel_tol=1e-3):
+            return views
+    return views.model_copy(update={"scale": "constant", "scale_factor": 1.0})
+
+
+def _difference(means: Tensor, others: Tensor) -> str:
+    """How `means` differ from `others`, in words; "" where they are the same."""
     if means.shape != others.shape:
-        return float("inf")
+        return f"{means.shape[1]:,} instead of {others.shape[1]:,}"
     means, others = means.cpu().double(), others.cpu().double()
     spread = (others - others.median(1, keepdim=True).values).norm(dim=-1).median()
-    return float((means - others).norm(dim=-1).median() / spread.clamp_min(1e-12))
+    far = float((means - others).norm(dim=-1).median() / spread.clamp_min(1e-12))
+    return "" if far <= SAME else f"means differ by {far:.0%} of the scene"
 
 
 def _of_model(name: str, wanted: Wanted) -> Source:
@@ -195,10 +222,6 @@ def _scene(recipe: Recipe, wanted: Wanted) -> Scene:
     data = recipe.build_data()
     if wanted.size is not None:
         raise ValueError("--size is for photos: name a folder of them, or leave it out")
-    split = "test" if data.names("test") else "train"
-    names = data.names(split)
-    if wanted.scene is not None and wanted.scene not in names:
-        raise ValueError(
-            f"there is no {split} scene {wanted.scene!r}; there are {names[0]} to {names[-1]}"
-        )
-    return data.scenes(split)[names.index(wanted.scene) if wanted.scene else 0]
+    if wanted.scene is not None:
+        return named_scene(data, "the data of the recipe", wanted.scene)
+    return data.scenes("test" if data.names("test") else "train")[0]

@@ -15,7 +15,7 @@ from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
 from qgs_viewer.choice import Choice, anchor_colors, painted, query_color
 from qgs_viewer.look import Look
-from qgs_viewer.placement import Splats, corners, on_photo
+from qgs_viewer.placement import corners, on_photo
 
 PHOTO_SIDE = 256
 """Pixels on the longer side of photos in the scene: small ones are enlarged, large ones reduced."""
@@ -34,7 +34,7 @@ class Stage:
         self.scene = scene
         self.unit = 1.0
         self._gaussians: viser.GaussianSplatHandle | None = None
-        scene.set_up_direction("-y")
+        self._painted: tuple[Look, Choice] | None = None
 
     def put(
         self, look: Look, choice: Choice, every: Cameras | None = None, unit: float | None = None
@@ -49,7 +49,7 @@ class Stage:
 
     def update(self, look: Look, choice: Choice) -> None:
         """Draw what a choice changes."""
-        self._draw_gaussians(painted(look, choice))
+        self._draw_gaussians(look, choice)
         if (views := self.scene.get_handle_by_name(_VIEWS)) is not None:
             views.visible = choice.photos
         self._draw_anchors(look, choice)
@@ -57,7 +57,11 @@ class Stage:
         self._draw_path(look, choice)
         self._draw_reading(look, choice)
 
-    def _draw_gaussians(self, shown: Splats) -> None:
+    def _draw_gaussians(self, look: Look, choice: Choice) -> None:
+        paint = Choice(choice.by_query, choice.query, others=choice.others)
+        if self._painted is not None and self._painted[0] is look and self._painted[1] == paint:
+            return
+        shown = painted(look, choice)
         factor = shown.magnification
         parts = (shown.centers * factor, shown.covariances * factor**2)
         parts = (*parts, shown.colors, shown.opacities)
@@ -66,6 +70,7 @@ class Stage:
         else:
             self._gaussians.set_gaussians(*parts)
             self._gaussians.scale = 1 / factor
+        self._painted = look, paint
 
     @property
     def photo_depth(self) -> float:
@@ -74,8 +79,8 @@ class Stage:
 
     @property
     def anchor_radius(self) -> float:
-        """Half the size of an anchor's dot, shown world."""
-        return 0.005 * self.unit
+        """Half the width of an anchor's dot, shown world; viser's `point_size` is such a half."""
+        return 0.01 * self.unit
 
     def _draw_photos(self, look: Look, every: Cameras | None) -> None:
         self.scene.remove_by_name(_VIEWS)
@@ -111,7 +116,7 @@ class Stage:
         numbers, colors = anchor_colors(look.queries, choice)
         self.scene.add_point_cloud(
             "/anchors", found.centers[0].float().numpy()[numbers], colors,
-            point_size=2 * self.anchor_radius, point_shape="circle", precision="float32",
+            point_size=self.anchor_radius, point_shape="circle", precision="float32",
         )  # fmt: skip
 
     def _draw_support(self, look: Look, choice: Choice) -> None:
@@ -138,19 +143,29 @@ class Stage:
         self._lines("/path", torch.stack([points[:-1], points[1:]], 1), INK, 3.0)
 
     def _draw_reading(self, look: Look, choice: Choice) -> None:
-        """Lines from where the query was when it read to the patches that it read most."""
+        """Lines from where the query was when it read to the patches that it read most.
+
+        A square of half its width marks each, a little nearer to the camera than the photo, which
+        would hide it.
+        """
         reading = None
         if choice.query is not None and choice.layer and choice.patches:
-            reading = look.strongest(choice.query, choice.layer, choice.patches, self.photo_depth)
+            depth = 0.97 * self.photo_depth
+            reading = look.strongest(choice.query, choice.layer, choice.patches, depth)
         if reading is None or choice.query is None:
             self.scene.remove_by_name("/reading")
+            self.scene.remove_by_name("/patches")
             return
         hub = look.hub(choice.query, choice.layer - 1).expand_as(reading.points)
         lines = torch.stack([hub, reading.points], 1)
         strength = 0.25 + 0.75 * (reading.shares / reading.shares.max())[:, None].numpy()
         pale = strength * np.array(query_color(choice.query)) + (1 - strength) * 235
-        colors = pale.round().astype(np.uint8)[:, None].repeat(2, 1)
-        self._lines("/reading", lines, colors, 2.0)
+        colors = pale.round().astype(np.uint8)
+        self._lines("/reading", lines, colors[:, None].repeat(2, 1), 2.0)
+        self.scene.add_point_cloud(
+            "/patches", reading.points.float().numpy(), colors,
+            point_size=reading.side / 4, point_shape="square", precision="float32",
+        )  # fmt: skip
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
         """Segments (n, 2, 3), `width` pixels wide."""

@@ -1,0 +1,70 @@
+"""`qgs view`, without a browser."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import qgs
+from qgs.types import Gaussians
+
+viser = pytest.importorskip(
+    "viser", reason="viser is not installed: pip install query-gaussians-viewer"
+)
+
+
+@pytest.fixture
+def ply(tmp_path: Path) -> Path:
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 5, 4)
+    sizes = torch.full((1, 5, 3), 0.1)
+    points = torch.rand(1, 5, 3)
+    qgs.save_ply(
+        Gaussians(points, sizes, quats, torch.full((1, 5), 0.9), points), tmp_path / "a.ply"
+    )
+    return tmp_path / "a.ply"
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Addresses that would have been opened; the server ends at once."""
+    found: list[str] = []
+    monkeypatch.setattr("webbrowser.open", found.append)
+    monkeypatch.setattr(viser.ViserServer, "sleep_forever", lambda self: None)
+    return found
+
+
+def view(*arguments: str) -> tuple[str, BaseException | None]:
+    from qgs_viewer.commands import app
+
+    result = CliRunner().invoke(app, [*arguments, "--device", "cpu"])
+    return result.output, result.exception
+
+
+def test_it_opens_the_browser_unless_told_not_to(ply: Path, opened: list[str]) -> None:
+    told, error = view(str(ply), "--port", "0")
+    assert error is None
+    assert len(opened) == 1
+    assert opened[0] in told
+    _, error = view(str(ply), "--port", "0", "--no-open")
+    assert error is None
+    assert len(opened) == 1
+
+
+def test_other_machines_are_told_the_address(ply: Path, opened: list[str], monkeypatch) -> None:
+    monkeypatch.setattr("qgs_viewer.commands._own_address", lambda: "192.0.2.7")
+    told, error = view(str(ply), "--port", "0", "--host", "0.0.0.0")
+    assert error is None
+    assert opened[0].startswith("http://localhost:")
+    assert f"http://192.0.2.7:{opened[0].rpartition(':')[2]}" in told
+
+
+def test_a_page_never_replaces_a_file(ply: Path, opened: list[str], tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    _, error = view(str(ply), "--html", str(page))
+    assert error is None
+    page.write_text("mine")
+    _, error = view(str(ply), "--html", str(page))
+    assert isinstance(error, FileExistsError)
+    assert page.read_text() == "mine"
+    assert opened == []
