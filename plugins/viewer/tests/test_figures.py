@@ -217,7 +217,7 @@ def test_curves_are_left_out_in_plain_words() -> None:
     show = exhibition_of(*PAIR)
     with pytest.raises(NothingToShowError, match=r"tokengs, locus: no history\.jsonl"):
         curves.made(show)
-    known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0])
+    known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0], [1, 2, 3])
     first, other = show.exhibits
     trained = replace(first, curves=known)
     made = curves.made(Exhibition([trained, other], show.samples, show.depths))
