@@ -30,7 +30,7 @@ from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
 import qgs
 from qgs.contracts import MetricInput
 from qgs.drawing.figures import Curves
-from qgs.drawing.images import rgb_picture
+from qgs.drawing.images import depth_picture, depth_range, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics import Dispersion
 
@@ -60,13 +60,29 @@ def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
     error = (image - truth).abs().mean(0)
     for expected in (truth, image, sample.inputs.images[0, 1]):
         assert any(np.array_equal(rgb_picture(expected), found) for found in shown)
-    torch.testing.assert_close(novel_views.error_map(image, truth), error)
+    torch.testing.assert_close(novel_views.error_map(image, truth)[0], error)
 
 
-def test_an_error_is_bright_where_it_is_great() -> None:
-    error = torch.tensor([[0.0, 0.1, 0.2, 0.4]])
-    lightness = novel_views.error_picture(error, 0.2).sum(-1)[0]
-    assert lightness[0] < lightness[1] < lightness[2] == lightness[3]
+@pytest.mark.parametrize("kinds", [PAIR, PAIR[:1]])
+def test_depths_of_a_scene_have_one_scale_and_the_true_one_a_column(kinds: tuple[str, ...]) -> None:
+    show = exhibition_of(*kinds)
+    true = torch.linspace(1, 9, 2 * SIDE * SIDE).view(2, 1, SIDE, SIDE)
+    made = novel_views.made(replace(show, depths=[true, None]))
+    titled = {axis.get_title(loc="left"): axis for axis in made.figure.axes}
+    sample, maps = show.samples[0], [true[1]]
+    for model in show.models.values():
+        with torch.no_grad():
+            gaussians = model(sample.inputs).gaussians
+            maps.append(model.render(gaussians, sample.targets.cameras[:, 1:2]).depth[0, 0])
+    near, far = depth_range(torch.cat(maps))
+    shown = pictures(made.figure.axes)
+    for found in maps:
+        assert any(np.array_equal(depth_picture(found, near, far), one) for one in shown)
+    assert words([titled["true depth"]]) == [f"{near:.2g} to {far:.2g}"]
+    assert "the true depth, which is shown" in made.caption
+    without = novel_views.made(show)
+    assert "true depth" not in [axis.get_title(loc="left") for axis in without.figure.axes]
+    assert "true depth" not in without.caption
 
 
 def test_bars_are_the_metric_of_each_scene() -> None:
