@@ -20,17 +20,19 @@ from qgs_viewer.figures import (
     novel_views,
     refinement,
 )
-from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
+from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError, exhibit
 from qgs_viewer.figures.layers import chosen_layers
-from qgs_viewer.figures.overview import overview, seen_points
+from qgs_viewer.figures.overview import level_axes, overview, seen_points
 from qgs_viewer.figures.paper import DPI, WIDTH, new_figure, write_figure
-from qgs_viewer.figures.plan import plan_of
-from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
+from qgs_viewer.figures.plan import ground, plan_of
+from small import KINDS, QUERIES, SIDE, VIEWS, Walk, exhibit_of, exhibition_of, sample_of
 
 import qgs
 from qgs.contracts import MetricInput
+from qgs.data.sampling import make_sample
 from qgs.drawing.figures import Curves
-from qgs.drawing.images import depth_picture, depth_range, rgb_picture
+from qgs.drawing.images import depth_picture, depth_range, enlarged, rgb_picture
+from qgs.drawing.queries import attention_pictures
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics import Dispersion
 
@@ -216,6 +218,40 @@ def test_the_overview_stands_behind_and_above_and_sees_the_scene() -> None:
     eye = to_camera(camera.c2w[:, 0, :3, 3][None].view(1, 1, 3), inputs)[0, :, 0]
     assert (eye[:, 1] < 0).all()
     assert (eye[:, 2] < 0).all()
+
+
+def test_axes_of_cameras_that_face_each_other_are_those_of_the_first() -> None:
+    first = sample_of().inputs.cameras[:, :1]
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).to(first.c2w)
+    for turned in (turn, turn[:, [2, 0, 1, 3]][[2, 0, 1, 3]]):  # face to face; and upside down
+        cameras = replace(
+            first,
+            c2w=torch.cat([first.c2w, first.c2w @ turned], 1),
+            intrinsics=first.intrinsics.expand(1, 2, 4),
+        )
+        down, ahead = level_axes(cameras)
+        torch.testing.assert_close(down, first.c2w[0, 0, :3, 1])
+        torch.testing.assert_close(ahead, first.c2w[0, 0, :3, 2])
+        assert overview(cameras, torch.rand(9, 3).to(first.c2w), (30, 40)).c2w.isfinite().all()
+    right = ground(cameras)
+    torch.testing.assert_close(right.mT @ right, torch.eye(2).double(), atol=1e-6, rtol=0)
+
+
+def test_all_photos_that_are_shown_are_said_to_be() -> None:
+    made = attention.made(exhibition_of("locus"))
+    assert "over the patches of the input photos" in made.caption
+    show = exhibition_of("locus")
+    many = make_sample(Walk(), (0, 1, 4), (2, 3), VIEWS, mirror=False)
+    shown = exhibit("locus", show.exhibits[0].model, many)
+    made = attention.made(Exhibition([shown], [many], [None], query=3))
+    assert "over the patches of 2 of 3 input photos" in made.caption
+    depth = shown.look.depth
+    weights = shown.look.attention(3, depth)
+    maps = attention.part_maps(shown, weights, "weights")
+    photos = [enlarged(rgb_picture(i), attention.PHOTO) for i in many.inputs.images[0, :2]]
+    expected = attention_pictures(photos, maps[:2])
+    for picture in expected:
+        assert any(np.array_equal(picture, one) for one in pictures(made.figure.axes))
 
 
 @pytest.mark.parametrize("kind", KINDS)
