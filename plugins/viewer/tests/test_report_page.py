@@ -14,6 +14,8 @@ pytest.importorskip("viser", reason="viser is not installed: pip install query-g
 
 from browser import CHROMIUM, Page, chromium
 from qgs_viewer import section
+from qgs_viewer.look import look_inside
+from qgs_viewer.page import shared_start
 from qgs_viewer.section import refinement_section, scene_section, self_attention_section
 from small import VIEWS, Walk, model_of
 
@@ -98,7 +100,9 @@ def test_a_notable_query_of_a_model_with_anchors_is_picked(monkeypatch: pytest.M
     monkeypatch.setattr(section, "scenes_html", lambda _, choices: chosen.update(choices) or "")
     shown = [(one, one.model(sample.inputs)) for one in contenders()]
     scene_section(shown, sample)
-    (locus, prediction), view = shown[1], sample.targets.cameras[:, :1]
+    (locus, prediction) = shown[1]
+    looks = [look_inside(one.model, sample.inputs) for one, _ in shown]
+    view = section._first_camera(shared_start(looks))
     (notable,) = notable_queries(locus.model, prediction.gaussians, view, 1)
     assert [*chosen] == ["locus"]
     assert (chosen["locus"].query, chosen["locus"].layer) == (notable.index, locus.model.depth)

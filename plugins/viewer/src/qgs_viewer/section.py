@@ -31,10 +31,10 @@ def scene_section(shown: Shown, sample: Sample) -> ReportSection:
         rgb_picture(contender.model.render(prediction.gaussians, camera).rgb[0, 0])
         for contender, prediction in shown
     ]
-    names, view = ", ".join(looks), sample.targets.cameras[:, :1]
+    names = ", ".join(looks)
     choices = {
         contender.name: Choice(
-            query=notable_queries(contender.model, prediction.gaussians, view, 1)[0].index,
+            query=notable_queries(contender.model, prediction.gaussians, camera, 1)[0].index,
             layer=contender.model.depth,
             others="shown",
         )
@@ -46,7 +46,7 @@ def scene_section(shown: Shown, sample: Sample) -> ReportSection:
         "The scene, to turn",
         "The Gaussians of the first scene above in 3D, with the input photos where they were "
         "taken, and the anchors of the last layer as dots where there are any: of a query that is "
-        "notable in the first target view also the support, its way through the layers as a dark "
+        "notable in the first view of it also the support, its way through the layers as a dark "
         "line, and lines to the patches that it reads most. Drag to turn, scroll to come closer; "
         "W, A, S, D, Q and E walk.",
         {"": [tile]},
