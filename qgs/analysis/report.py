@@ -44,7 +44,7 @@ from qgs.types import Prediction
 class Contender:
     """A trained model. scores: means of `Report.columns`. recipe: YAML.
 
-    about: what kind of model it is, in a sentence or two. curves: of a training for this report.
+    about: what kind of model it is, in a sentence or two. curves: of its training.
     """
 
     name: str
@@ -300,7 +300,7 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
                 figures.setdefault(contender.name, []).append(Tile(picture, caption))
     return ReportSection(
         "What one query reads",
-        "Cross-attention of the heaviest query over the patches of both input views in the last "
+        "Cross-attention of the heaviest query over the patches of the input views in the last "
         "layer, averaged over heads: strong colour is much. A geometry bias, where there is one, "
         "is added to the content logits before the softmax; what it hides is pale.",
         figures,
@@ -309,7 +309,7 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
 
 
 def training_curves(shown: Shown, sample: Sample) -> ReportSection:
-    """Loss and PSNR against seconds for every model that was trained for this."""
+    """Loss and PSNR for every model whose training has a history."""
     curves = {contender.name: contender.curves for contender, _ in shown if contender.curves}
     tiles = [Tile(figure_picture(curves_figure(curves), dpi=144))] if curves else []
     return ReportSection("Training", "", {"": tiles} if tiles else {}, width=600)

@@ -19,8 +19,8 @@ from qgs.composer.schema import summary_of
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.drawing.figures import Curves
 from qgs.engine.evaluation import Evaluation, evaluate
-from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
+from qgs.io.files import read_records
 from qgs.io.ply import save_ply
 from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
@@ -80,7 +80,8 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
-    return entry_of(name, recipe, evaluation, result.model, curves=curves_of(result.folder))
+    curves = curves_of(result.folder.checkpoint)
+    return entry_of(name, recipe, evaluation, result.model, curves=curves)
 
 
 def entry_of(
@@ -112,11 +113,12 @@ def _about(recipe: Recipe) -> str:
     return " ".join(f"{part.type}: {summary_of(part.component)}" for part in chosen)
 
 
-def curves_of(folder: RunFolder) -> Curves:
-    """The history of a run, but for steps that were skipped."""
-    names = ("seconds", "loss", "psnr")
-    steps = [r for r in folder.history() if not r.get("skipped") and r.keys() >= set(names)]
-    return Curves(*([step[name] for step in steps] for name in names))
+def curves_of(file: Path) -> Curves | None:
+    """NAME.history.jsonl beside NAME.safetensors, or its run's history, but for skipped steps."""
+    own, names = file.with_suffix(".history.jsonl"), ("seconds", "loss", "psnr", "step")
+    records = read_records(own if own.is_file() else file.with_name("history.jsonl"))
+    steps = [r for r in records if not r.get("skipped") and r.keys() >= set(names)]
+    return Curves(*([step[name] for step in steps] for name in names)) if steps else None
 
 
 def baselines(entry: Entry) -> dict[str, dict[str, float | None]]:

@@ -132,10 +132,9 @@ def _write(report: Report, entries: Sequence[Entry], target: Path, console: Cons
     console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)
     for entry in entries:
         run = target / entry.contender.name
-        files = [f"{run}/example.ply"]
-        if entry.contender.curves is not None:
-            files.insert(0, f"{run}/checkpoint.safetensors")
-        console.print(f"{entry.contender.name}: {', '.join(files)}", soft_wrap=True)
+        files = run / "checkpoint.safetensors", run / "example.ply"
+        there = ", ".join(str(file) for file in files if file.is_file())
+        console.print(f"{entry.contender.name}: {there}", soft_wrap=True)
     console.print("Next:")
     for command, what in report.commands.items():
         console.print(f"  {command}  {what}", soft_wrap=True, highlight=False)

@@ -10,7 +10,7 @@ from qgs.contracts import SceneSource
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
-from qgs.engine.folder import RunFolder, checkpoint_of
+from qgs.engine.folder import checkpoint_of
 from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
 from qgs.io.models import about
 from qgs.wording import short_names
@@ -37,11 +37,8 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
     for name, recipe in recipes.items():
         model = load(files[name], choose_device(device))
         evaluation = evaluate(model, recipe, trained_on=trained[name])
-        curves = contest.curves_of(RunFolder(files[name].parent))
-        curves = curves if curves.seconds else None
-        entries.append(
-            contest.entry_of(name, recipe, evaluation, model, about(files[name]), curves)
-        )
+        parts = name, recipe, evaluation, model, about(files[name]), contest.curves_of(files[name])
+        entries.append(contest.entry_of(*parts))
     return entries
 
 

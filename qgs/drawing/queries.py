@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from einops import rearrange
 from PIL import Image, ImageDraw
 from torch import Tensor
 
@@ -13,6 +12,7 @@ from qgs.drawing.figures import INK, Color, categorical
 from qgs.drawing.images import NOTHING, Picture, enlarged, rgb_picture, washed
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.metrics.dispersion import token_dispersion
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, SpatialSupport
 
@@ -130,12 +130,18 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
 
 @dataclass(frozen=True)
 class DrawnQuery:
-    """A query by its index. weight: sum of blending, pixels. spread: mean distance to centroid."""
+    """A query by its index. spread: mean distance of its Gaussians to their centroid."""
 
     index: int
     color: Color
-    weight: float
     spread: float
+
+
+def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> list[DrawnQuery]:
+    """`chosen` of the `count` queries of the first scene, each with a colour by its place."""
+    distances = token_dispersion(gaussians.means.detach(), gaussians.count // count)[0]
+    spreads = distances.view(count, -1).mean(1)
+    return [DrawnQuery(q, categorical(place), float(spreads[q])) for place, q in enumerate(chosen)]
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
@@ -151,19 +157,13 @@ def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
     """`count` queries to show in cameras (1, V): heavy, well inside the first view, and apart."""
-    queries = model.queries.count
-    weights_G = rendered_weights(model, gaussians, cameras)[0].cpu()
-    weights_NK = rearrange(weights_G, "(n k) -> n k", n=queries)
-    means_NK3 = rearrange(gaussians.means[0], "(n k) c -> n k c", n=queries).cpu()
+    weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().view(model.queries.count, -1)
+    means_NK3 = gaussians.means[0].cpu().view(*weights_NK.shape, 3)
     weights_N = weights_NK.sum(1)
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
     places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
     chosen = _apart(weights_N.argsort(descending=True).tolist(), places_N2, count)
-    spreads_N = (means_NK3 - means_NK3.mean(1, keepdim=True)).norm(dim=-1).mean(1)
-    return [
-        DrawnQuery(query, categorical(rank), float(weights_N[query]), float(spreads_N[query]))
-        for rank, query in enumerate(chosen)
-    ]
+    return colored_queries(gaussians, len(weights_N), chosen)
 
 
 def _apart(order: Sequence[int], places_N2: Tensor, count: int) -> list[int]:

@@ -184,11 +184,23 @@ def test_what_a_mask_hides_has_the_colour_of_nothing_and_no_part_in_the_scale():
 
 
 def test_curves_are_drawn_for_each_model():
-    run = Curves([0.0, 1.0, 2.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0])
+    run = Curves([0.0, 1.0, 2.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0], [1, 2, 3])
     alone = figure_picture(curves_figure({"a": run}), dpi=60)
     both = figure_picture(curves_figure({"a": run, "b": run}), dpi=60)
     assert alone.shape == both.shape
     assert (alone != both).any()
+
+
+def test_curves_of_hours_which_may_hold_pauses_are_drawn_by_steps():
+    run = Curves([0.0, 1.0, 7000.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0], [100, 200, 300])
+    paused = replace(run, seconds=[0.0, 1.0, 9000.0])
+    for curves, place, unit in (
+        ({"a": run}, run.seconds, "seconds"),
+        ({"a": run, "b": paused}, run.steps, "steps"),
+    ):
+        for axis in curves_figure(curves).axes:
+            assert axis.get_xlabel() == unit
+            assert all(list(line.get_xdata()) == list(place) for line in axis.lines)
 
 
 def test_running_mean_keeps_a_line_straight():

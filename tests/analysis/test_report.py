@@ -65,7 +65,7 @@ def page_of(tree: dict, name: str) -> str:
         parameters=1000,
         recipe="recipe: 1",
         about="Small, see https://example.org/small for more.",
-        curves=Curves([0.0, 1.0], [1.0, 0.5], [8.0, 9.0]),
+        curves=Curves([0.0, 1.0], [1.0, 0.5], [8.0, 9.0], [1, 2]),
     )
     report = Report(
         columns={

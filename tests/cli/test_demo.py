@@ -10,7 +10,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import qgs
-from qgs.cli.contest import resolve_fairly
+from qgs.cli.contest import curves_of, resolve_fairly
 from qgs.cli.demo import new_folder
 from qgs.cli.trained import WINDOWS, checkpoints, judge, remarks
 from qgs.composer import resolve
@@ -128,9 +128,23 @@ def test_a_report_of_runs_shows_how_they_were_trained(models, tmp_path):
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<h2>Training</h2>" in page
     assert "judged on the test split of their recipe" in page
+    assert "run: report/run/example.ply" in result.output, "no checkpoint was written there"
     photos = photos_in(tmp_path / "mine", 6, step=0.1)
     assert run_qgs("report", "run", "--photos", photos).exit_code == 0
     assert "<h2>Your photos</h2>" in (tmp_path / "report-2" / "report.html").read_text()
+
+
+def test_a_checkpoint_has_a_history_of_its_own_or_of_its_run(tmp_path):
+    def write(name, step):
+        record = {"step": step, "seconds": 1.0, "loss": 1.0, "psnr": 9.0}
+        (tmp_path / name).write_text(json.dumps(record) + "\n")
+
+    own, other = (tmp_path / f"{name}.safetensors" for name in ("own", "other"))
+    write("own.history.jsonl", 1)
+    assert curves_of(own).steps == [1]
+    assert curves_of(other) is None
+    write("history.jsonl", 2)
+    assert [curves_of(file).steps for file in (own, other)] == [[1], [2]]
 
 
 @pytest.mark.parametrize("count", [3, 20])

@@ -5,8 +5,10 @@ import torch.nn.functional as F
 from pydantic import ValidationError
 from qgs_rooms.source import RoomsSource
 
+from qgs.cli.contest import curves_of
 from qgs.data.sampling import mirrored_views
 from qgs.geometry.rays import pixel_directions
+from qgs.io.models import checkpoint_path
 from qgs.types import Cameras, Views
 
 
@@ -117,3 +119,13 @@ def test_slices_and_range():
     assert [scene.name for scene in scenes[3:]] == ["train/000003", "train/000004"]
     with pytest.raises(IndexError):
         scenes[5]
+
+
+@pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])
+def test_models_come_with_their_training_curves(name):
+    file = checkpoint_path(f"rooms/{name}")
+    curves = curves_of(file)
+    assert curves is not None
+    assert list(curves.steps) == list(range(100, 40_001, 100))
+    assert curves.psnr[0] + 5 < curves.psnr[-1]
+    assert file.with_suffix(".history.jsonl").stat().st_size < 60_000

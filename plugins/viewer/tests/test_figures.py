@@ -20,17 +20,19 @@ from qgs_viewer.figures import (
     novel_views,
     refinement,
 )
-from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
+from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError, exhibit
 from qgs_viewer.figures.layers import chosen_layers
-from qgs_viewer.figures.overview import overview, seen_points
+from qgs_viewer.figures.overview import level_axes, overview, seen_points
 from qgs_viewer.figures.paper import DPI, WIDTH, new_figure, write_figure
-from qgs_viewer.figures.plan import plan_of
-from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
+from qgs_viewer.figures.plan import ground, plan_of
+from small import KINDS, QUERIES, SIDE, VIEWS, Walk, exhibit_of, exhibition_of, sample_of
 
 import qgs
 from qgs.contracts import MetricInput
+from qgs.data.sampling import make_sample
 from qgs.drawing.figures import Curves
-from qgs.drawing.images import rgb_picture
+from qgs.drawing.images import depth_picture, depth_range, enlarged, rgb_picture
+from qgs.drawing.queries import attention_pictures
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics import Dispersion
 
@@ -60,13 +62,29 @@ def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
     error = (image - truth).abs().mean(0)
     for expected in (truth, image, sample.inputs.images[0, 1]):
         assert any(np.array_equal(rgb_picture(expected), found) for found in shown)
-    torch.testing.assert_close(novel_views.error_map(image, truth), error)
+    torch.testing.assert_close(novel_views.error_map(image, truth)[0], error)
 
 
-def test_an_error_is_bright_where_it_is_great() -> None:
-    error = torch.tensor([[0.0, 0.1, 0.2, 0.4]])
-    lightness = novel_views.error_picture(error, 0.2).sum(-1)[0]
-    assert lightness[0] < lightness[1] < lightness[2] == lightness[3]
+@pytest.mark.parametrize("kinds", [PAIR, PAIR[:1]])
+def test_depths_of_a_scene_have_one_scale_and_the_true_one_a_column(kinds: tuple[str, ...]) -> None:
+    show = exhibition_of(*kinds)
+    true = torch.linspace(1, 9, 2 * SIDE * SIDE).view(2, 1, SIDE, SIDE)
+    made = novel_views.made(replace(show, depths=[true, None]))
+    titled = {axis.get_title(loc="left"): axis for axis in made.figure.axes}
+    sample, maps = show.samples[0], [true[1]]
+    for model in show.models.values():
+        with torch.no_grad():
+            gaussians = model(sample.inputs).gaussians
+            maps.append(model.render(gaussians, sample.targets.cameras[:, 1:2]).depth[0, 0])
+    near, far = depth_range(torch.cat(maps))
+    shown = pictures(made.figure.axes)
+    for found in maps:
+        assert any(np.array_equal(depth_picture(found, near, far), one) for one in shown)
+    assert words([titled["true depth"]]) == [f"{near:.2g} to {far:.2g}"]
+    assert "the true depth, which is shown" in made.caption
+    without = novel_views.made(show)
+    assert "true depth" not in [axis.get_title(loc="left") for axis in without.figure.axes]
+    assert "true depth" not in without.caption
 
 
 def test_bars_are_the_metric_of_each_scene() -> None:
@@ -202,6 +220,40 @@ def test_the_overview_stands_behind_and_above_and_sees_the_scene() -> None:
     assert (eye[:, 2] < 0).all()
 
 
+def test_axes_of_cameras_that_face_each_other_are_those_of_the_first() -> None:
+    first = sample_of().inputs.cameras[:, :1]
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).to(first.c2w)
+    for turned in (turn, turn[:, [2, 0, 1, 3]][[2, 0, 1, 3]]):  # face to face; and upside down
+        cameras = replace(
+            first,
+            c2w=torch.cat([first.c2w, first.c2w @ turned], 1),
+            intrinsics=first.intrinsics.expand(1, 2, 4),
+        )
+        down, ahead = level_axes(cameras)
+        torch.testing.assert_close(down, first.c2w[0, 0, :3, 1])
+        torch.testing.assert_close(ahead, first.c2w[0, 0, :3, 2])
+        assert overview(cameras, torch.rand(9, 3).to(first.c2w), (30, 40)).c2w.isfinite().all()
+    right = ground(cameras)
+    torch.testing.assert_close(right.mT @ right, torch.eye(2).double(), atol=1e-6, rtol=0)
+
+
+def test_all_photos_that_are_shown_are_said_to_be() -> None:
+    made = attention.made(exhibition_of("locus"))
+    assert "over the patches of the input photos" in made.caption
+    show = exhibition_of("locus")
+    many = make_sample(Walk(), (0, 1, 4), (2, 3), VIEWS, mirror=False)
+    shown = exhibit("locus", show.exhibits[0].model, many)
+    made = attention.made(Exhibition([shown], [many], [None], query=3))
+    assert "over the patches of 2 of 3 input photos" in made.caption
+    depth = shown.look.depth
+    weights = shown.look.attention(3, depth)
+    maps = attention.part_maps(shown, weights, "weights")
+    photos = [enlarged(rgb_picture(i), attention.PHOTO) for i in many.inputs.images[0, :2]]
+    expected = attention_pictures(photos, maps[:2])
+    for picture in expected:
+        assert any(np.array_equal(picture, one) for one in pictures(made.figure.axes))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_gaussians_of_the_query_that_was_asked_for(kind: str) -> None:
     made = global_gaussians.made(exhibition_of(kind, query=7))
@@ -217,7 +269,7 @@ def test_curves_are_left_out_in_plain_words() -> None:
     show = exhibition_of(*PAIR)
     with pytest.raises(NothingToShowError, match=r"tokengs, locus: no history\.jsonl"):
         curves.made(show)
-    known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0])
+    known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0], [1, 2, 3])
     first, other = show.exhibits
     trained = replace(first, curves=known)
     made = curves.made(Exhibition([trained, other], show.samples, show.depths))

@@ -72,7 +72,7 @@ def test_all_figures_of_the_models_in_the_box(tmp_path: Path) -> None:
     done = run_qgs("figures", "rooms/tokengs-64", "rooms/locus-64", "--out", tmp_path / "figures")
     assert done.exit_code == 0, done.output
     made = {file.stem for file in (tmp_path / "figures").glob("*.pdf")}
-    assert made == {*FIGURES} - {"curves"}
+    assert made == {*FIGURES}
     for name in made:
         pixels = Image.open(tmp_path / "figures" / f"{name}.png").convert("L")
         assert pixels.width > 1400

@@ -13,12 +13,16 @@ from PIL import Image
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
 from browser import CHROMIUM, Page, chromium
-from qgs_viewer.section import scene_section, self_attention_section
+from qgs_viewer import section
+from qgs_viewer.look import look_inside
+from qgs_viewer.page import shared_start
+from qgs_viewer.section import refinement_section, scene_section, self_attention_section
 from small import VIEWS, Walk, model_of
 
 from qgs.analysis.report import GROUP, Contender, Report, report_html
 from qgs.contracts import Column
 from qgs.data.sampling import Sample, make_sample
+from qgs.drawing.queries import notable_queries
 
 KINDS = ("tokengs", "locus")
 SHOWN = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"
@@ -47,7 +51,20 @@ def page_of_two_scenes() -> str:
 
 def test_the_viewer_offers_its_sections() -> None:
     found = {e.name: e.load() for e in entry_points(group=GROUP) if e.module.startswith("qgs_view")}
-    assert found == {"scene": scene_section, "self_attention": self_attention_section}
+    assert found == {
+        "refinement": refinement_section,
+        "scene": scene_section,
+        "self_attention": self_attention_section,
+    }
+
+
+def test_refinement_is_shown_of_models_with_anchors() -> None:
+    sample = sample_of(1, 2)
+    shown = [(one, one.model(sample.inputs)) for one in contenders()]
+    (tile,) = refinement_section(shown, sample).figures[""]
+    (single,) = refinement_section(shown[1:], sample).figures[""]
+    np.testing.assert_array_equal(tile.image, single.image)
+    assert not refinement_section(shown[:1], sample).figures
 
 
 def test_self_attention_is_shown_of_models_that_tell_it() -> None:
@@ -76,6 +93,20 @@ def test_the_section_has_all_models_and_the_code_of_the_viewer_once() -> None:
     assert len(tile.page) - len(one.page) < 100_000 < len(one.page)
     assert tile.page.index('["tokengs"') < tile.page.index('["locus"')
     assert not re.search(r"(src|href)=.?http", tile.page)
+
+
+def test_a_notable_query_of_a_model_with_anchors_is_picked(monkeypatch: pytest.MonkeyPatch) -> None:
+    sample, chosen = sample_of(1, 2), {}
+    monkeypatch.setattr(section, "scenes_html", lambda _, choices: chosen.update(choices) or "")
+    shown = [(one, one.model(sample.inputs)) for one in contenders()]
+    scene_section(shown, sample)
+    (locus, prediction) = shown[1]
+    looks = [look_inside(one.model, sample.inputs) for one, _ in shown]
+    view = section._first_camera(shared_start(looks))
+    (notable,) = notable_queries(locus.model, prediction.gaussians, view, 1)
+    assert [*chosen] == ["locus"]
+    assert (chosen["locus"].query, chosen["locus"].layer) == (notable.index, locus.model.depth)
+    assert chosen["locus"].others == "shown"
 
 
 def drawn(page: Page, folder: Path, name: str) -> np.ndarray:

@@ -40,13 +40,18 @@ def scene_html(
     return page.replace("<head>", f"<head>{_WORKERS}", 1)
 
 
-def scenes_html(looks: Mapping[str, Look]) -> str:
+def scenes_html(looks: Mapping[str, Look], choices: Mapping[str, Choice] | None = None) -> str:
     """A page of scenes side by side, by name, all seen from `shared_start` at first.
 
-    It holds viser's code once, and is dark where the page or the system around it is.
+    choices: what is shown of each, by default what `scene_html` shows. The page holds viser's code
+    once, and is dark where the page or the system around it is.
     """
     start = shared_start(looks.values())
-    pages = [scene_html(look, start=start).partition(_DATA) for look in looks.values()]
+    chosen = choices or {}
+    pages = [
+        scene_html(look, chosen.get(name), start=start).partition(_DATA)
+        for name, look in looks.items()
+    ]
     data, ends = zip(*(rest.split('"', 1) for _, _, rest in pages), strict=True)
     shell = (pages[0][0] + _DATA, '"' + ends[0])
     template = page_environment("qgs_viewer").get_template("scenes.html")

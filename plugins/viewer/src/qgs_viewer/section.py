@@ -1,4 +1,4 @@
-"""Sections of report.html: the scene to turn, and which queries read which."""
+"""Sections of report.html: the scene to turn, refinement by layer, which queries read which."""
 
 import torch
 
@@ -6,9 +6,11 @@ from qgs.analysis.report import ReportSection, Shown, Tile
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import rgb_picture, side_by_side
+from qgs.drawing.queries import notable_queries
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras
-from qgs_viewer.figures import graph
+from qgs_viewer.choice import Choice
+from qgs_viewer.figures import graph, refinement
 from qgs_viewer.figures.exhibits import exhibit
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.page import scenes_html, shared_start
@@ -30,12 +32,23 @@ def scene_section(shown: Shown, sample: Sample) -> ReportSection:
         for contender, prediction in shown
     ]
     names = ", ".join(looks)
-    tile = Tile(side_by_side(pictures), names, page=scenes_html(looks))
+    choices = {
+        contender.name: Choice(
+            query=notable_queries(contender.model, prediction.gaussians, camera, 1)[0].index,
+            layer=contender.model.depth,
+            others="shown",
+        )
+        for contender, prediction in shown
+        if looks[contender.name].support(0) is not None
+    }
+    tile = Tile(side_by_side(pictures), names, page=scenes_html(looks, choices))
     return ReportSection(
         "The scene, to turn",
         "The Gaussians of the first scene above in 3D, with the input photos where they were "
-        "taken, and the anchors of the last layer as dots where there are any. Drag to turn, "
-        "scroll to come closer; W, A, S, D, Q and E walk.",
+        "taken, and the anchors of the last layer as dots where there are any: of a query that is "
+        "notable in the first view of it also the support, its way through the layers as a dark "
+        "line, and lines to the patches that it reads most. Drag to turn, scroll to come closer; "
+        "W, A, S, D, Q and E walk.",
         {"": [tile]},
         width=600,
     )
@@ -53,6 +66,21 @@ def self_attention_section(shown: Shown, sample: Sample) -> ReportSection:
         f"The first scene from above, input cameras as triangles. Every dark dot is a query: its "
         f"anchor before the layer, or where it has none, the place of what it adds to the photos. "
         f"Lines lead from {graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
+        {"": tiles} if tiles else {},
+        width=600,
+    )
+
+
+def refinement_section(shown: Shown, sample: Sample) -> ReportSection:
+    """Ways, radii and steps of the anchors from layer to layer, of models that have anchors."""
+    exhibits = [exhibit(contender.name, contender.model, sample) for contender, _ in shown]
+    anchored = [e for e in exhibits if e.look.support(0) is not None]
+    tiles = [Tile(figure_picture(refinement.figure(anchored), dpi=144))] if anchored else []
+    return ReportSection(
+        "How layers move and size anchors",
+        "The first scene from above, with the way of every anchor from its learned start (circle) "
+        "to the last layer (dot); then the radius of the supports, and how far each layer moves "
+        "the anchors: the line is the median over queries, bands hold half and 90 % of them.",
         {"": tiles} if tiles else {},
         width=600,
     )

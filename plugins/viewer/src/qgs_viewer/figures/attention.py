@@ -45,16 +45,17 @@ def made(show: Exhibition) -> Made:
     """See `figure`. Raises NothingToShowError where no model explains its cross-attention."""
     shown = [e for e in show.exhibits if e.look.attention(0, e.look.depth) is not None]
     if not shown:
-        raise NothingToShowError("the cross-attention of these models tells nothing of itself")
+        raise NothingToShowError("none of these models reports its cross-attention")
     queries = {e.name: e.notable(1, e.sample.targets.cameras[:, :1], show.query)[0] for e in shown}
     told = ", ".join(f"{name} query {query.index}" for name, query in queries.items())
     views = len(show.samples[0].input_frames)
+    photos = f"{VIEWS} of {views}" if views > VIEWS else "the"
     caption = (
-        f"Cross-attention of one query ({told}) over the patches of {min(views, VIEWS)} of {views} "
-        f"input photos of scene {show.samples[0].scene}, means over heads, in several layers. "
+        f"Cross-attention of one query ({told}) over the patches of {photos} input "
+        f"photos of scene {show.samples[0].scene}, means over heads, in several layers. "
         "Content logits, the bias that geometry adds to them where there is one, and the attention "
-        "that results; strong colour is much, each pair of photos has its own scale from its least "
-        "to its greatest value. Blue: the query's anchor when it read, and its support."
+        "that results; strong colour is much, the photos of one part share one scale from their "
+        "least to their greatest value. Blue: the query's anchor when it read, and its support."
     )
     return Made(figure(shown, queries), caption)
 
@@ -96,8 +97,10 @@ def _row(axes: Sequence[Axes], shown: Exhibit, query: int, layer: int, views: in
                 middle = {"ha": "center", "va": "center", "transform": places[0].transAxes}
                 places[0].text(1.0, 0.5, "none", in_layout=False, **middle)
             continue
-        photos = [enlarged(rgb_picture(image), PHOTO) for image in shown.sample.inputs.images[0]]
-        pictures = attention_pictures(photos, maps)
+        photos = [
+            enlarged(rgb_picture(image), PHOTO) for image in shown.sample.inputs.images[0, :views]
+        ]
+        pictures = attention_pictures(photos, maps[:views])
         for view, axis in enumerate(places):
             picture_panel(axis, pictures[view])
             _anchor(axis, shown, query, layer - 1, view, pictures[view].shape[1])

@@ -13,8 +13,9 @@ def made(show: Exhibition) -> Made:
     if not curves:
         raise NothingToShowError(f"{missing}; run folders of `qgs train` have one")
     caption = (
-        "Training loss and PSNR of the training views against seconds of training: single steps "
-        "pale, their running mean strong." + (f" {missing}." if without else "")
+        "Training loss and PSNR of the training views by seconds, or where a training took over "
+        "two hours by steps: records of the history pale, their running mean strong."
+        + (f" {missing}." if without else "")
     )
     with paper_style():
         figure = curves_figure(curves)

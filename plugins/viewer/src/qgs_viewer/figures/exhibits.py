@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from qgs.data.sampling import Sample
-from qgs.drawing.figures import Curves, categorical
-from qgs.drawing.queries import DrawnQuery, notable_queries, rendered_weights
-from qgs.metrics.dispersion import token_dispersion
+from qgs.drawing.figures import Curves
+from qgs.drawing.queries import DrawnQuery, colored_queries, notable_queries
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians
 from qgs_viewer.look import Look, look_inside
@@ -42,12 +41,6 @@ class Exhibit:
         """What it makes of the inputs."""
         return self.look.gaussians
 
-    @property
-    def dispersions(self) -> Tensor:
-        """Mean distance of each query's Gaussians to their centroid, (N,), model's units."""
-        each = self.gaussians.count // self.look.queries
-        return token_dispersion(self.gaussians.means, each)[0].view(-1, each).mean(1).cpu()
-
     def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
         """`query`, or the `count` most notable ones in the first of cameras (1, V).
 
@@ -58,10 +51,7 @@ class Exhibit:
         if not 0 <= query < self.look.queries:
             last = self.look.queries - 1
             raise ValueError(f"{self.name} has no query {query}; its queries are 0 to {last}")
-        members = self.look.members(query)
-        weights = rendered_weights(self.model, self.gaussians, cameras)[0, members]
-        spread = float(self.dispersions[query])
-        return [DrawnQuery(query, categorical(0), float(weights.sum()), spread)]
+        return colored_queries(self.gaussians, self.look.queries, [query])
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,10 @@ from qgs_viewer.figures.paper import (
     tag,
 )
 from qgs_viewer.placement import corners, on_photo
+from qgs_viewer.stage import FRUSTUM
 
 SHAPE = (3, 4)
 """Height to width of a panel."""
-FRUSTUM = 0.12
-"""Length of a drawn input camera, of the median distance to what it sees."""
 
 
 def made(show: Exhibition) -> Made:

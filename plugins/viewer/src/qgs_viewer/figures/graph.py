@@ -10,6 +10,7 @@ from torch import Tensor
 
 from qgs.drawing.figures import MUTED, hex_color
 from qgs.drawing.queries import DrawnQuery, rendered_weights
+from qgs_viewer.figures.attention import PARTS
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition, NothingToShowError
 from qgs_viewer.figures.layers import chosen_layers
 from qgs_viewer.figures.paper import WIDTH, Made, new_figure, paper_style, row_label
@@ -19,14 +20,13 @@ QUERIES = 5
 LAYERS = 2
 EDGES = 10
 """Edges of each chosen query, to those that it attends to most."""
-PARTS = {"content": "content logits", "geometry": "geometry bias", "weights": "attention"}
 
 
 def made(show: Exhibition) -> Made:
     """See `figure`. Raises NothingToShowError where no model explains its self-attention."""
     shown = [e for e in show.exhibits if e.look.self_attention(0, e.look.depth) is not None]
     if not shown:
-        raise NothingToShowError("the self-attention of these models tells nothing of itself")
+        raise NothingToShowError("none of these models reports its self-attention")
     count = QUERIES if show.query is None else 1
     chosen = {e.name: e.notable(count, e.sample.targets.cameras[:, :1], show.query) for e in shown}
     nodes = "at its anchor before the layer where it has one, else amid those of "

@@ -5,13 +5,19 @@ from math import ceil
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from qgs.data.sampling import Sample
-from qgs.drawing.images import DEPTH_MAP, Picture, depth_picture, depth_range, rgb_picture
+from qgs.drawing.images import (
+    DEPTH_MAP,
+    ERROR_MAP,
+    depth_picture,
+    depth_range,
+    error_picture,
+    rgb_picture,
+)
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Rendering
@@ -30,27 +36,28 @@ from qgs_viewer.figures.paper import (
 SCENES = 3
 INPUTS = 2
 """Input views of each scene that are shown."""
-TITLES = ("error", "depth", "render", "truth", *["inputs"] * INPUTS)
-"""Of columns, from the right."""
-ERROR_MAP = "magma"
+TITLES = ("error", "depth", "true depth", "render", "truth", *["inputs"] * INPUTS)
+"""Of columns, from the right; the true depth has one only where it is known."""
+TRUE = " of the models' and the true depth, which is shown where it is known"
 BRIGHTEST = 0.99
 """Quantile of all errors at which the colour scale ends."""
 
 
 def made(show: Exhibition) -> Made:
     """See `figure`."""
-    samples, first = show.samples[:SCENES], show.samples[0]
+    samples, depths, first = show.samples[:SCENES], show.depths[:SCENES], show.samples[0]
     target = first.label(_middle(first.target_frames))
     more = len(first.input_frames) - INPUTS
     caption = (
         f"Novel views of {', '.join(sample_name(s, samples) for s in samples)}, each from "
         f"{len(first.input_frames)} photos{f', {INPUTS} of them shown' if more > 0 else ''}. Of "
         f"each the middle target is shown (in the first, frame {target}), with PSNR. Depth: "
-        "light is near, dark is far; each map has the range told in it (2nd to 98th percentile, "
-        "units of the models' world); grey is nothing. Error: mean over channels of the absolute "
-        "difference from the truth, one scale in all. Pixels as rendered."
+        "light is near, dark is far; all maps of a scene have the scale told in the first of them "
+        f"(2nd to 98th percentile{TRUE * _known(depths)}, units of the models' world); grey is "
+        "nothing. Error: mean over channels of the absolute difference from the truth, one scale "
+        "in all. Pixels as rendered."
     )
-    return Made(figure(show.models, samples, show.depths[:SCENES]), caption)
+    return Made(figure(show.models, samples, depths), caption)
 
 
 @torch.no_grad()
@@ -59,14 +66,16 @@ def figure(
     samples: Sequence[Sample],
     depths: Sequence[Tensor | None],
 ) -> Figure:
-    """Inputs, truth, render with PSNR, depth and error of the middle target of each sample.
+    """Inputs, truth, render with PSNR, depths and error of the middle target of each sample.
 
     depths: for each sample the true depth (T, 1, H, W) of its targets, where known.
     """
     scenes = [_rendered(models, sample) for sample in samples]
     errors = [error_map(r.rgb[0, 0], truth) for seen, truth in scenes for r in seen.values()]
     brightest = float(torch.quantile(torch.cat([e.flatten() for e in errors]), BRIGHTEST))
-    columns, rows = ceil(INPUTS / len(models)) + 4, len(samples) * len(models)
+    titles = [title for title in TITLES if title != "true depth" or _known(depths)]
+    columns = ceil(INPUTS / len(models)) + len(titles) - INPUTS
+    rows = len(samples) * len(models)
     height, width = samples[0].inputs.cameras.size
     side = (WIDTH - 0.35) / columns
     with paper_style():
@@ -75,23 +84,21 @@ def figure(
         *panels, scales = drawn.subplots(rows + 1, columns, height_ratios=heights)
         for number, (sample, depth) in enumerate(zip(samples, depths, strict=True)):
             block = np.array(panels[number * len(models) : (number + 1) * len(models)])
-            _scene(block, sample, depth, *scenes[number], brightest)
+            _scene(block, sample, depth, *scenes[number], brightest, _known(depths))
             row_label(block[0, 0], sample_name(sample, samples))
-        for axis, title in zip(panels[0][::-1], TITLES, strict=False):
+        for axis, title in zip(panels[0][::-1], titles, strict=False):
             axis.set_title(title)
         _scales(scales, brightest)
     return drawn
 
 
 def error_map(image: Tensor, truth: Tensor) -> Tensor:
-    """Mean over channels of |image - truth|, (3, H, W) each -> (H, W)."""
-    return (image - truth.to(image)).abs().mean(0).float().cpu()
+    """Mean over channels of |image - truth|, (3, H, W) each -> (1, H, W)."""
+    return (image - truth.to(image)).abs().mean(0, keepdim=True).float().cpu()
 
 
-def error_picture(error: Tensor, brightest: float) -> Picture:
-    """An error map (H, W) from 0 (dark) to `brightest`."""
-    shade = (error / max(brightest, 1e-12)).clamp(0, 1).numpy()
-    return (colormaps[ERROR_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
+def _known(depths: Sequence[Tensor | None]) -> bool:
+    return any(depth is not None for depth in depths)
 
 
 def _middle(frames: Sequence[int]) -> int:
@@ -119,32 +126,31 @@ def _scene(
     seen: Mapping[str, Rendering],
     truth: Tensor,
     brightest: float,
+    column: bool,
 ) -> None:
-    """One row for each model; inputs and truth beside them."""
+    """One row for each model; inputs and truth beside them. column: whether true depth has one."""
     for axis in block.flat:
         blank_panel(axis)
     shown = [rgb_picture(image) for image in sample.inputs.images[0, :INPUTS]]
     for number, picture in enumerate(shown):
         picture_panel(block[number % len(block), number // len(block)], picture)
-    first = block.shape[1] - 4
+    first = block.shape[1] - 4 - column
     picture_panel(block[0, first], rgb_picture(truth))
-    if depth is not None and len(block) > 1:
-        _depth(block[1, first], depth[len(sample.target_frames) // 2], "true, ")
+    maps = [rendering.depth[0, 0].cpu() for rendering in seen.values()]
+    true = [] if depth is None else [depth[len(sample.target_frames) // 2].cpu()]
+    near, far = depth_range(torch.cat([*true, *maps]))
+    for line, found in zip(block, maps, strict=True):
+        picture_panel(line[-2], depth_picture(found, near, far))
+    for found in true:
+        picture_panel(block[0, -3], depth_picture(found, near, far))
+    tag(block[0, -3 if true else -2], f"{near:.2g} to {far:.2g}")
     for line, (name, rendering) in zip(block, seen.items(), strict=True):
         score = Psnr.column.shown(float(psnr(rendering.rgb[0, 0], truth.to(rendering.rgb))))
         picture_panel(line[first + 1], rgb_picture(rendering.rgb[0, 0]))
         tag(line[first + 1], f"{score} {Psnr.column.unit}")
         row_label(line[first + 1], name)
-        _depth(line[first + 2], rendering.depth[0, 0])
         error = error_map(rendering.rgb[0, 0], truth)
-        picture_panel(line[first + 3], error_picture(error, brightest))
-
-
-def _depth(axis: Axes, depth: Tensor, words: str = "") -> None:
-    """Depth (1, H, W) in colours of its own range, which is told."""
-    near, far = depth_range(depth)
-    picture_panel(axis, depth_picture(depth, near, far))
-    tag(axis, f"{words}{near:.2g} to {far:.2g}")
+        picture_panel(line[-1], error_picture(error, brightest))
 
 
 def _scales(axes: Sequence[Axes], brightest: float) -> None:

@@ -6,7 +6,6 @@ from qgs.cli import contest, trained
 from qgs.data.domain import Domain, verdict
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.data.sampling import Sample
-from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import load
 from qgs.wording import listed
 from qgs_viewer.figures.exhibits import Exhibition, exhibit
@@ -32,8 +31,7 @@ def open_exhibition(
     found.see(samples[0].inputs.cameras, samples[0].targets.cameras)
     for name, file in files.items():
         model = load(file, device)
-        curves = contest.curves_of(RunFolder(file.parent))
-        exhibits.append(exhibit(name, model, samples[0], curves if curves.seconds else None))
+        exhibits.append(exhibit(name, model, samples[0], contest.curves_of(file)))
         if photos is not None and (said := verdict(model.trained_on or Domain(), found)):
             notes.setdefault(said, []).append(name)
         if query is not None:

@@ -17,6 +17,8 @@ TILT, TURN = math.radians(28), math.radians(24)
 """How far it looks down, and from the side."""
 TANGENT = math.tan(math.radians(20))
 """Of half its narrower angle of view."""
+SURE = 0.05
+"""Length of a mean of unit axes from which it is a direction."""
 INSIDE = 0.96
 """Share of the seen points that it frames."""
 
@@ -34,12 +36,25 @@ def seen_points(model: QueryGaussianModel, gaussians: Gaussians, cameras: Camera
     return world[depths[..., 0] > 0]
 
 
+def level_axes(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Down and ahead (3,), by the mean of cameras (1, V); unit vectors at a right angle.
+
+    Where the mean has none, as of cameras that face each other, by the first camera alone.
+    """
+    axes = cameras.c2w[0, :, :3]
+    for found in (axes.mean(0), axes[0]):
+        _, down, forward, _ = found.unbind(-1)
+        level = forward - (forward @ down) / (down @ down).clamp_min(1e-12) * down
+        if min(down.norm(), level.norm()) > SURE:
+            break
+    return F.normalize(down, dim=0), F.normalize(level, dim=0)
+
+
 @full_precision
 def overview(cameras: Cameras, points: Tensor, size: tuple[int, int]) -> Cameras:
     """A camera (1, 1) of (H, W) `size` that frames points (P, 3) and input cameras (1, V)."""
-    _, down, forward, eyes = cameras.c2w[0, :, :3].unbind(-1)
-    down, forward = F.normalize(down.mean(0), dim=0), forward.mean(0)
-    level = F.normalize(forward - (forward @ down) * down, dim=0)
+    down, level = level_axes(cameras)
+    eyes = cameras.c2w[0, :, :3, 3]
     level = math.cos(TURN) * level + math.sin(TURN) * torch.linalg.cross(down, level)
     axis = math.cos(TILT) * level + math.sin(TILT) * down
     turned = look_at(torch.zeros_like(axis), axis, down)[:3, :3]

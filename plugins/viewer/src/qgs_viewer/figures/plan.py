@@ -9,16 +9,15 @@ from torch import Tensor
 
 from qgs.types import Cameras
 from qgs_viewer.figures.exhibits import Exhibit
-from qgs_viewer.figures.overview import seen_points
+from qgs_viewer.figures.overview import level_axes, seen_points
 from qgs_viewer.figures.paper import INK_HEX
+from qgs_viewer.stage import SOLID
 
 SHAPE = 1.15
 """Width to height of a plan."""
 MARGIN = 1.2
 OUTSIDE = 0.03
 """Share of the points that may lie outside of it on either side."""
-OPAQUE = 0.1
-"""Opacity from which a Gaussian is drawn."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,7 @@ class Plan:
 
 def ground(cameras: Cameras) -> Tensor:
     """Right and ahead as columns (3, 2), level by the mean of cameras (1, V)."""
-    _, down, forward, _ = cameras.c2w[0, :, :3].double().cpu().unbind(-1)
-    down, forward = F.normalize(down.mean(0), dim=0), forward.mean(0)
-    ahead = F.normalize(forward - (forward @ down) * down, dim=0)
+    down, ahead = (axis.double().cpu() for axis in level_axes(cameras))
     return torch.stack([torch.linalg.cross(down, ahead), ahead], -1)
 
 
@@ -67,7 +64,7 @@ def _ends(places: Tensor) -> Tensor:
 def draw_ground(axis: Axes, shown: Exhibit, plan: Plan) -> None:
     """The Gaussians as pale dots in their colours, and the input cameras, on a plan."""
     gaussians = shown.gaussians
-    opaque = (gaussians.opacities[0] > OPAQUE).cpu()
+    opaque = (gaussians.opacities[0] > SOLID).cpu()
     places = plan.of(gaussians.means[0])[opaque]
     colors = gaussians.colors[0].detach().clamp(0, 1).cpu()[opaque].numpy()
     axis.scatter(*places.T.numpy(), s=5, c=colors, alpha=0.35, linewidths=0, rasterized=True)
