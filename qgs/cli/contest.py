@@ -30,6 +30,7 @@ PICTURED_SCENES = 6
 NEXT = {
     "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
     "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "makes a sharp scene of them",
+    "qgs view MODEL PHOTOS": "shows the scene and its queries in the browser",
     "qgs recipes": "lists recipes, each a model to train or to change",
 }
 """Commands that a reader of a report may want, and what they do."""
