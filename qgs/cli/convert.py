@@ -18,6 +18,7 @@ def convert(
     ] = None,
 ) -> None:
     """Write Gaussians as PLY or .splat for other viewers, the most opaque alone where asked."""
+    from qgs.io.files import refuse_existing
     from qgs.io.ply import load_ply, save_ply
     from qgs.io.splat import save_splat
 
@@ -27,8 +28,7 @@ def convert(
             f"{out} must end in .ply or .splat; for .spz, .sog and others give the PLY to "
             "PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT.sog`"
         )
-    if out.exists():
-        raise FileExistsError(f"{out} exists; choose another file, or delete it yourself")
+    refuse_existing(out)
     gaussians = load_ply(source)
     kept = gaussians if count is None else gaussians.most_opaque(count)
     writers[suffix](kept, out)

@@ -8,6 +8,15 @@ import typer
 Checkpoint: TypeAlias = Annotated[
     str, typer.Argument(help="Run folder, checkpoint, its URL, or a shipped model: PLUGIN/NAME.")
 ]
+Runs: TypeAlias = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
+    ),
+]
+Photos: TypeAlias = Annotated[
+    str | None, typer.Option(help="Folder of photos and cameras; default: the recipe's data.")
+]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override, such as model.queries.count=128; repeatable."),

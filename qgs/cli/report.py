@@ -7,19 +7,12 @@ import typer
 from rich.console import Console
 
 from qgs.cli.demo import new_folder, show_trained
-from qgs.cli.options import Device
+from qgs.cli.options import Device, Photos, Runs
 
 
 def report(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
-        ),
-    ],
-    photos: Annotated[
-        str | None, typer.Option(help="Folder of photos and cameras; default: the recipe's data.")
-    ] = None,
+    runs: Runs,
+    photos: Photos = None,
     out: Annotated[
         Path | None, typer.Option(help="New folder for the page; default: report, report-2, ...")
     ] = None,

@@ -14,7 +14,7 @@ from qgs_viewer.figures import graph, refinement
 from qgs_viewer.figures.exhibits import exhibit
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.page import scenes_html, shared_start
-from qgs_viewer.server import FIELD_OF_VIEW, first_eye
+from qgs_viewer.server import FIELD_OF_VIEW, first_eye, up_of
 
 _SIZE = 240, 320  # of each scene's picture, H, W
 
@@ -89,7 +89,7 @@ def refinement_section(shown: Shown, sample: Sample) -> ReportSection:
 def _first_camera(look: Look) -> Cameras:
     """The viewer's first view of a look that is placed in the model's world, (1, 1)."""
     eye, target = (torch.from_numpy(point).double() for point in first_eye(look))
-    pose = look_at(eye, target - eye, torch.tensor([0.0, 1.0, 0.0]).double())
+    pose = look_at(eye, target - eye, -up_of(look))
     height, width = _SIZE
     focal = height / 2 / torch.tan(torch.tensor(FIELD_OF_VIEW / 2)).item()
     lens = torch.tensor([focal, focal, width / 2, height / 2])

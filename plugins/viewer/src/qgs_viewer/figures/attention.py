@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from qgs.contracts import AttentionWeights
-from qgs.drawing.figures import hex_color
+from qgs.drawing.figures import categorical, hex_color
 from qgs.drawing.images import enlarged, rgb_picture
 from qgs.drawing.queries import (
     OUTLINE_POINTS,
@@ -38,7 +38,7 @@ VIEWS = 2
 PARTS = {"content": "content logits", "geometry": "geometry bias", "weights": "attention"}
 PHOTO = 256
 """Pixels on the longer side of a photo."""
-ANCHOR = (0, 114, 178)
+ANCHOR = categorical(1)
 
 
 def made(show: Exhibition) -> Made:

@@ -8,22 +8,15 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device
+from qgs.cli.options import Device, Photos, Runs
 
 app = typer.Typer(help="Figures for a paper.")
 
 
 @app.command()
 def figures(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
-        ),
-    ],
-    photos: Annotated[
-        str | None, typer.Option(help="Folder of photos and cameras; default: the recipe's data.")
-    ] = None,
+    runs: Runs,
+    photos: Photos = None,
     scene: Annotated[
         str | None, typer.Option(help="Scene of the figures of one scene; default: the first.")
     ] = None,

@@ -24,7 +24,7 @@ from qgs_viewer.figures.paper import (
     tag,
 )
 from qgs_viewer.placement import corners, on_photo
-from qgs_viewer.stage import FRUSTUM
+from qgs_viewer.stage import FRUSTUM, frustum_lines
 
 SHAPE = (3, 4)
 """Height to width of a panel."""
@@ -86,10 +86,8 @@ def _frusta(axis: Axes, inputs: Cameras, camera: Cameras, length: float) -> None
     """Input cameras as wire frames of `length`, seen by `camera`."""
     flat = Cameras(inputs.c2w[0], inputs.intrinsics[0], inputs.size)
     rims = on_photo(flat, corners(inputs.size), length)
-    for eye, rim in zip(flat.c2w[:, :3, 3], rims, strict=True):
-        local = to_camera(torch.cat([eye[None], rim.to(eye)])[None], camera)[0, 0]
-        apex, *ring = to_pixels(local, camera.intrinsics[0, 0]).cpu().numpy() - 0.5
-        for one, other in zip(ring, [*ring[1:], ring[0]], strict=True):
-            for line in ((one, other), (apex, one)):
-                x, y = zip(*line, strict=True)
-                axis.plot(x, y, color=INK_HEX, linewidth=0.7, scalex=False, scaley=False)
+    lines = frustum_lines(flat.c2w[:, :3, 3], rims.to(flat.c2w))
+    local = to_camera(lines.flatten(0, 1)[None], camera)[0, 0]
+    pixels = to_pixels(local, camera.intrinsics[0, 0]).cpu().numpy() - 0.5
+    for x, y in pixels.reshape(-1, 2, 2).transpose(0, 2, 1):
+        axis.plot(x, y, color=INK_HEX, linewidth=0.7, scalex=False, scaley=False)
