@@ -10,6 +10,8 @@ from qgs.components.decoder import (
 )
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
+from qgs.components.latents import LatentBottleneck
+from qgs.components.multiscale import MultiscaleViT
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
@@ -18,6 +20,8 @@ from qgs.contracts import Component
 
 COMPONENTS: tuple[type[Component], ...] = (
     MultiViewViT,
+    MultiscaleViT,
+    LatentBottleneck,
     LatentQueries,
     ContentCrossAttention,
     ContentSelfAttention,
@@ -38,12 +42,14 @@ __all__ = [
     "CrossAttentionCore",
     "FreeCenters",
     "GaussianHead",
+    "LatentBottleneck",
     "LatentQueries",
     "LayerScale",
     "LayerSupervision",
     "Mlp",
     "MlpFeedForward",
     "MultiViewViT",
+    "MultiscaleViT",
     "NoRefinement",
     "OneCycleAdamW",
     "SelfAttentionCore",

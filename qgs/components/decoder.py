@@ -40,10 +40,10 @@ class ContentCrossAttention(CrossAttention):
         return {name: MEMORY_FIELDS[name] for name in ("memory.keys", "memory.values")}
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        return self.core(state.features, memory.keys, memory.values)
+        return self.core(state.features, memory["keys"], memory["values"])
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
-        return self.core.explain(state.features, memory.keys, queries)
+        return self.core.explain(state.features, memory["keys"], queries)
 
 
 class ContentSelfAttention(SelfAttention):

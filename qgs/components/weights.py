@@ -15,6 +15,9 @@ from qgs.contracts.weights import (
 
 ENCODER = "enc_dec_backbone.encoder."
 DECODER = "enc_dec_backbone.decoder_blocks."
+READOUT = "enc_dec_backbone.multiscale_norms."
+LATENTS = "enc_dec_backbone.latents"
+LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
 BACKBONE_RENAMES = (
     Rename("encoder.rgb_embedding.", "patch_embed."),
@@ -42,6 +45,29 @@ BACKBONE_RENAMES = (
     Rename("head.linear.", "activation_head.deconv."),
 )
 """Names that TokenGS and the models built on it share."""
+
+LATENT_RENAMES = (
+    Rename("encoder.norms.{}.", READOUT + "{}."),
+    Rename("encoder.latents", LATENTS),
+    Rename("encoder.feature_kv_proj.", "enc_dec_backbone.latent_feature_kv_proj."),
+    Rename("encoder.feature_k_norm.", "enc_dec_backbone.latent_feature_k_norm."),
+    Rename("encoder.latent_kv_proj.", "enc_dec_backbone.latent_kv_proj."),
+    *(
+        Rename(f"encoder.latent_blocks.{{}}.{ours}", LATENT_BLOCK + f"{{}}.{theirs}")
+        for ours, theirs in (
+            ("cross_attention.norm.", "gs_cross_attn.gs_token_norm."),
+            ("cross_attention.", "gs_cross_attn."),
+            ("cross_scale.", "gs_cross_attn_scale."),
+            ("self_norm.", "gs_self_attn.norm."),
+            ("self_attention.", "gs_self_attn.gs_self_attn."),
+            ("self_scale.", "gs_self_attn_scale."),
+            ("mlp_norm.", "mlp.norm."),
+            ("mlp.", "mlp.mlp."),
+            ("mlp_scale.", "mlp_scale."),
+        )
+    ),
+)
+"""Names of the encoders of TokenGS 2026.6: the readout of several blocks, the latent bottleneck."""
 
 READ_OPTIONS = (
     "model.width",
@@ -114,7 +140,7 @@ TOKENGS = WeightLayout(
     name="TokenGS",
     source="nv-tlabs/TokenGS",
     components={
-        "encoder": ("qgs/multiview_vit",),
+        "encoder": ("qgs/multiview_vit", "qgs/multiscale_vit", "qgs/latent_bottleneck"),
         "queries": ("qgs/latent",),
         "cross_attention": ("qgs/content",),
         "self_attention": ("qgs/content",),
@@ -125,6 +151,7 @@ TOKENGS = WeightLayout(
     },
     renames=(
         *BACKBONE_RENAMES,
+        *LATENT_RENAMES,
         Rename("decoder.{}.cross_attention.core.q_proj.", DECODER + "{}.gs_cross_attn.q_proj."),
     ),
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),

@@ -20,19 +20,25 @@ MEMORY_FIELDS: Fields = {
 class Encoder(ModelComponent):
     """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
 
-    Runs once per forward pass. A token may see all views; it depends most on its own patch, that of
-    its view, row and column. Raises ValueError for images that it cannot divide into patches.
+    Runs once per forward pass. A token may see all views; where the memory has a grid, it depends
+    most on its own patch, that of its view, row and column. Raises ValueError for images that it
+    cannot divide into patches.
 
     ordered_views: whether the order of the views matters. Otherwise, permuting the views permutes
     the tokens.
+    tunable: whether `project` makes a memory of other features, which tuning at test time needs.
     """
 
     slot: ClassVar[str] = "encoder"
     ordered_views: ClassVar[bool] = False
+    tunable: ClassVar[bool] = False
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
-        """Every encoder fills the whole ImageMemory."""
+        """The parts of the ImageMemory that it fills: all, unless it says otherwise.
+
+        One that leaves some out, or whose features have a width of its own, overrides this.
+        """
         return MEMORY_FIELDS
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -45,3 +51,11 @@ class Encoder(ModelComponent):
     @abstractmethod
     def forward(self, views: Views) -> ImageMemory:
         """Encode all views of each scene together."""
+
+    def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
+        """`memory` made anew from other `features` of its shape: what tuning at test time reads.
+
+        `project(memory.features, memory)` is that memory again. Raises NotImplementedError unless
+        the encoder is `tunable`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} makes no memory of other features")
