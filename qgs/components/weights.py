@@ -76,6 +76,9 @@ READ_OPTIONS = (
     "model.encoder.patch_size",
     "model.encoder.depth",
     "model.encoder.mlp_ratio",
+    "model.encoder.blocks",
+    "model.encoder.latents",
+    "model.encoder.latent_depth",
     "model.queries.type",
     "model.queries.count",
     "model.decoder.depth",
@@ -124,6 +127,8 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
 def _read(shapes: Shapes) -> dict[str, Any]:
     model = backbone(shapes, "qgs/latent")
+    later = _encoder_of_2026_6(shapes, model)
+    model["encoder"] |= later
     model["decoder"] |= {
         "cross_attention": {"type": "qgs/content"},
         "self_attention": {"type": "qgs/content"},
@@ -131,9 +136,26 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     }
     model["head"] |= {"scale_input_limit": None, "quat_eps": 1e-12}
     unlimited = {"input_limit": None, "output_limit": None}
-    model["centers"] = {"type": "qgs/free", "z_offset": 1.0, **unlimited}
+    model["centers"] = {"type": "qgs/free", "z_offset": 0.0 if later else 1.0, **unlimited}
     model["supervision"] = {"type": "qgs/layers", "layers": [model["decoder"]["depth"]]}
-    return {"recipe": 1, "model": model}
+    tree = {"recipe": 1, "model": model}
+    return {**tree, "views": {"frame": "mean_cam"}} if later else tree
+
+
+def _encoder_of_2026_6(shapes: Shapes, model: dict[str, Any]) -> dict[str, Any]:
+    """The options that the encoder of `model` has besides, from the names of its readout."""
+    scales, depth = layer_count(shapes, READOUT), model["encoder"]["depth"]
+    if not scales:
+        return {}
+    if scales > depth:
+        raise LayoutError(f"{READOUT}: {scales} norms, one for each block read, of {depth} blocks")
+    step = 2 if 2 * scales <= depth + 1 else 1
+    found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
+    if LATENTS not in shapes:
+        return {"type": "qgs/multiscale_vit", **found}
+    blocks = layer_count(shapes, LATENT_BLOCK)
+    found |= {"latents": size_at(shapes, LATENTS, 0), "latent_depth": blocks}
+    return {"type": "qgs/latent_bottleneck", **found}
 
 
 TOKENGS = WeightLayout(
@@ -159,8 +181,10 @@ TOKENGS = WeightLayout(
     read_options=READ_OPTIONS,
     undecided=(
         "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
+        "blocks that an encoder of 2026.6 reads: every second one up to the last",
         "supervised layers: the last",
-        "scale and frame of the world, losses, renderer, training: the framework's defaults",
+        "frame of the world: the mean camera for encoders of 2026.6, else the first",
+        "scale of the world, losses, renderer, training: the framework's defaults",
     ),
 )
-"""The released TokenGS for posed photos, without its dynamic and latent extensions."""
+"""The released TokenGS for posed photos, without its dynamic tokens."""

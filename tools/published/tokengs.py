@@ -8,6 +8,8 @@ from published.options import ReleasedOptions
 UNSUPPORTED_BUT = {"num_dynamic_gs_tokens": 0, "time_embedding": False}
 """Parts of the release that no recipe can express."""
 
+FRAMES = ("first_cam", "mean_cam")
+
 OF_2026_6 = {"use_multiscale_encoder": False, "use_latent_bottleneck": False}
 """Encoders that LocusGS's release does not have."""
 
@@ -34,7 +36,8 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
         "output_limit": None,
     }
     model["supervision"] = {"layers": [released.count("dec_depth")]}
-    return {"recipe": 1, "model": model}
+    frame = released.meaning("camera_normalization_method", {name: name for name in FRAMES})
+    return {"recipe": 1, "model": model, "views": {"frame": frame}}
 
 
 def backbone(options: ReleasedOptions) -> dict[str, Any]:
