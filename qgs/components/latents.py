@@ -49,8 +49,12 @@ class LatentBottleneck(MultiscaleReadout):
     tunable = True
 
     class Config(MultiscaleReadout.Config):
-        latents: int = Field(default=4096, ge=1)
-        """L, the number of latents."""
+        depth: int = Field(default=12, ge=1, le=256)
+        """Number of ViT blocks."""
+        blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
+        """Numbers of the blocks that are read, ascending; 1 is the first, and `depth` the last."""
+        latents: int = Field(ge=1)
+        """L, the number of latents (TokenGS: 4096)."""
         latent_std: float = Field(default=0.02, ge=0)
         """Standard deviation of the normal distribution that the latents start from."""
         latent_depth: int = Field(default=12, ge=1, le=256)

@@ -26,9 +26,7 @@ class MultiscaleReadout(PatchViT):
     """Features of an image token: the outputs of S chosen blocks, each with a norm of its own."""
 
     class Config(PatchViT.Config):
-        depth: int = Field(default=12, ge=1, le=256)
-        """Number of ViT blocks."""
-        blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
+        blocks: tuple[int, ...] = Field(default=(1, 2, 3), min_length=1)
         """Numbers of the blocks that are read, ascending; 1 is the first, and `depth` the last."""
 
         @field_validator("blocks")
@@ -44,9 +42,7 @@ class MultiscaleReadout(PatchViT):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.read = frozenset(config.blocks)
-        self.norms = nn.ModuleList(
-            nn.LayerNorm(dims.width, config.norm_eps) for _ in config.blocks
-        )
+        self.norms = nn.ModuleList(nn.LayerNorm(dims.width, config.norm_eps) for _ in config.blocks)
         self.feature_width = len(config.blocks) * dims.width
 
     @classmethod

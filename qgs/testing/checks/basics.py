@@ -11,7 +11,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 from qgs.composer.flow import fits
 from qgs.composer.registry import file_of
 from qgs.testing.case import Case, ContractError, expect
-from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of, tracked_inputs
+from qgs.testing.inputs import Inputs, Maker, Sizes, inputs_of, sizes_of, tracked_inputs
 from qgs.testing.modules import each_mode, seeded
 from qgs.testing.registry import ALL_SLOTS, MODULES, PARAMETRIC, check
 from qgs.testing.running import with_place
@@ -106,9 +106,14 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
     batch, count = sizes.batch, sizes.queries
     match case.slot:
         case "encoder":
-            head, token = (batch, heads, None, width // heads), (batch, None)
-            shapes = {"keys": head, "values": head}
-            return {**shapes, "features": (*token, width), "patch_rays": (*token, 6)}
+            of_heads = ("memory.keys", "memory.values")
+            return {
+                name.removeprefix("memory."): (
+                    *((batch, heads, None) if name in of_heads else (batch, None)),
+                    *sizes_of(spec, case.dims),
+                )
+                for name, spec in case.component.provides(case.config).items()
+            }
         case "queries" | "refinement":
             count = module.count if case.slot == "queries" else count
             maker = Maker(case, replace(sizes, queries=count), torch.Generator())
