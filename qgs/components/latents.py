@@ -1,4 +1,4 @@
-"""`qgs/latent_bottleneck`: learned latents that read the photos and stand for them (TokenGS 2026.6).
+"""`qgs/latent_bottleneck`: learned latents that stand for the photos (TokenGS 2026.6).
 
 Axes: L latents, C = S D the width of the image tokens' features.
 """

@@ -4,6 +4,7 @@ from typing import Any
 
 from qgs.components.head import CHANNELS
 from qgs.contracts.weights import (
+    LayoutError,
     Rename,
     Shapes,
     WeightLayout,
