@@ -378,6 +378,8 @@ def _wide_and_tall(case: Case) -> Iterator[tuple[str, Views]]:
 def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
     """Pixels along a patch, as the grid of `memory` says."""
     count, (height, width), grid = views.images.shape[1], views.cameras.size, memory.grid
+    expect(grid is not None, f"{where}, it gives `patch_rays` without a `grid`")
+    assert grid is not None
     patch = max(height // max(grid[1], 1), 1)
     right = grid == (count, height / patch, width / patch)
     seen = f"{where} of {count} views, `grid` is {grid}, which is not (V, H/P, W/P) for any P"
