@@ -33,7 +33,7 @@ class GaussianHead(Head):
         """Standard deviation of the truncated normal that the weights start from."""
         position_std: float | None = Field(default=None, gt=0)
         """The same for the weights that make positions; null for `init_std`."""
-        z_bias: float = 0.0
+        z_init: float = 0.0
         """What the biases of the z of positions start from, raw (TokenGS 2026.6: log 1.1)."""
         norm: bool = False
         """A LayerNorm before the linear layer (in neither release; steadier for small models)."""
@@ -62,7 +62,7 @@ class GaussianHead(Head):
             with torch.no_grad():
                 self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
         with torch.no_grad():
-            self.linear.bias.unflatten(0, (-1, sum(CHANNELS)))[:, CHANNELS[0] - 1] = config.z_bias
+            self.linear.bias.unflatten(0, (-1, sum(CHANNELS)))[:, CHANNELS[0] - 1] = config.z_init
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:

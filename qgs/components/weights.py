@@ -128,7 +128,7 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
 def _read(shapes: Shapes) -> dict[str, Any]:
     model = backbone(shapes, "qgs/latent")
-    later = _encoder_of_2026_6(shapes, model)
+    later = _encoder_of_2026_6(shapes, model["encoder"]["depth"])
     model["encoder"] |= later
     model["decoder"] |= {
         "cross_attention": {"type": "qgs/content"},
@@ -139,13 +139,14 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     unlimited = {"input_limit": None, "output_limit": None}
     model["centers"] = {"type": "qgs/free", "z_offset": 0.0 if later else 1.0, **unlimited}
     model["supervision"] = {"type": "qgs/layers", "layers": [model["decoder"]["depth"]]}
-    tree = {"recipe": 1, "model": model}
-    return {**tree, "views": {"frame": "mean_cam"}} if later else tree
+    tree: dict[str, Any] = {"recipe": 1, "model": model}
+    tree |= {"views": {"frame": "mean_cam"}} if later else {}
+    return tree | ({"evaluation": {"tuning": "latents"}} if LATENTS in shapes else {})
 
 
-def _encoder_of_2026_6(shapes: Shapes, model: dict[str, Any]) -> dict[str, Any]:
-    """The options that the encoder of `model` has besides, from the names of its readout."""
-    scales, depth = layer_count(shapes, READOUT), model["encoder"]["depth"]
+def _encoder_of_2026_6(shapes: Shapes, depth: int) -> dict[str, Any]:
+    """What the encoder, of `depth` blocks, has besides; nothing if it is none of 2026.6."""
+    scales = layer_count(shapes, READOUT)
     if not scales:
         return {}
     if scales > depth:

@@ -85,7 +85,7 @@ def test_head_starts_with_the_spread_it_is_told() -> None:
 
 
 def test_head_starts_at_the_depth_it_is_told() -> None:
-    head = GaussianHead(GaussianHead.Config(gaussians_per_query=4, z_bias=math.log(1.1)), DIMS)
+    head = GaussianHead(GaussianHead.Config(gaussians_per_query=4, z_init=math.log(1.1)), DIMS)
     offsets = head(QueryState(torch.zeros(1, 1, 16))).offsets
     torch.testing.assert_close(posact(offsets), torch.tensor([0, 0, 0.1]).expand(1, 1, 4, 3))
 

@@ -98,7 +98,7 @@ LOSS_LIMITS: list[tuple[str, str, float, float, dict[str, Any]]] = [
 
 BEGINNINGS = {
     "std", "init_std", "position_std", "layer_scale", "init_radius", "gamma_init", "weight",
-    "mse_weight", "l1_weight", "ssim_weight", "ratio", "mlp_ratio", "latent_std", "z_bias",
+    "mse_weight", "l1_weight", "ssim_weight", "ratio", "mlp_ratio", "latent_std", "z_init",
 }  # fmt: skip
 """Numbers that say how training starts, what it weighs or how wide a layer is."""
 
