@@ -8,6 +8,7 @@ from qgs.components.decoder import (
     MlpFeedForward,
     NoRefinement,
 )
+from qgs.components.dynamic import BlockCausalSelfAttention, DynamicQueries
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
 from qgs.components.latents import LatentBottleneck
@@ -23,6 +24,8 @@ COMPONENTS: tuple[type[Component], ...] = (
     MultiscaleViT,
     LatentBottleneck,
     LatentQueries,
+    DynamicQueries,
+    BlockCausalSelfAttention,
     ContentCrossAttention,
     ContentSelfAttention,
     MlpFeedForward,
@@ -37,9 +40,11 @@ __all__ = [
     "COMPONENTS",
     "NORM_EPS",
     "TOKENGS",
+    "BlockCausalSelfAttention",
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",
+    "DynamicQueries",
     "FreeCenters",
     "GaussianHead",
     "LatentBottleneck",
