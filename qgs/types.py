@@ -185,31 +185,42 @@ class Views(TensorContainer):
 
 @dataclass(frozen=True)
 class ImageMemory(TensorContainer):
-    """What the encoder leaves for the decoder.
+    """What the encoder leaves for the decoder: M tokens, with what it knows of them.
 
+    features: (B, M, C), for components that project their own keys and values; C is the model's
+        width D, or a width of the encoder's own.
     keys, values: (B, h, M, D/h), made once for all decoder layers.
-    features: (B, M, D), for components that project their own keys and values.
     patch_rays: (B, M, 6) float32 world-frame Plücker rays (moment, direction), averaged over each
-        patch and not renormalised.
-    grid: (V, H/P, W/P), M is its product; tokens are ordered view, row, column.
+        patch and not renormalised. None where tokens are not of one patch, or cameras unknown.
+    grid: (V, H/P, W/P), M is its product; tokens are ordered view, row, column. None for tokens
+        that are no patches, such as learned latents.
+
+    `Encoder.provides` says which of them there are.
     """
 
-    keys: Tensor
-    values: Tensor
     features: Tensor
-    patch_rays: Tensor
-    grid: tuple[int, int, int]
+    keys: Tensor | None = None
+    values: Tensor | None = None
+    patch_rays: Tensor | None = None
+    grid: tuple[int, int, int] | None = None
     _derived: dict[tuple[str, bool, bool], Tensor] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     def __post_init__(self) -> None:
         _check_shapes(
-            self, features="B M D", keys="B h M D/h", values="B h M D/h", patch_rays="B M 6"
+            self, features="B M C", keys="B h M D/h", values="B h M D/h", patch_rays="B M 6"
         )
         tokens = self.features.shape[1]
-        if math.prod(self.grid) != tokens:
+        if self.grid is not None and math.prod(self.grid) != tokens:
             raise ValueError(f"ImageMemory.grid {self.grid} must hold the {tokens} tokens")
+
+    def __getitem__(self, name: str) -> Tensor:
+        """A part that a component `requires`, such as "keys"; KeyError where there is none."""
+        part = getattr(self, name, None)
+        if not isinstance(part, Tensor):
+            raise KeyError(f"the image memory has no {name}; its encoder does not provide it")
+        return part
 
     def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """`compute()` of the first layer that asks for `name`, kept for the other layers.
@@ -226,13 +237,21 @@ class ImageMemory(TensorContainer):
 
 @dataclass(frozen=True)
 class QueryState(TensorContainer):
-    """The state of every query: features (B, N, D) and named fields (B, N, ...)."""
+    """The state of every query: features (B, N, D) and named fields (B, N, ...).
+
+    mask: (B, N) bool, False for places that hold no query where scenes of a batch have different
+        numbers of them; None where every place holds one. What stands there is finite, no other
+        query reads it, and its Gaussians have opacity 0.
+    """
 
     features: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+    mask: Tensor | None = None
 
     def __post_init__(self) -> None:
-        _check_shapes(self, features="B N D")
+        _check_shapes(self, features="B N D", mask="B N")
+        if self.mask is not None and self.mask.dtype != torch.bool:
+            raise ValueError(f"QueryState.mask must be bool, got {self.mask.dtype}")
         count = tuple(self.features.shape[:2])
         for name, tensor in self.fields.items():
             if tuple(tensor.shape[:2]) != count:
@@ -251,9 +270,8 @@ class QueryState(TensorContainer):
         self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
     ) -> "QueryState":
         """A new state with other features and with `fields` added or replaced."""
-        return QueryState(
-            self.features if features is None else features, {**self.fields, **(fields or {})}
-        )
+        features = self.features if features is None else features
+        return QueryState(features, {**self.fields, **(fields or {})}, self.mask)
 
 
 _OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "colors": "... 3"}

@@ -223,7 +223,7 @@ def small(steps: int) -> Recipe:
 def use_checkpoint(checkpoint: Path) -> None:
     model = qgs.load(checkpoint)
     with torch.no_grad():
-        gaussians = model.decode(model.queries(1))
+        gaussians = model.decode(model.queries.start(1))
     save_ply(gaussians, checkpoint.with_suffix(".ply"))
     load_step(checkpoint)
     verdict(load_domain(checkpoint), Domain())

@@ -257,7 +257,8 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
         prediction = model(sample.inputs, layers=range(1, model.depth + 1))
         chosen = notable_queries(model, prediction.gaussians, camera, ANCHORS)
         colors = {query.index: query.color for query in chosen}
-        states = {"learned start": model.queries(1)} | {
+        start = model.queries(model.encoder(sample.inputs), sample.inputs)
+        states = {"learned start": start} | {
             f"after layer {number}": layer.state for number, layer in prediction.layers.items()
         }
         for caption, state in states.items():

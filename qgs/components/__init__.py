@@ -5,6 +5,7 @@ from qgs.components.centers import FreeCenters, posact
 from qgs.components.decoder import (
     ContentCrossAttention,
     ContentSelfAttention,
+    CrossSelfMlp,
     MlpFeedForward,
     NoRefinement,
 )
@@ -19,6 +20,7 @@ from qgs.contracts import Component
 COMPONENTS: tuple[type[Component], ...] = (
     MultiViewViT,
     LatentQueries,
+    CrossSelfMlp,
     ContentCrossAttention,
     ContentSelfAttention,
     MlpFeedForward,
@@ -36,6 +38,7 @@ __all__ = [
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",
+    "CrossSelfMlp",
     "FreeCenters",
     "GaussianHead",
     "LatentQueries",

@@ -73,14 +73,23 @@ class SelfAttentionCore(nn.Module):
         )
         return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
-    def forward(self, x_BTD: Tensor) -> Tensor:
+    def forward(self, x_BTD: Tensor, mask_BT: Tensor | None = None) -> Tensor:
+        """(B, T, D). mask: False for tokens that nobody reads."""
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
-        return self.proj(merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd)))
+        mask = None if mask_BT is None else mask_BT[:, None, None]
+        read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask)
+        return self.proj(merge_heads(read_BhTd))
 
-    def explain(self, x_BTD: Tensor, queries: Tensor) -> AttentionWeights:
-        """Attention of the tokens with indices `queries` (Q,)."""
+    def explain(
+        self, x_BTD: Tensor, queries: Tensor, mask_BT: Tensor | None = None
+    ) -> AttentionWeights:
+        """Attention of the tokens with indices `queries` (Q,), with the mask as in `forward`."""
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
-        return attention_weights(q_BhTd[:, :, queries], k_BhTd, None)
+        bias_B1QT = None
+        if mask_BT is not None:
+            hidden_BT = torch.where(mask_BT, 0.0, -torch.inf)
+            bias_B1QT = hidden_BT[:, None, None].expand(-1, -1, len(queries), -1)
+        return attention_weights(q_BhTd[:, :, queries], k_BhTd, bias_B1QT)
 
 
 class CrossAttentionCore(nn.Module):

@@ -20,8 +20,9 @@ MEMORY_FIELDS: Fields = {
 class Encoder(ModelComponent):
     """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
 
-    Runs once per forward pass. A token may see all views; it depends most on its own patch, that of
-    its view, row and column. Raises ValueError for images that it cannot divide into patches.
+    Runs once per forward pass. A token may see all views; where the memory has a grid, it depends
+    most on its own patch, that of its view, row and column. Raises ValueError for images that it
+    cannot divide into patches.
 
     ordered_views: whether the order of the views matters. Otherwise, permuting the views permutes
     the tokens.
@@ -32,7 +33,10 @@ class Encoder(ModelComponent):
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
-        """Every encoder fills the whole ImageMemory."""
+        """The parts of the ImageMemory that it fills: all, unless it says otherwise.
+
+        One that leaves some out, or whose features have a width of its own, overrides this.
+        """
         return MEMORY_FIELDS
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -157,7 +157,8 @@ def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
     """`count` queries to show in cameras (1, V): heavy, well inside the first view, and apart."""
-    weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().view(model.queries.count, -1)
+    per_query = model.head.gaussians_per_query
+    weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().unflatten(0, (-1, per_query))
     means_NK3 = gaussians.means[0].cpu().view(*weights_NK.shape, 3)
     weights_N = weights_NK.sum(1)
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
@@ -187,7 +188,7 @@ def query_picture(
 ) -> Picture:
     """The Gaussians of `chosen` in colour with lines to centroids, over a grey scene; (1, 1)."""
     scene = washed(rgb_picture(model.render(gaussians, cameras, background).rgb[0, 0]))
-    per_query = gaussians.count // model.queries.count
+    per_query = model.head.gaussians_per_query
     members = [range(q.index * per_query, (q.index + 1) * per_query) for q in chosen]
     index = [i for member in members for i in member]
     shown = gaussians[:, torch.tensor(index, dtype=torch.long, device=gaussians.means.device)]

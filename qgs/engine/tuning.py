@@ -41,7 +41,7 @@ def tune(
         raise ValueError(f"token tuning takes at least one step, got {steps}")
     with torch.no_grad():
         memory = model.encoder(views)
-        start = model.queries(views.images.shape[0])
+        start = model.queries(memory, views)
     state = map_tensors(lambda x: x.detach().clone().requires_grad_(x.is_floating_point()), start)
     leaves = [tensor for _, tensor in named_tensors(state) if tensor.requires_grad]
     optimizer = torch.optim.Adam(leaves, lr=rate)

@@ -140,7 +140,7 @@ def loss_value(kind: str, options: dict[str, Any]) -> Tensor:
     z = torch.tensor([0.0, 5e-4, 0.01, 0.5, 1.0])
     points = torch.stack([torch.full_like(z, 0.3), torch.zeros_like(z), z], -1)[None]
     model = compose(LOCUS)
-    state = model.queries(1)
+    state = model.queries.start(1)
     gaussians = model.decode(state)
     opaque = torch.linspace(0.1, 0.9, gaussians.count)[None]
     gaussians = type(gaussians)(

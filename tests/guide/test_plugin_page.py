@@ -96,7 +96,7 @@ def test_the_field_starts_changes_and_places(package: ModuleType) -> None:
     queries = depth.DepthQueries(depth.DepthQueries.Config(count=4), dims)
     refinement = depth.DepthRefinement(depth.DepthRefinement.Config(), dims)
     centers = depth.DepthCenters(depth.DepthCenters.Config(), dims)
-    state = refinement(queries(2))
+    state = refinement(queries.start(2))
     learned = queries.log_depth + refinement.step(queries.features)
     means = centers(torch.zeros(2, 4, 1, 3), state)
     torch.testing.assert_close(means[1, :, 0, 2:], learned.clamp(-4, 4).exp())

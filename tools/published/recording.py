@@ -15,10 +15,10 @@ from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from torch import Tensor, nn
 
-from qgs.components import MultiViewViT
+from qgs.components import CrossSelfMlp, MultiViewViT
 from qgs.components.encoder import imagenet_normalised
 from qgs.geometry.rays import camera_rays, plucker_rays
-from qgs.model import DecoderLayer, QueryGaussianModel
+from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, Views
 
 
@@ -61,7 +61,7 @@ class _Recorder:
         yield first.register_forward_pre_hook(self._encoder_input)
         yield encoder.register_forward_hook(self._memory)
         for index, layer in enumerate(self.model.decoder):
-            assert isinstance(layer, DecoderLayer)
+            assert isinstance(layer, CrossSelfMlp)
             yield layer.register_forward_pre_hook(partial(self._entering, index))
             yield layer.cross_attention.register_forward_hook(self._cross_attention)
             yield layer.self_attention.register_forward_hook(self._self_attention)
@@ -76,8 +76,8 @@ class _Recorder:
 
     def _memory(self, module: nn.Module, args: Any, memory: ImageMemory) -> None:
         self.found["encoder_features"] = memory.features
-        self.found["keys"], self.found["values"] = memory.keys, memory.values
-        self.found["plucker_patch"] = memory.patch_rays
+        self.found |= {name: memory[name] for name in ("keys", "values")}
+        self.found["plucker_patch"] = memory["patch_rays"]
 
     def _entering(
         self, index: int, module: nn.Module, args: tuple[QueryState, ImageMemory]

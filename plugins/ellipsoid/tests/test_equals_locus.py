@@ -83,14 +83,14 @@ def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined: bool, bo
         torch.testing.assert_close(seen.state[RAW_RADII], raw, rtol=1e-5, atol=1e-5)
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 40, 4)
         assert torch.equal(seen.state[ROTATION], identity)
-    moved = theirs.state["anchor.center"] - locus.queries(2)["anchor.center"]
+    moved = theirs.state["anchor.center"] - locus.queries.start(2)["anchor.center"]
     assert moved.abs().max() > 0.01, "the anchors must move for this to say anything"
 
 
 def test_the_bias_of_every_layer_is_that_of_locusgs() -> None:
     locus, ellipsoid = _pair()
     memory = locus.encoder(_photos())
-    ours, theirs = ellipsoid.queries(2), locus.queries(2)
+    ours, theirs = ellipsoid.queries.start(2), locus.queries.start(2)
     for mine, other in zip(ellipsoid.decoder, locus.decoder, strict=True):
         seen = mine.cross_attention.bias(ours, memory)
         expected = other.cross_attention.bias(theirs, memory)

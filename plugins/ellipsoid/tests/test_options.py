@@ -142,7 +142,7 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise() -> None:
     with torch.no_grad():
         for parameter in queries.parameters():
             parameter += torch.randn_like(parameter)
-    state = queries(2)
+    state = queries.start(2)
     torch.testing.assert_close(state[ROTATION].norm(dim=-1), torch.ones(2, 500))
     torch.testing.assert_close(state[ROTATION][1], F.normalize(queries.rotation, dim=-1))
     assert torch.equal(state[CENTER][1], queries.center)

@@ -35,7 +35,7 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
             return super().bias(state, memory)
         features = memory.once(
             f"ellipsoid.ray_features.{config.direction_eps:g}",
-            lambda: ray_features(memory.patch_rays, config.direction_eps),
+            lambda: ray_features(memory["patch_rays"], config.direction_eps),
         )
         place = state[CENTER], anchor_rotation(state[ROTATION]), sigma_sq_BN3
         return ellipsoid_bias(*place, features, config.bias_min, self.gamma)

@@ -94,7 +94,7 @@ class RayBiasedCrossAttention(CrossAttention):
         """gamma b (B, N, M), float32, of the state before this layer."""
         config, eps = self.config, self.config.direction_eps
         rays_BFM = memory.once(
-            f"locus.ray_features.{eps:g}", lambda: ray_features(memory.patch_rays, eps)
+            f"locus.ray_features.{eps:g}", lambda: ray_features(memory["patch_rays"], eps)
         )
         sigma_sq = self.sigma_sq(state)
         return ray_bias(state[CENTER], sigma_sq, rays_BFM, config.bias_min, self.gamma)
@@ -102,9 +102,9 @@ class RayBiasedCrossAttention(CrossAttention):
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
         """The update (B, N, D)."""
         bias_BNM = self.bias(state, memory)
-        return self.core(state.features, memory.keys, memory.values, bias_BNM)
+        return self.core(state.features, memory["keys"], memory["values"], bias_BNM)
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
         """Attention over image tokens, with the bias apart."""
         bias_BNM = self.bias(state, memory)
-        return self.core.explain(state.features, memory.keys, queries, bias_BNM)
+        return self.core.explain(state.features, memory["keys"], queries, bias_BNM)

@@ -42,7 +42,7 @@ class Look:
     @property
     def queries(self) -> int:
         """How many queries there are to pick; 0 without a model."""
-        return self.inside.model.queries.count if self.inside else 0
+        return self.inside.states[0].features.shape[1] if self.inside else 0
 
     @property
     def depth(self) -> int:
@@ -139,7 +139,8 @@ def look_inside(
     placement: Placement | None = None,
 ) -> Look:
     """What `model` makes of views (1, V), with all that can be asked of it."""
-    memory, start = model.encoder(views), model.queries(1)
+    memory = model.encoder(views)
+    start = model.queries(memory, views)
     prediction = model.predict(memory, start, range(1, model.depth + 1))
     states = [start, *(layer.state for layer in prediction.layers.values())]
     inside = Inside(model, memory, states)

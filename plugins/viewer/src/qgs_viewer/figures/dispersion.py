@@ -46,7 +46,7 @@ def dispersions(model: QueryGaussianModel, samples: Sequence[Sample]) -> dict[st
     values: dict[str, list[float]] = {"mean": [], "median": []}
     for sample in samples:
         means = model(sample.inputs.to(device)).gaussians.means
-        distances = token_dispersion(means, means.shape[1] // model.queries.count)
+        distances = token_dispersion(means, model.head.gaussians_per_query)
         values["mean"].append(float(distances.mean()))
         values["median"].append(float(torch.quantile(distances, 0.5)))
     return values
