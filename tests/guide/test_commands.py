@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import typer
 from guide_pages import DOCS, text_of
+from qgs_plugintools.new_command import rendered
 from typer.core import TyperGroup
 
 from qgs.cli import app
-from qgs.cli.new_plugin import rendered
 
 TEMPLATE = {path.name: text for path, text in rendered("sightline")}
 README = TEMPLATE["README.md"]
