@@ -14,14 +14,14 @@ import pytest
 import torch
 from guide_pages import blocks
 from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_plugintools import Case, cases_of, checks_for, run_check
+from qgs_plugintools.inputs import inputs_of
+from qgs_plugintools.new_command import rendered
 
-from qgs.cli.new_plugin import rendered
 from qgs.composer import RecipeError
 from qgs.composer.recipe import resolve
 from qgs.composer.registry import InstalledPlugin
 from qgs.contracts import ModelDims
-from qgs.testing import Case, cases_of, checks_for, run_check
-from qgs.testing.inputs import inputs_of
 from qgs.types import QueryState
 
 PACKAGE = "qgs_sightline"
