@@ -9,7 +9,7 @@ import pytest
 SPATIAL = """
 from typing import Literal
 from qgs.contracts import (
-    CrossAttention, ComponentConfig, FieldSpec, Plugin, Queries, Refinement, SceneSource)
+    CrossAttention, ComponentConfig, FieldSpec, LearnedQueries, Plugin, Refinement, SceneSource)
 from qgs.types import QueryState
 
 PLACE = {"place.center": FieldSpec((3,), frame="world")}

@@ -122,7 +122,7 @@ BROKEN_PLUGINS = {
     ),
     "abstract component": (
         "class Half(LearnedQueries):\n    name = 'half'\nplugin = Plugin('bad', 2, (Half,))",
-        "leaves count, forward abstract",
+        "leaves count, start abstract",
     ),
     "device that is none": (
         "class Odd(TorchRenderer):\n    name = 'odd'\n    devices = ('tpu',)\n"

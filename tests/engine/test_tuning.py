@@ -60,7 +60,7 @@ def test_every_floating_field_is_tuned_and_no_other(
     start = model.queries.start(1)
     numbers = torch.arange(start.features.shape[1])[None]
     labelled = start.replace(fields={"stranger.label": numbers})
-    monkeypatch.setattr(model.queries, "forward", lambda batch_size: labelled)
+    monkeypatch.setattr(model.queries, "forward", lambda memory, views: labelled)
     seen: list[QueryState] = []
     predict = model.predict
 

@@ -96,8 +96,8 @@ def test_the_bias_of_every_layer_is_that_of_locusgs() -> None:
         expected = other.cross_attention.bias(theirs, memory)
         torch.testing.assert_close(seen, expected, rtol=1e-5, atol=1e-5)
         assert expected.min() < -1
-        ours = ellipsoid.refinements[0](mine(ours, memory))
-        theirs = locus.refinements[0](other(theirs, memory))
+        ours = ellipsoid.refinements[0](mine(ours, memory)[0])
+        theirs = locus.refinements[0](other(theirs, memory)[0])
 
 
 def _like_locus(gradients: dict[str, Tensor]) -> dict[str, Tensor]:

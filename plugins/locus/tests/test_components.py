@@ -61,7 +61,7 @@ def test_queries_start_as_configured() -> None:
 def test_queries_without_radius_provide_none() -> None:
     config = AnchoredQueries.Config(count=4, radius=False)
     assert set(AnchoredQueries.provides(config)) == {"anchor.center"}
-    assert set(AnchoredQueries(config, DIMS)(1).fields) == {"anchor.center"}
+    assert set(AnchoredQueries(config, DIMS).start(1).fields) == {"anchor.center"}
 
 
 def test_frustum_centers_lie_in_the_frustum() -> None:

@@ -204,7 +204,7 @@ def test_its_component_computes_its_formula(sink: float) -> None:
     module = attention(attention.Config(sink_init=sink), ModelDims(16, 2, 1))
     state = QueryState(torch.randn(2, 3, 16))
     keys, values = torch.randn(2, 2, 2, 6, 8)
-    memory = ImageMemory(keys, values, torch.randn(2, 6, 16), torch.randn(2, 6, 6), (1, 2, 3))
+    memory = ImageMemory(torch.randn(2, 6, 16), keys, values, torch.randn(2, 6, 6), (1, 2, 3))
     logits = module.core.project(state.features) @ keys.transpose(-1, -2) / 8**0.5
     read = logits.exp() @ values / (math.exp(sink) + logits.exp().sum(-1, keepdim=True))
     expected = module.core.out_proj(read.transpose(1, 2).flatten(2))

@@ -8,12 +8,14 @@ import torch
 from pydantic_core import to_jsonable_python
 from torch import Tensor, nn
 
+from qgs.components import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
 from qgs.composer.errors import did_you_mean
 from qgs.composer.registry import component_fault
 from qgs.composer.yaml_text import dump
 from qgs.contracts import (
     Component,
     ComponentConfig,
+    DecoderLayer,
     ModelComponent,
     ModelDims,
     Problem,
@@ -27,6 +29,15 @@ SMALL = ModelDims(width=32, heads=2, depth=2)
 
 IMAGE_SIZES = ((16, 24), (24, 16), (28, 42), (32, 48), (64, 96))
 """Sizes that are tried in turn until the component's `problems` accepts one."""
+
+SUBLAYERS: Mapping[str, Any] = {
+    "cross_attention": ContentCrossAttention,
+    "self_attention": ContentSelfAttention,
+    "feed_forward": MlpFeedForward,
+}
+"""What a decoder layer is given in its slots."""
+
+LAYER_SCALE = 0.3
 
 NOISE = 0.1
 """Added to parameters where initial zeros would hide what a component does."""
@@ -144,6 +155,10 @@ class Case:
     def construct(self) -> Any:
         """A new instance, drawn from the global random state."""
         make: Any = self.component
+        if issubclass(make, DecoderLayer):
+            inside = {slot: SUBLAYERS[slot] for slot in make.sublayers}
+            parts = {slot: part(part.Config(), self.dims) for slot, part in inside.items()}
+            return make(self.config, self.dims, parts, LAYER_SCALE)
         return make(self.config, self.dims) if self.has_parameters else make(self.config)
 
     def lively(self, seed: int = 0) -> Any:

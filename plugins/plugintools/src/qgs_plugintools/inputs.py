@@ -31,7 +31,8 @@ PATCH = 8
 
 ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "encoder": ("views",),
-    "queries": ("batch_size",),
+    "queries": ("memory", "views"),
+    "layer": ("state", "memory"),
     "cross_attention": ("state", "memory"),
     "self_attention": ("state",),
     "feed_forward": ("features",),
@@ -87,6 +88,13 @@ def required_fields(case: Case) -> dict[str, FieldSpec]:
     return {n: spec for n, spec in required.items() if not n.startswith(elsewhere)}
 
 
+def memory_width(case: Case) -> int:
+    """Width of the memory's features: what the case requires, else that of its model."""
+    spec = case.component.requires(case.config).get("memory.features")
+    width = spec.shape[0] if spec else "D"
+    return width if isinstance(width, int) else case.dims.width
+
+
 class Maker:
     """Draws inputs of the given sizes from one generator."""
 
@@ -95,10 +103,6 @@ class Maker:
         self.sizes = sizes
         self.generator = generator
         self.image = sizes.image or case.size
-
-    def batch_size(self) -> int:
-        """B."""
-        return self.sizes.batch
 
     def normal(self, *shape: int) -> Tensor:
         """Numbers from N(0, 1)."""
@@ -163,10 +167,11 @@ class Maker:
         cameras = self.cameras(image=(grid[1] * PATCH, grid[2] * PATCH))
         batch, tokens = self.sizes.batch, math.prod(grid)
         heads = (batch, dims.heads, tokens, dims.width // dims.heads)
+        keys, values = self.normal(*heads), self.normal(*heads)
         return ImageMemory(
-            keys=self.normal(*heads),
-            values=self.normal(*heads),
-            features=self.normal(batch, tokens, dims.width),
+            features=self.normal(batch, tokens, memory_width(self.case)),
+            keys=keys,
+            values=values,
             patch_rays=patch_rays(plucker_rays(cameras), PATCH),
             grid=grid,
         )

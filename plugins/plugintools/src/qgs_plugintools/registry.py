@@ -26,9 +26,11 @@ MODULES = ALL_SLOTS & frozenset(ARGUMENTS)
 PARAMETRIC = frozenset(n for n in MODULES if issubclass(SLOTS[n].contract, ModelComponent))
 """Slots whose components are built with the sizes of the model."""
 STATEFUL = frozenset(
-    {"cross_attention", "self_attention", "refinement", "head", "centers", "losses"}
+    {"layer", "cross_attention", "self_attention", "refinement", "head", "centers", "losses"}
 )
 """Slots whose components read the state of the queries."""
+READERS = STATEFUL | {"queries"}
+"""Slots whose components read the state of the queries or the image memory."""
 PER_QUERY = STATEFUL - {"losses"} | {"feed_forward"}
 """Slots whose components give something for every query."""
 

@@ -91,7 +91,7 @@ class ViewsAField(PlacesByALayer):
     def forward(self, state):
         center = state["place.center"]
         place = self.place(center.view(-1, 3)).view(*center.shape[:2], -1)
-        return self.attention(self.norm(state.features + place))
+        return self.attention(self.norm(state.features + place), state.mask)
 
 
 @mutant("compiles", "3 more graphs are compiled")

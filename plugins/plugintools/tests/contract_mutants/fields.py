@@ -3,8 +3,14 @@
 from contract_mutants.mutant import mutant
 from torch import Tensor, nn
 
-from qgs.components import ContentCrossAttention, ContentSelfAttention, NoRefinement
+from qgs.components import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    CrossSelfMlp,
+    NoRefinement,
+)
 from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement
+from qgs.types import QueryState
 
 CHECK = "reads_within_requires"
 PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
@@ -130,3 +136,16 @@ class WritesMoreInTraining(Steps):
 class NeedsAFieldUndeclared(ContentSelfAttention):
     def forward(self, state):
         return super().forward(state) + state["place.center"].sum(-1, keepdim=True)
+
+
+@mutant("writes_equal_provides", "it loses unrelated.center")
+class LayerLosesFields(CrossSelfMlp):
+    def forward(self, state, memory):
+        state, memory = super().forward(state, memory)
+        return QueryState(state.features, mask=state.mask), memory
+
+
+@mutant("runs", "it gives a QueryState, not a tuple", also=None)
+class LayerForgetsTheMemory(CrossSelfMlp):
+    def forward(self, state, memory):
+        return super().forward(state, memory)[0]

@@ -97,7 +97,7 @@ class Exponentiates(MlpFeedForward):
     "coincident_queries_stay_finite",
     "with coincident queries",
     # The spread is that around the first query, and zeros coincide.
-    also="zeros_stay_finite query_permutation",
+    also="zeros_stay_finite query_permutation masked_queries_are_not_read",
 )
 class DividesBySpread(ContentSelfAttention):
     def forward(self, state):

@@ -70,9 +70,9 @@ class PlacesQueriesInHalf(LatentQueries):
     def provides(cls, config):
         return PLACE
 
-    def forward(self, batch_size):
+    def start(self, batch_size):
         center = (self.center @ self.turn).to(self.center)
-        state = super().forward(batch_size)
+        state = super().start(batch_size)
         return state.replace(fields={"place.center": center.expand(batch_size, -1, -1)})
 
 

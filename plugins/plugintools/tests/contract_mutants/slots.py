@@ -71,8 +71,8 @@ class StartsWithZeroQuaternions(GaussianHead):
 
 @mutant("queries_are_shared_by_scenes", "scene 1 of 3", options={"count": 6})
 class NumbersScenes(LatentQueries):
-    def forward(self, batch_size):
-        state = super().forward(batch_size)
+    def start(self, batch_size):
+        state = super().start(batch_size)
         scene = torch.arange(batch_size).to(state.features)[:, None, None]
         return state.replace(state.features + scene)
 
@@ -298,3 +298,9 @@ class ExplainsToFewTokens(ContentCrossAttention):
     def explain(self, state, memory, queries):
         content = super().explain(state, memory, queries).content[..., 1:]
         return AttentionWeights(content, None, content.softmax(-1))
+
+
+@mutant("masked_queries_are_not_read", "of the others")
+class IgnoresTheMask(ContentSelfAttention):
+    def forward(self, state):
+        return self.attention(self.norm(state.features))

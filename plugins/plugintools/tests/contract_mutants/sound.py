@@ -22,7 +22,7 @@ from qgs.contracts import (
     ComponentConfig,
     FeedForward,
     FieldSpec,
-    Queries,
+    LearnedQueries,
     SelfAttention,
 )
 from qgs.losses import Opacity
@@ -90,7 +90,9 @@ class PassesFieldsOn(ContentSelfAttention):
 
     def forward(self, state):
         doubled = replace(state, features=2 * state.features)
-        return super().forward(QueryState(doubled.features, doubled.fields | {}).replace())
+        return super().forward(
+            QueryState(doubled.features, doubled.fields | {}, state.mask).replace()
+        )
 
 
 @named
@@ -101,7 +103,7 @@ class TurnsAutocastOff(PlacesByALayer):
         center = state["place.center"]
         with torch.autocast(center.device.type, enabled=False):
             bounded = center / (1 + center.norm(dim=-1, keepdim=True))
-        return self.attention(self.norm(state.features + self.place(bounded)))
+        return self.attention(self.norm(state.features + self.place(bounded)), state.mask)
 
 
 @named
@@ -130,7 +132,7 @@ class FusesInHalf(ContentCrossAttention):
 
 
 @named
-class DecodesItsQueries(Queries):
+class DecodesItsQueries(LearnedQueries):
     """Codes of each query, and what all share: a layer, and the logarithm of a size."""
 
     class Config(ComponentConfig):
@@ -150,7 +152,7 @@ class DecodesItsQueries(Queries):
     def provides(cls, config):
         return {"place.size": FieldSpec((1,))}
 
-    def forward(self, batch_size):
+    def start(self, batch_size):
         size = self.log_size.exp().expand(batch_size, self.count, 1)
         return QueryState(
             self.up(self.code).expand(batch_size, -1, -1), {"place.size": size.clone()}

@@ -52,7 +52,7 @@ class NumbersQueries(ContentSelfAttention):
         return super().forward(state) + number[:, None]
 
 
-@mutant("query_permutation", "with 200 permuted queries")
+@mutant("query_permutation", "with 200 permuted queries", also="masked_queries_are_not_read")
 class AttendsWithinWindows(ContentSelfAttention):
     """Of 16 consecutive queries."""
 

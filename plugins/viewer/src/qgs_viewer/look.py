@@ -103,12 +103,13 @@ class Look:
     def strongest(self, query: int, layer: int, count: int, depth: float) -> "Reading | None":
         """The `count` patches that a query attends to most, on photos `depth` from their cameras.
 
-        Mean over heads. None where attention tells nothing.
+        Mean over heads. None where attention tells nothing, or tokens are no patches.
         """
         weights = self.attention(query, layer)
-        if weights is None or self.views is None or self.inside is None:
+        grid = self.inside.memory.grid if self.inside else None
+        if weights is None or self.views is None or grid is None:
             return None
-        grid, cameras = self.inside.memory.grid, self.views.cameras[0]
+        cameras = self.views.cameras[0]
         pixels = patch_centers(grid, cameras.size)
         points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
         shares = weights.weights[0, :, 0].float().mean(0).cpu()

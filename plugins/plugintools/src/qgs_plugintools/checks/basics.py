@@ -23,6 +23,7 @@ Shape: TypeAlias = tuple[int | None, ...]
 OUTPUTS: Mapping[str, type] = {
     "encoder": ImageMemory,
     "queries": QueryState,
+    "layer": tuple,
     "refinement": QueryState,
     "head": GaussianAttributes,
     "renderer": Rendering,
@@ -62,6 +63,9 @@ def check_runs(case: Case) -> None:
     output = case.lively()(*inputs_of(case).values())
     kind = OUTPUTS.get(case.slot, Tensor)
     expect(isinstance(output, kind), f"it gives a {type(output).__name__}, not a {kind.__name__}")
+    if case.slot == "layer":
+        kinds = [type(part).__name__ for part in output]
+        expect(kinds == ["QueryState", "ImageMemory"], f"it gives {kinds}, not state and memory")
     if isinstance(output, Mapping):
         odd = [name for name, term in output.items() if not isinstance(term, Tensor)]
         expect(not odd, f"{', '.join(map(str, odd))} is no tensor")
@@ -105,15 +109,25 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
     batch, count = sizes.batch, sizes.queries
     match case.slot:
         case "encoder":
-            head, token = (batch, heads, None, width // heads), (batch, None)
-            shapes = {"keys": head, "values": head}
-            return {**shapes, "features": (*token, width), "patch_rays": (*token, 6)}
-        case "queries" | "refinement":
-            count = module.count if case.slot == "queries" else count
-            maker = Maker(case, replace(sizes, queries=count), torch.Generator())
+            head: Shape = (batch, heads, None)
+            named: dict[Any, Any] = {"D": width, "D/h": width // heads}
             provided = case.component.provides(case.config).items()
-            fields = {f"fields.{n}": tuple(maker.field(n, s).shape) for n, s in provided}
-            return {"features": (batch, count, width), **fields}
+            lead = {"memory.keys": head, "memory.values": head}
+            return {
+                name.removeprefix("memory."): (
+                    *lead.get(name, (batch, None)),
+                    *(named.get(size, size) for size in spec.shape),
+                )
+                for name, spec in provided
+            }
+        case "queries" | "refinement" | "layer":
+            count = module.count if case.slot == "queries" else count
+            maker = Maker(case, replace(sizes, queries=count or 1), torch.Generator())
+            provided = case.component.provides(case.config).items()
+            where = "0." if case.slot == "layer" else ""
+            fields = {n: (batch, count, *maker.field(n, s).shape[2:]) for n, s in provided}
+            fields = {f"{where}fields.{name}": shape for name, shape in fields.items()}
+            return {f"{where}features": (batch, count, width), **fields}
         case "head":
             each = (batch, count, module.gaussians_per_query)
             sized = {"offsets": 3, "scales": 3, "quats": 4, "colors": 3}

@@ -6,16 +6,26 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from qgs.components import LatentQueries
+from qgs.components import LatentQueries, MultiViewViT
 from qgs.composer import RecipeError
 from qgs.composer.recipe import Recipe, resolve
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
-from qgs.contracts import CONTRACT_VERSION, Component, ComponentConfig, Fields, Loss, Plugin
-from qgs.types import LayerPrediction, QueryState, map_tensors
+from qgs.contracts import (
+    CONTRACT_VERSION,
+    MEMORY_FIELDS,
+    Component,
+    ComponentConfig,
+    DecoderLayer,
+    Fields,
+    FieldSpec,
+    Loss,
+    Plugin,
+)
+from qgs.types import ImageMemory, LayerPrediction, QueryState, Views, map_tensors
 from qgs_plugintools.case import Case, expect
-from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, required_fields
+from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
 from qgs_plugintools.modules import each_mode, seeded
-from qgs_plugintools.registry import ALL_SLOTS, MODULES, STATEFUL, check
+from qgs_plugintools.registry import ALL_SLOTS, MODULES, READERS, check
 from qgs_plugintools.trees import (
     described,
     difference,
@@ -31,7 +41,7 @@ GIVEN = "given_fields"
 """Names of the plugin that offers the component, and of the queries that give it its fields."""
 
 
-@check(STATEFUL)
+@check(READERS)
 def check_reads_within_requires(case: Case) -> None:
     """Only fields in `requires` are asked for, of the state and of the image memory.
 
@@ -40,6 +50,8 @@ def check_reads_within_requires(case: Case) -> None:
     """
     module, inputs, required = case.lively(), inputs_of(case), case.component.requires(case.config)
     unread = {name for name in leaves(inputs) if name.startswith("memory.")} - set(required)
+    if issubclass(case.component, DecoderLayer) and case.component.sublayers:
+        unread = set()  # what stands in its slots may read them
     if issubclass(case.component, Loss) and case.component.renderings == "none":
         inputs["rendering"] = Maker(case, Sizes(), torch.Generator()).rendering(views=2)
         unread = {name for name in leaves(inputs) if name.startswith("rendering.")}
@@ -48,12 +60,18 @@ def check_reads_within_requires(case: Case) -> None:
     for mode in each_mode(module):
         asked: set[str] = set()
         with seeded(0):
-            first = module(*_with_asked_fields(inputs, asked).values())
+            first = _read_off(case, module, _with_asked_fields(inputs, asked))
         beyond = sorted(asked - set(required))
         expect(not beyond, f"in {mode} it reads {', '.join(beyond)}, which it does not require")
         with seeded(0):
-            found = difference(first, module(*poisoned.values())) if unread else ""
+            found = difference(first, _read_off(case, module, poisoned)) if unread else ""
         expect(not found, f"in {mode} it reads some of {names}, which it declares not to: {found}")
+
+
+def _read_off(case: Case, module: Any, inputs: Inputs) -> Any:
+    """The output; of a layer the state, since it passes on a memory that it does not read."""
+    output = module(*inputs.values())
+    return output[0] if case.slot == "layer" else output
 
 
 class AskedFields(dict[str, Tensor]):
@@ -88,7 +106,7 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
     return {name: changed(value) for name, value in inputs.items()}
 
 
-@check(STATEFUL)
+@check(READERS)
 def check_requires_are_read(case: Case) -> None:
     """Every field in `requires` is read: else recipes that lack it are refused for nothing."""
     module, inputs = case.lively(), inputs_of(case)
@@ -102,21 +120,22 @@ def check_requires_are_read(case: Case) -> None:
         expect(read, f"it requires {field}, which changes nothing")
 
 
-@check({"refinement", "queries"})
+@check({"layer", "refinement", "queries"})
 def check_writes_equal_provides(case: Case) -> None:
     """The fields that are written are those in `provides`, in the shape and dtype given there.
 
-    A refinement passes on the features and all other fields as they are.
+    A layer and a refinement pass on all other fields as they are, a refinement the features too.
     """
     module = case.lively()
     for mode in each_mode(module):
         inputs, before = inputs_of(case), {}
-        if case.slot == "refinement":
+        if case.slot != "queries":
             state = inputs["state"]
             before = {"unrelated.center": torch.randn(*state.features.shape[:2], 3), **state.fields}
-            inputs = {"state": QueryState(state.features, before)}
+            inputs = {**inputs, "state": QueryState(state.features, before)}
         with seeded(0):
             output = module(*inputs.values())
+        output = output[0] if case.slot == "layer" else output
         provided = case.component.provides(case.config)
         kept = {n for n, x in output.fields.items() if n in before and _same(x, before[n])}
         written = set(output.fields) - kept
@@ -167,7 +186,29 @@ def _resolved(case: Case, given: Fields) -> Recipe:
     if given:
         components.append(_queries_with(case, given))
         recipe["model"]["queries"]["type"] = f"{PLUGIN}/{GIVEN}"
+    features = case.component.requires(case.config).get("memory.features")
+    if features and features != MEMORY_FIELDS["memory.features"]:
+        components.append(_encoder_with(case, features))
+        recipe["model"]["encoder"]["type"] = f"{PLUGIN}/{GIVEN}"
     return resolve(recipe, plugins=(Plugin(PLUGIN, CONTRACT_VERSION, components),))
+
+
+def _encoder_with(case: Case, spec: FieldSpec) -> type[Component]:
+    """An encoder whose features have a width of their own."""
+
+    class GivenEncoder(MultiViewViT):
+        name: ClassVar[str] = GIVEN
+
+        @classmethod
+        def provides(cls, config: ComponentConfig) -> Fields:
+            return {**MEMORY_FIELDS, "memory.features": spec}
+
+        def forward(self, views: Views) -> ImageMemory:
+            memory, wide = super().forward(views), memory_width(case)
+            repeats = -(-wide // memory.features.shape[-1])
+            return replace(memory, features=memory.features.repeat(1, 1, repeats)[..., :wide])
+
+    return GivenEncoder
 
 
 def _queries_with(case: Case, given: Fields) -> type[Component]:
@@ -180,12 +221,12 @@ def _queries_with(case: Case, given: Fields) -> type[Component]:
         def provides(cls, config: ComponentConfig) -> Fields:
             return given
 
-        def forward(self, batch_size: int) -> QueryState:
+        def start(self, batch_size: int) -> QueryState:
             sizes = Sizes(batch=1, queries=self.count)
             maker = Maker(case, sizes, torch.Generator().manual_seed(0))
             fields = {name: maker.field(name, spec) for name, spec in given.items()}
             fields = map_tensors(lambda x: x.expand(batch_size, *x.shape[1:]), fields)
-            return super().forward(batch_size).replace(fields=fields)
+            return super().start(batch_size).replace(fields=fields)
 
     return GivenQueries
 

@@ -27,6 +27,8 @@ READ = {
     "self_attention": ("state.features",),
     "feed_forward": ("features",),
     "refinement": (),
+    "queries": (),
+    "layer": ("state.features",),
     "head": ("state.features",),
     "centers": ("offsets",),
     "renderer": (
@@ -174,7 +176,7 @@ def check_points_behind_cameras_stay_finite(case: Case) -> None:
         _expect_finite(case, f"points {where}", _changed(case, moved))
 
 
-@check({"encoder", "cross_attention", "renderer", "losses"})
+@check({"encoder", "layer", "cross_attention", "renderer", "losses"})
 def check_duplicated_view_stays_finite(case: Case) -> None:
     """A view that is given twice gives finite outputs and finite gradients."""
 

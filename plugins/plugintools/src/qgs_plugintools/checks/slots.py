@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from qgs.contracts import (
     AttentionWeights,
+    LearnedQueries,
     Loss,
     Metric,
     MetricInput,
@@ -20,13 +21,21 @@ from qgs.contracts import (
     Split,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.types import GaussianAttributes, ImageMemory, Views, map_tensors
+from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views, map_tensors
 from qgs.wording import listed
 from qgs_plugintools.case import CannotCheck, Case, expect
 from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of
 from qgs_plugintools.modules import each_mode, seeded
 from qgs_plugintools.registry import check
-from qgs_plugintools.trees import cloned, described, difference, mapped, not_finite
+from qgs_plugintools.trees import (
+    cloned,
+    described,
+    difference,
+    floating,
+    leaves,
+    mapped,
+    not_finite,
+)
 
 Patch = tuple[int, int, int]  # view, row and column
 
@@ -61,9 +70,14 @@ def _expect_valid(out: GaussianAttributes, saturated: bool, where: str) -> None:
 
 @check({"queries"})
 def check_queries_are_shared_by_scenes(case: Case) -> None:
-    """Every scene starts from the same state, for any number of scenes."""
-    module = case.lively()
-    one, several = module(1), module(3)
+    """Learned queries start from the same state in every scene, for any number of scenes.
+
+    `start` gives the state that a forward pass gives.
+    """
+    if not issubclass(case.component, LearnedQueries):
+        raise CannotCheck("these queries may read the photos: they are no LearnedQueries")
+    module, inputs = case.lively(), inputs_of(case, Sizes(batch=3))
+    one, several = module.start(1), module(*inputs.values())
     for scene in range(3):
         found = difference(one, map_tensors(lambda x, s=scene: x[s : s + 1], several))
         expect(not found, f"scene {scene} of 3 starts otherwise than a scene alone: {found}")
@@ -76,7 +90,7 @@ def check_queries_resize(case: Case) -> None:
     Checked of components whose option `count` says how many there are.
     """
     module, options = case.build(), case.config.model_dump(mode="json")
-    if "count" not in options:
+    if "count" not in options or module.count is None:
         raise CannotCheck("no option `count` says how many queries there are")
     for count in (max(module.count // 2, 1), module.count + 3):
         text = json.dumps({**options, "count": count})
@@ -301,6 +315,8 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
     for where, views in _wide_and_tall(case):
         memory = module(views)
         patch = _patch_size(where, views, memory)
+        if memory.patch_rays is None:
+            raise CannotCheck("it gives no patch rays")
         rays = patch_rays(plucker_rays(views.cameras), patch)
         found = difference({"patch_rays": memory.patch_rays}, {"patch_rays": rays}, 1e-4, 1e-5)
         expect(not found, f"{where}, against the mean rays of patches of {patch} pixels, {found}")
@@ -322,7 +338,9 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         places = _places(tokens[:12], grid)
         changed = module(_one_patch_each(views, places, patch))
         for name in ("keys", "values", "features"):
-            change = (getattr(changed, name) - getattr(memory, name)).square().sum(-1)
+            if getattr(memory, name) is None:
+                continue
+            change = (changed[name] - memory[name]).square().sum(-1)
             change = change.sum(1) if change.ndim == 3 else change
             if not change.any():
                 expect(name == "keys", f"{where}, `{name}` stays as it is when the images change")
@@ -349,6 +367,8 @@ def _wide_and_tall(case: Case) -> Iterator[tuple[str, Views]]:
 def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
     """Pixels along a patch, as the grid of `memory` says."""
     count, (height, width), grid = views.images.shape[1], views.cameras.size, memory.grid
+    if grid is None:
+        raise CannotCheck("its tokens are no patches: the memory has no grid")
     patch = max(height // max(grid[1], 1), 1)
     right = grid == (count, height / patch, width / patch)
     seen = f"{where} of {count} views, `grid` is {grid}, which is not (V, H/P, W/P) for any P"
@@ -386,6 +406,29 @@ def check_memo_is_of_the_memory_alone(case: Case) -> None:
         found = difference(reader(later["state"], replace(memory)), read)
         seen = f"what it keeps in the memory depends on {what}: read after another layer, {found}"
         expect(not found, seen)
+
+
+@check({"layer", "self_attention"})
+def check_masked_queries_are_not_read(case: Case) -> None:
+    """What stands where the state's mask is False changes nothing of the other queries."""
+    module, inputs = case.lively(), inputs_of(case, Sizes(queries=5))
+    state = inputs["state"]
+    mask = torch.tensor([[True, False, True, True, False], [True, True, False, True, True]])
+
+    def seen(state: QueryState) -> Any:
+        given = {**inputs, "state": replace(state, mask=mask.to(state.features.device))}
+        output = module(*given.values())
+        output = output[0] if case.slot == "layer" else output
+        return {name: x[mask] for name, x in floating(output).items()}
+
+    other = inputs_of(case, Sizes(queries=5), seed=1)["state"]
+    changed = {
+        name: torch.where(mask.view(*mask.shape, *[1] * (x.ndim - 2)), x, leaves(other)[name])
+        for name, x in leaves(state).items()
+    }
+    moved = mapped(state, lambda name, x: changed[name])
+    found = difference(seen(state), seen(moved), 1e-4, 1e-5)
+    expect(not found, f"when masked queries change, of the others {found}")
 
 
 @check({"cross_attention", "self_attention"})

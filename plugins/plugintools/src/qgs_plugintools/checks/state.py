@@ -32,15 +32,17 @@ def check_inputs_are_not_changed(case: Case) -> None:
 def check_outputs_share_no_memory(case: Case) -> None:
     """What a component computes lies in memory of its own: not in that of its inputs or weights.
 
-    Buffers are weights here. A refinement may hand on the fields that it does not provide.
+    Buffers are weights here. A refinement and a layer may hand on the fields that they do not
+    provide, a layer the memory too.
     """
     module, inputs = case.lively(), inputs_of(case)
     outputs = leaves(module(*inputs.values()))
     tensors = [*leaves(inputs).items(), *tensors_of(module).items()]
     owners = {x.untyped_storage().data_ptr(): name for name, x in tensors if x.numel()}
-    provided = {f"fields.{name}" for name in case.component.provides(case.config)}
+    provided = [f"fields.{name}" for name in case.component.provides(case.config)]
+    own = {"refinement": provided, "layer": ["0.features", *(f"0.{name}" for name in provided)]}
     for name, tensor in outputs.items():
-        if case.slot == "refinement" and name not in provided:
+        if name not in own.get(case.slot, outputs):
             continue
         owner = owners.get(tensor.untyped_storage().data_ptr()) if tensor.numel() else None
         expect(owner is None, f"`{name}` lies in the memory of `{owner}`")

@@ -32,7 +32,7 @@ TURN = (0.8, 0.4, -0.2, 0.4)
 SHIFT = (0.4, -0.3, 0.6)
 
 
-@check(MODULES - {"queries", "losses"})
+@check(MODULES - {"losses"})
 def check_batch_independence(case: Case) -> None:
     """What is computed for a scene does not depend on any other scene, in training neither.
 
@@ -75,16 +75,20 @@ def check_query_permutation(case: Case) -> None:
     counted = (*QUERY_INPUTS, "gaussians", "prediction")
     moved = {n: _reordered(x, order) if n in counted else x for n, x in inputs.items()}
     one, other = (module(*given.values()) for given in (inputs, moved))
-    expected = _reordered(one, order) if case.slot in PER_QUERY else one
+    expected = one
+    if case.slot == "layer":
+        expected = _reordered(one[0], order), one[1]
+    elif case.slot in PER_QUERY:
+        expected = _reordered(one, order)
     found = difference(expected, other, RTOL, ATOL)
     expect(not found, f"with {sizes.queries} permuted queries, {found}")
 
 
-@check({"encoder", "cross_attention", "renderer", "losses"})
+@check({"encoder", "layer", "cross_attention", "renderer", "losses"})
 def check_view_permutation(case: Case) -> None:
     """Views have no order, unless an encoder or a cross-attention declares `ordered_views`.
 
-    Then they have one.
+    Then they have one. Tokens of no grid, such as learned latents, keep their places.
     """
     module, component = case.lively(), case.component
     may_declare = issubclass(component, Encoder | CrossAttention)
@@ -94,7 +98,11 @@ def check_view_permutation(case: Case) -> None:
     inputs, order = inputs_of(case, sizes), _shuffled(sizes.views)
     moved = {n: _permuted(x, order) if n in VIEW_INPUTS else x for n, x in inputs.items()}
     one, other = (module(*given.values()) for given in (inputs, moved))
-    expected = _permuted(one, order) if case.slot in ("encoder", "renderer") else one
+    expected = one
+    if case.slot == "layer":
+        expected = one[0], _permuted(one[1], order)
+    elif case.slot in ("encoder", "renderer"):
+        expected = _permuted(one, order)
     found = difference(expected, other, RTOL, ATOL)
     expect(ordered or not found, f"with {sizes.views} permuted views, {found}{hint}")
     ignored = "`ordered_views` is declared, but the order is ignored"
@@ -114,6 +122,8 @@ def _reordered(tree: Any, order: list[int]) -> Any:
 
 def _permuted(tree: Any, order: list[int]) -> Any:
     """A tree with a dimension of views behind that of scenes, or an image memory."""
+    if isinstance(tree, ImageMemory) and tree.grid is None:
+        return tree
     if not isinstance(tree, ImageMemory):
         return map_tensors(lambda x: x[:, order] if x.shape[1] else x, tree)
     tokens = torch.arange(tree.features.shape[1]).unflatten(0, (len(order), -1))[order].flatten()
