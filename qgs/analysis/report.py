@@ -83,8 +83,7 @@ class Report:
 
 
 GROUP = "qgs.report"
-"""Group of entry points NAME = "module:function", each a maker of a section, as `orbit` is, or of
-several, one after the other."""
+"""Group of entry points NAME = "module:function": as `orbit`, or a generator of sections."""
 SIDE = 256  # pixels on the longer side of pictures that models render for show
 QUERIES = 5
 ANCHORS = 12
@@ -114,12 +113,17 @@ class Tile:
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A heading, a text, and figures by model, at least `width` CSS pixels wide."""
+    """A heading, a text, and tiles by model, `width` CSS pixels wide or more. Raises TypeError."""
 
     title: str
     text: str
     figures: Mapping[str, Sequence[Tile]]
     width: int = 300
+
+    def __post_init__(self) -> None:
+        tiles = [tile for tiles in self.figures.values() for tile in tiles]
+        if wrong := [type(tile).__name__ for tile in tiles if not isinstance(tile, Tile)]:
+            raise TypeError(f"it has {wrong[0]} among its figures, not a Tile")
 
 
 @torch.no_grad()
@@ -147,22 +151,15 @@ def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[Report
         try:
             made = entry.load()(shown, samples)
             for section in made if isinstance(made, Iterator | list | tuple) else [made]:
-                yield _checked_section(section)
+                if not isinstance(section, ReportSection):
+                    raise TypeError(f"it gives {type(section).__name__}, not a ReportSection")
+                yield section
         except (Exception, SystemExit) as error:
             release = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "no distribution"
             warn_once(
                 f"the report does without the section `{entry.name}` of {release}, `{entry.value}`"
                 f" fails: {type(error).__name__}: {error}; update {release}, or uninstall it"
             )
-
-
-def _checked_section(section: Any) -> ReportSection:
-    if not isinstance(section, ReportSection):
-        raise TypeError(f"it gives {type(section).__name__}, not a ReportSection")
-    tiles = [tile for tiles in section.figures.values() for tile in tiles]
-    if wrong := [type(tile).__name__ for tile in tiles if not isinstance(tile, Tile)]:
-        raise TypeError(f"it has {wrong[0]} among its figures, not a Tile")
-    return section
 
 
 def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:

@@ -49,25 +49,20 @@ def model_html(model: QueryGaussianModel) -> str:
     """A picture of the way from views to Gaussians, and the same as a table."""
     rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in _rows(model)]
     kinds = {slot: kind for slot, kind, _ in _rows(model)}
-    picture = pipeline_svg(kinds, parameter_counts(model), model.depth, _budget(model))
+    picture = pipeline_svg(kinds, parameter_counts(model), model.depth)
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     head = "<tr><th>slot</th><th>component</th><th>parameters</th></tr>"
     return f"<p>{escape(_heading(model))}</p>{picture}<table>{head}{body}</table>"
 
 
 def _heading(model: QueryGaussianModel) -> str:
-    told = [f"{_count(model):,} parameters", f"{model.depth} decoder layers", _budget(model)]
-    device = next((parameter.device for parameter in model.parameters()), "cpu")
-    return f"{type(model).__name__}: {', '.join(filter(None, told))}, on {device}"
-
-
-def _budget(model: QueryGaussianModel) -> str:
-    """How many Gaussians it makes, "" where its recipe does not say."""
     tree = (model.recipe or {}).get("model", {})
     options = {**tree.get("queries", {}), **tree.get("head", {})}
-    if not {"count", "gaussians_per_query"} <= options.keys():
-        return ""
-    return f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians"
+    told = [f"{_count(model):,} parameters", f"{model.depth} decoder layers"]
+    if {"count", "gaussians_per_query"} <= options.keys():
+        told.append(f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians")
+    device = next((parameter.device for parameter in model.parameters()), "cpu")
+    return f"{type(model).__name__}: {', '.join(told)}, on {device}"
 
 
 def _rows(model: QueryGaussianModel) -> list[tuple[str, str, str]]:

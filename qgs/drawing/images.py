@@ -33,10 +33,7 @@ def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
 
 
 def color_error(images: Tensor, truth: Tensor) -> Tensor:
-    """Mean over channels of the difference, of images as they are seen: clipped to [0, 1].
-
-    (..., 3, H, W) each -> (..., 1, H, W).
-    """
+    """Mean over channels of what clipped images are off, (..., 3, H, W) -> (..., 1, H, W)."""
     return (images.clamp(0, 1) - truth.to(images)).abs().mean(-3, keepdim=True)
 
 
