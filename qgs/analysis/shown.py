@@ -5,6 +5,7 @@ from html import escape
 import torch
 from torch import nn
 
+from qgs.analysis.pipeline import pipeline_svg
 from qgs.composer.slots import LAYER_SLOTS, SUBLAYER_SLOTS
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Prediction
@@ -48,11 +49,13 @@ def model_text(model: QueryGaussianModel) -> str:
 
 
 def model_html(model: QueryGaussianModel) -> str:
-    """The same as a table."""
+    """A picture of the way from views to Gaussians, and the same as a table."""
     rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in _rows(model)]
+    kinds = {slot: kind for slot, kind, _ in _rows(model)}
+    picture = pipeline_svg(kinds, parameter_counts(model), model.depth)
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     head = "<tr><th>slot</th><th>component</th><th>parameters</th></tr>"
-    return f"<p>{escape(_heading(model))}</p><table>{head}{body}</table>"
+    return f"<p>{escape(_heading(model))}</p>{picture}<table>{head}{body}</table>"
 
 
 def _heading(model: QueryGaussianModel) -> str:

@@ -152,7 +152,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
         def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
             if fault := _state_fault(chosen, arguments, state):
-                place = place_of(component.forward)
+                place = place_of(getattr(component, "start", component.forward))
                 raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
             hook.remove()  # the state is checked until it has once been what it must be
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from qgs.analysis.trace import LayerTrace, Trace, trace
+from qgs.analysis.trace import Trace, trace
 from qgs.contracts import AttentionWeights
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
@@ -37,7 +37,7 @@ class Look:
     frames: Sequence[int] = ()
     placement: Placement = field(default_factory=Placement.identity)
     inside: Inside | None = None
-    _traces: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
+    _traces: dict[int, tuple[Trace, int]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def queries(self) -> int:
@@ -78,20 +78,32 @@ class Look:
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
         """What a query reads in a layer, (1, h, 1, M); None if it tells nothing, or in layer 0."""
-        return self._traced(query, layer).cross_attention if self.inside and layer else None
+        return self._told("cross_attention", query, layer)
 
     def self_attention(self, query: int, layer: int) -> AttentionWeights | None:
         """The queries that a query reads in a layer, (1, h, 1, N); None as for `attention`."""
-        return self._traced(query, layer).self_attention if self.inside and layer else None
+        return self._told("self_attention", query, layer)
 
-    def _traced(self, query: int, layer: int) -> LayerTrace:
-        assert self.inside is not None
-        if query not in self._traces:
+    def _told(self, part: str, query: int, layer: int) -> AttentionWeights | None:
+        if self.inside is None or not layer:
+            return None
+        self.trace([query])
+        record, place = self._traces[query]
+        found: AttentionWeights | None = getattr(record.layers[layer], part)
+        if found is None:
+            return None
+        only = slice(place, place + 1)
+        geometry = None if found.geometry is None else found.geometry[:, :, only]
+        return AttentionWeights(found.content[:, :, only], geometry, found.weights[:, :, only])
+
+    def trace(self, queries: Sequence[int]) -> None:
+        """Have the attention of `queries` at hand, by one pass through the decoder for all."""
+        missing = [query for query in dict.fromkeys(queries) if query not in self._traces]
+        if missing and self.inside is not None:
             model, memory = self.inside.model, self.inside.memory
-            with torch.no_grad(), trace(model, queries=[query]) as record:
+            with torch.no_grad(), trace(model, queries=missing) as record:
                 model.predict(memory, self.inside.states[0])
-            self._traces[query] = record
-        return self._traces[query].layers[layer]
+            self._traces.update({query: (record, at) for at, query in enumerate(missing)})
 
     def hub(self, query: int, layer: int) -> Tensor:
         """Where lines of a query start, (3,): its support's centre, or its Gaussians' mean."""
