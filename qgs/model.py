@@ -31,6 +31,7 @@ from qgs.types import (
     QueryState,
     Rendering,
     Views,
+    map_tensors,
 )
 
 if TYPE_CHECKING:
@@ -170,8 +171,9 @@ class QueryGaussianModel(nn.Module):
         """The Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
         means = self.centers(attributes.offsets, state)
-        others = (attributes.scales, attributes.quats, attributes.opacities, attributes.colors)
-        return Gaussians(*(x.flatten(1, 2) for x in (means, *others)))  # N, K -> G
+        flat = map_tensors(lambda x: x.flatten(1, 2), attributes)  # N, K -> G
+        look = flat.colors, flat.sh, flat.features
+        return Gaussians(means.flatten(1, 2), flat.scales, flat.quats, flat.opacities, *look)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
