@@ -15,7 +15,7 @@ from qgs.engine.growth import DEAD, Leaves
 from qgs.engine.refining import mean_psnr, resized
 from qgs.geometry.poses import look_at
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Gaussians, Views, map_tensors
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 RATES: dict[str, float] = dict.fromkeys(
@@ -121,8 +121,8 @@ def test_a_coarser_level_shows_the_same_scene() -> None:
 
 def unusable() -> Iterator[Any]:
     photos, one = Views(torch.rand(1, 2, 3, 24, 24), ring(2)), cloud(4)
-    two = Gaussians(*(x.expand(2, *x.shape[1:]) for x in vars(one).values()))
-    broken = Gaussians(*(x * math.nan for x in vars(one).values()))
+    two = map_tensors(lambda x: x.expand(2, *x.shape[1:]), one)
+    broken = map_tensors(lambda x: x * math.nan, one)
     yield pytest.param(two, photos, {}, r"of one scene.*got 2 scenes of 4 Gaussians", id="scenes")
     yield pytest.param(one, photos.select([]), {}, "1 scenes of 0 photos", id="photos")
     yield pytest.param(one, photos, {"seconds": 0}, "0 seconds.*at least one of each", id="seconds")

@@ -8,7 +8,7 @@ from commands import run_qgs
 
 import qgs
 from qgs.io.splat import RECORD, save_splat
-from qgs.types import Gaussians
+from qgs.types import Gaussians, map_tensors
 
 
 def gaussians(count: int) -> Gaussians:
@@ -52,7 +52,7 @@ def test_the_most_opaque_are_kept(tmp_path):
     assert run_qgs("convert", tmp_path / "all.ply", tmp_path / "same.PLY").exception is None
     assert torch.equal(qgs.load_ply(tmp_path / "same.PLY").means, given.means)
     assert given.most_opaque(99).count == 50
-    both = Gaussians(*(torch.cat([x, x.flip(1)]) for x in vars(given).values()))
+    both = map_tensors(lambda x: torch.cat([x, x.flip(1)]), given)
     halves = both.most_opaque(5)
     torch.testing.assert_close(halves.colors[0], halves.colors[1].flip(0))
     assert run_qgs("convert", tmp_path / "few.ply", tmp_path / "few.splat").exception is None
