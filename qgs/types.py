@@ -63,9 +63,15 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 def concatenated(parts: Sequence[_C], dim: int) -> _C:
-    """One container with the tensors of all `parts`, which have the same fields, along `dim`."""
-    rows = zip(*([x for _, x in named_tensors(part)] for part in parts), strict=True)
-    return map_tensors(lambda _: torch.cat(next(rows), dim), parts[0])
+    """One container with the tensors of all `parts` along `dim`.
+
+    Raises ValueError where one has a tensor that another one lacks.
+    """
+    found = [dict(named_tensors(part)) for part in parts]
+    if odd := sorted({name for other in found for name in other.keys() ^ found[0].keys()}):
+        raise ValueError(f"some of what is put together have {', '.join(odd)}, others have not")
+    joined = iter([torch.cat([x[name] for x in found], dim) for name in found[0]])
+    return map_tensors(lambda _: next(joined), parts[0])
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:

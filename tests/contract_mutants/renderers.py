@@ -31,7 +31,7 @@ class ChangedRenderer(TorchRenderer):
 @mutant(
     "no_gaussians_give_the_background",
     "not the background",
-    also="rendering_is_over_the_background",
+    also=f"rendering_is_over_the_background {FEATURES}",
 )
 class HasItsOwnBackground(TorchRenderer):
     def forward(self, gaussians, cameras, background=None):
@@ -97,7 +97,7 @@ class TurnsHarmonicsWithTheWorld(ChangedRenderer):
         return replace(gaussians, sh=rotated(gaussians.sh, up)), cameras
 
 
-@mutant(HARMONICS, "with 3 coefficients, view 0 is off")
+@mutant(HARMONICS, "with 3 coefficients, view 0 is off", also=FEATURES)
 class LetsColoursBeNegative(ChangedRenderer):
     def given(self, gaussians, cameras):
         if gaussians.sh is None:

@@ -4,6 +4,7 @@ import math
 import os
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -101,6 +102,24 @@ def test_there_are_as_many_as_wanted(scene: tuple[Views, Views], wanted: int) ->
         torch.testing.assert_close(two_steps[:, : wanted // 2], kept, atol=0.06, rtol=0)
 
 
+def test_harmonics_are_refined_and_features_kept(scene: tuple[Views, Views]) -> None:
+    """New Gaussians start with none of both, copies with those of their parents."""
+    photos, compared = scene
+    start = cloud(30)
+    marks = torch.arange(1.0, 31)[None, :, None]
+    start = replace(start, sh=torch.zeros(1, 30, 8, 3), features=marks)
+    result = qgs.refine(start, photos, 120, count=50, compared=compared).gaussians
+    assert result.sh is not None
+    assert result.sh.shape == (1, 50, 8, 3)
+    assert result.sh.abs().max() > 1e-3
+    assert {*result.features.flatten().tolist()} <= {*range(31)}
+    kept = start.most_opaque(15).features
+    assert (result.features == kept[0, 0, 0]).any()
+    plain = qgs.refine(cloud(30), photos, 20, count=50).gaussians
+    assert plain.sh is None
+    assert plain.features is None
+
+
 def test_an_interrupt_keeps_what_there_is(
     scene: tuple[Views, Views], clock: Callable[[Callable[[int], Any]], None]
 ) -> None:
@@ -129,6 +148,10 @@ def unusable() -> Iterator[Any]:
     yield pytest.param(one, photos, {"count": 0}, "0 Gaussians wanted", id="count")
     yield pytest.param(broken, photos, {}, "not finite", id="nan")
     yield pytest.param(one, photos, {"count": 10**11}, "22.4 TB of memory", id="memory")
+    rich = replace(one, sh=torch.zeros(1, 4, 15, 3))
+    yield pytest.param(rich, photos, {"count": 10**11}, "94.4 TB of memory", id="harmonics")
+    nan = replace(one, sh=torch.full((1, 4, 15, 3), math.nan))
+    yield pytest.param(nan, photos, {}, "not finite", id="nan harmonics")
 
 
 @pytest.mark.parametrize(("gaussians", "views", "options", "message"), [*unusable()])
