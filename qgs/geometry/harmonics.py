@@ -15,19 +15,19 @@ from qgs.types import SH_COUNTS, Cameras, Gaussians
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658)
-_C3 += (0.3731763325901154, 1.445305721320277)
+_C3_INNER = (0.3731763325901154, 1.445305721320277)
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
     """The first `count` (3, 8 or 15) functions (..., count) at unit `directions` (..., 3)."""
     x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
     values = [-_C1 * y, _C1 * z, -_C1 * x]
     if count > SH_COUNTS[0]:
-        xx, yy, zz = x * x, y * y, z * z
         a, b, c = _C2
         values += [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
     if count > SH_COUNTS[1]:
-        a, b, c, d, e = _C3
+        (a, b, c), (d, e) = _C3, _C3_INNER
         values += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
         values += [d * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
         values += [e * z * (xx - yy), -a * x * (xx - 3 * yy)]
