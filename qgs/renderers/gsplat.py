@@ -47,14 +47,11 @@ class GsplatRenderer(Renderer):
         with torch.autocast("cuda", enabled=False):
             gaussians, cameras = gaussians.to(torch.float32), cameras.to(torch.float32)
             backdrop = background_of(background, config.background, gaussians.means)
-            colors = colors_of(gaussians, cameras)
-            if gaussians.features is not None:  # further channels, of every view if colours are
-                per_view = (
-                    gaussians.features.unsqueeze(1) if colors.ndim == 4 else gaussians.features
-                )
-                features = per_view.expand(*colors.shape[:-1], -1)
-                colors = torch.cat([colors, features], -1)
+            colors, features = colors_of(gaussians, cameras), gaussians.features
+            if features is not None:  # further channels, over 0
                 backdrop = F.pad(backdrop, (0, features.shape[-1]))
+                features = features[:, None] if colors.ndim == 4 else features
+                colors = torch.cat([colors, features.expand(*colors.shape[:-1], -1)], -1)
             height, width = cameras.size
             fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
             o, one = torch.zeros_like(fx), torch.ones_like(fx)
@@ -77,10 +74,10 @@ class GsplatRenderer(Renderer):
                 backgrounds=backdrop.expand(*cameras.shape, -1).contiguous(),
                 render_mode="RGB+ED",
             )
-        count = colors.shape[-1] - 3
-        rgb, features, depth = rgbd.movedim(-1, -3).split([3, count, 1], dim=-3)
-        features = None if gaussians.features is None else features
-        return Rendering(rgb, alpha.movedim(-1, -3), depth, features)
+        images = rgbd.movedim(-1, -3)
+        shown = None if features is None else images[..., 3:-1, :, :]
+        alpha = alpha.movedim(-1, -3)
+        return Rendering(images[..., :3, :, :], alpha, images[..., -1:, :, :], shown)
 
 
 def _unsupported(config: ComponentConfig) -> list[Problem]:

@@ -146,11 +146,8 @@ def _composite(
     after = torch.cumprod(1 - alphas, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(order)]
     weights = torch.where(after > config.transmittance_min, alphas * before, 0.0)
-    summed = [
-        colors[image[: colors.ndim - 2]][order],
-        depths[:, None],
-        torch.ones_like(depths[:, None]),
-    ]
+    colors, z = colors[image[: colors.ndim - 2]][order], depths[:, None]
+    summed = [colors, z, torch.ones_like(z)]
     if gaussians.features is not None:
         summed.append(gaussians.features[image[0]][order])
     return torch.einsum("ghw,gc->chw", weights, torch.cat(summed, 1))
