@@ -131,6 +131,8 @@ def test_harmonics_are_turned_into_the_world_of_the_photos(model, tmp_path, monk
     far = AutoRenderer(AutoRenderer.Config(far=1e5))  # in the unit of the photos
     again = far(load_ply(tmp_path / "placed.ply"), views.cameras)
     torch.testing.assert_close(again.rgb, own, atol=5e-3, rtol=0)
+    result.save(tmp_path / "saved")
+    assert torch.equal(load_ply(tmp_path / "saved" / "gaussians.ply").sh, result.gaussians.sh)
 
 
 def test_rotations_become_quaternions():
