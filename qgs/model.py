@@ -28,6 +28,7 @@ from qgs.types import (
     QueryState,
     Rendering,
     Views,
+    map_tensors,
 )
 
 if TYPE_CHECKING:
@@ -145,11 +146,12 @@ class QueryGaussianModel(nn.Module):
         """The Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
         means = self.centers(attributes.offsets, state)
-        opacities = attributes.opacities
+        flat = map_tensors(lambda x: x.flatten(1, 2), attributes)  # N, K -> G
+        opacities = flat.opacities
         if state.mask is not None:
-            opacities = opacities * state.mask[..., None]
-        others = (attributes.scales, attributes.quats, opacities, attributes.colors)
-        return Gaussians(*(x.flatten(1, 2) for x in (means, *others)))  # N, K -> G
+            opacities = (attributes.opacities * state.mask[..., None]).flatten(1, 2)
+        look = flat.colors, flat.sh, flat.features
+        return Gaussians(means.flatten(1, 2), flat.scales, flat.quats, opacities, *look)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None

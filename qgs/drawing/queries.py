@@ -148,9 +148,14 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
     """Blending weight (B, G) over all pixels: the gradient of a render's sum by the colours."""
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
-        rgb = model.render(replace(gaussians, colors=colors), cameras).rgb
+        rgb = model.render(_painted(gaussians, colors), cameras).rgb
         (gradient,) = torch.autograd.grad(rgb.sum(), colors)
     return gradient.mean(-1)
+
+
+def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
+    """The Gaussians in `colors`, from everywhere."""
+    return replace(gaussians, colors=colors, sh=None, features=None)
 
 
 def notable_queries(
@@ -194,7 +199,7 @@ def query_picture(
     shown = gaussians[:, torch.tensor(index, dtype=torch.long, device=gaussians.means.device)]
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
-    visible = replace(shown, colors=colors, opacities=shown.opacities.clamp_min(0.5))
+    visible = replace(_painted(shown, colors), opacities=shown.opacities.clamp_min(0.5))
     painted = model.render(visible, cameras, torch.zeros(3))
     alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
     color = painted.rgb[0, 0].permute(1, 2, 0).cpu().numpy() * 255

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs import Cameras, QueryGaussianModel, Views, compose
 from qgs.contracts import ModelDims
-from qgs.types import LayerPrediction
+from qgs.types import LayerPrediction, named_tensors
 
 
 def _recipe(
@@ -66,7 +66,7 @@ def _pair(
 def _tensors(layer: LayerPrediction) -> dict[str, Tensor]:
     """Everything that both models have."""
     state = {"anchor.center": layer.state["anchor.center"], "features": layer.state.features}
-    return {**vars(layer.gaussians), **state}
+    return {**dict(named_tensors(layer.gaussians)), **state}
 
 
 @pytest.mark.parametrize("bound", ["floor", "offset"])
@@ -117,7 +117,7 @@ def test_every_gradient_is_that_of_locusgs() -> None:
     for model in (model.double() for model in _pair()):
         torch.manual_seed(1)
         gaussians = model(_photos().to(torch.float64)).gaussians
-        loss = sum((x * torch.randn_like(x)).sum() for x in vars(gaussians).values())
+        loss = sum((x * torch.randn_like(x)).sum() for _, x in named_tensors(gaussians))
         loss.backward()
         seen.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
     expected, ours = seen[0], _like_locus(seen[1])
@@ -132,7 +132,7 @@ def test_it_is_locusgs_in_half_precision_too() -> None:
     photos = _photos()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         theirs, ours = (model(photos).gaussians for model in (locus, ellipsoid))
-    for name, tensor in vars(theirs).items():
+    for name, tensor in named_tensors(theirs):
         torch.testing.assert_close(getattr(ours, name), tensor, rtol=1e-5, atol=1e-5)
 
 

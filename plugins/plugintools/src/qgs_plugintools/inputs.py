@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from qgs.contracts import FieldSpec, Loss, Renderer
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import (
+    SH_COUNTS,
     Cameras,
     Gaussians,
     ImageMemory,
@@ -177,16 +178,20 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Gaussians of all shapes in front of the cameras."""
+        """Gaussians of all shapes in front of the cameras; a renderer's have all that they can."""
         shape = (self.sizes.batch, self.sizes.queries * self.sizes.gaussians)
         means = 0.4 * self.normal(*shape, 3)
-        return Gaussians(
+        plain = Gaussians(
             means=means + torch.tensor([0.0, 0.0, 1.5]).to(means),
             scales=self.uniform(0.05, 0.3, *shape, 3),
             quats=F.normalize(self.normal(*shape, 4), dim=-1),
             opacities=self.uniform(0.2, 0.9, *shape),
             colors=self.uniform(0, 1, *shape, 3),
         )
+        if self.case.slot != "renderer":
+            return plain
+        sh = 0.1 * self.normal(*shape, SH_COUNTS[1], 3)
+        return replace(plain, sh=sh, features=self.uniform(0, 1, *shape, 4))
 
     def prediction(self) -> LayerPrediction:
         """Gaussians, and the state they are said to come from."""

@@ -5,10 +5,13 @@ from dataclasses import replace
 import torch
 from contract_mutants.mutant import mutant
 
+from qgs.geometry.harmonics import rotated, seen_colors
 from qgs.renderers import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
 CAMERAS = "camera_gradients_match_differences"
+FEATURES = "features_are_blended_as_colours"
+HARMONICS = "colours_depend_on_the_direction"
 GAUSSIANS = "render_gradients_match_differences"
 
 
@@ -28,7 +31,7 @@ class ChangedRenderer(TorchRenderer):
 @mutant(
     "no_gaussians_give_the_background",
     "not the background",
-    also="rendering_is_over_the_background",
+    also=f"rendering_is_over_the_background {FEATURES}",
 )
 class HasItsOwnBackground(TorchRenderer):
     def forward(self, gaussians, cameras, background=None):
@@ -57,6 +60,108 @@ class WeighsDepthByAlpha(ChangedRenderer):
 
     def result(self, out):
         return replace(out, depth=out.alpha * out.depth)
+
+
+@mutant(HARMONICS, "with 3 coefficients, view 0 is off", also="gradients_reach_inputs")
+class IgnoresHarmonics(ChangedRenderer):
+    def given(self, gaussians, cameras):
+        return replace(gaussians, sh=None), cameras
+
+
+@mutant(HARMONICS, "with 15 coefficients, view 0 is off")
+class IgnoresTheThirdDegree(ChangedRenderer):
+    def given(self, gaussians, cameras):
+        sh = gaussians.sh
+        return replace(gaussians, sh=sh if sh is None else sh[..., :8, :]), cameras
+
+
+@mutant(HARMONICS, "view 1 is off", also="view_permutation")
+class LooksFromTheFirstView(ChangedRenderer):
+    """In every view it paints what the first one sees."""
+
+    def given(self, gaussians, cameras):
+        if gaussians.sh is None:
+            return gaussians, cameras
+        colors = seen_colors(gaussians, cameras[:, :1])[:, 0]
+        return replace(gaussians, sh=None, colors=colors), cameras
+
+
+@mutant(HARMONICS, "view 0 is off", also="world_frame_makes_no_difference")
+class TurnsHarmonicsWithTheWorld(ChangedRenderer):
+    """Takes the coefficients for those of another frame: y up."""
+
+    def given(self, gaussians, cameras):
+        if gaussians.sh is None:
+            return gaussians, cameras
+        up = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+        return replace(gaussians, sh=rotated(gaussians.sh, up)), cameras
+
+
+@mutant(HARMONICS, "with 3 coefficients, view 0 is off", also=FEATURES)
+class LetsColoursBeNegative(ChangedRenderer):
+    def given(self, gaussians, cameras):
+        if gaussians.sh is None:
+            return gaussians, cameras
+        return replace(gaussians, colors=gaussians.colors + 1), cameras
+
+    def result(self, out):
+        return replace(out, rgb=out.rgb - out.alpha)
+
+
+@mutant(HARMONICS, "coefficients of zero change the image")
+class DarkensWithHarmonics(ChangedRenderer):
+    """Halves colours that do not depend on the direction where there are coefficients."""
+
+    def given(self, gaussians, cameras):
+        if gaussians.sh is None or gaussians.sh.any():
+            return gaussians, cameras
+        return replace(gaussians, colors=gaussians.colors / 2), cameras
+
+
+@mutant(FEATURES, "Gaussians with features have none", also=None)
+class DropsFeatures(ChangedRenderer):
+    def result(self, out):
+        return replace(out, features=None)
+
+
+@mutant(FEATURES, "without features have some", also="")
+class InventsFeatures(ChangedRenderer):
+    def result(self, out):
+        return replace(out, features=out.alpha) if out.features is None else out
+
+
+@mutant(FEATURES, "features are off by up to")
+class PutsFeaturesBeforeTheBackground(ChangedRenderer):
+    def result(self, out):
+        missing = None if out.features is None else out.features + 0.5 * (1 - out.alpha)
+        return replace(out, features=missing)
+
+
+@mutant(FEATURES, "features are off by up to")
+class RendersThreeFeatures(ChangedRenderer):
+    """The others are copies of the third."""
+
+    def given(self, gaussians, cameras):
+        if gaussians.features is None:
+            return gaussians, cameras
+        order = [min(i, 2) for i in range(gaussians.features.shape[-1])]
+        return replace(gaussians, features=gaussians.features[..., order]), cameras
+
+
+@mutant(FEATURES, "features change the colours", also=HARMONICS)
+class PaintsWithFeatures(ChangedRenderer):
+    def given(self, gaussians, cameras):
+        if gaussians.features is None:
+            return gaussians, cameras
+        colors = gaussians.colors + gaussians.features[..., :3]
+        return replace(gaussians, colors=colors), cameras
+
+
+@mutant(GAUSSIANS, "gaussians.sh")
+class DoublesAGradientOfHarmonics(ChangedRenderer):
+    def given(self, gaussians, cameras):
+        sh = gaussians.sh
+        return replace(gaussians, sh=sh if sh is None else 2 * sh - sh.detach()), cameras
 
 
 @mutant(GAUSSIANS, "`gaussians.means`")

@@ -10,6 +10,9 @@ from torch import nn
 
 from qgs.components import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
 
+PAINT = "colours_depend_on_the_direction features_are_blended_as_colours"
+"""Checks that fail too where colours are not what they are given as."""
+
 
 @mutant("batch_independence", "scene 0 has a gradient")
 class CentresOnTheBatch(MlpFeedForward):
@@ -122,14 +125,14 @@ class WeighsTheFirstViewMost(OneTerm):
         return (error / torch.arange(1.0, len(error) + 1).to(error)).sum()
 
 
-@mutant("world_frame_makes_no_difference", "in a moved world, rgb")
+@mutant("world_frame_makes_no_difference", "in a moved world, rgb", also=PAINT)
 class DarkensByDistanceFromTheOrigin(ChangedRenderer):
     def given(self, gaussians, cameras):
         colors = gaussians.colors * gaussians.means[..., 2:].sigmoid()
         return replace(gaussians, colors=colors), cameras
 
 
-@mutant("world_frame_makes_no_difference", "in a moved world, rgb")
+@mutant("world_frame_makes_no_difference", "in a moved world, rgb", also=PAINT)
 class DarkensByHeight(ChangedRenderer):
     """Above the first camera, along the world's y axis: no shift of the world changes it."""
 

@@ -33,7 +33,7 @@ READ = {
     "centers": ("offsets",),
     "renderer": (
         *("gaussians.means", "gaussians.scales", "gaussians.quats"),
-        *("gaussians.opacities", "gaussians.colors"),
+        *("gaussians.opacities", "gaussians.colors", "gaussians.sh", "gaussians.features"),
     ),
     "losses": (),
 }

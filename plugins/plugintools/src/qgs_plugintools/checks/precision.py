@@ -26,7 +26,7 @@ GEOMETRY = {
     "cross_attention": (EXPLAINED,),
     "self_attention": (EXPLAINED,),
     "centers": ("output",),
-    "renderer": ("rgb", "alpha", "depth"),
+    "renderer": ("rgb", "alpha", "depth", "features"),
     "losses": ("",),
 }
 """Outputs that are geometry, or measures of it, by the beginning of their names."""

@@ -1,4 +1,4 @@
-"""Renderers: the background, depth, and gradients in Gaussians, poses and intrinsics.
+"""Renderers: the background, depth, directions, features, and gradients in all that they read.
 
 Finite differences are taken in a scene without jumps: every Gaussian contributes to every pixel,
 far above `alpha_min`, none blocks what is behind it, and none changes its place in the order of
@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Renderer
-from qgs.types import map_tensors
+from qgs.geometry.harmonics import seen_colors
+from qgs.types import SH_COUNTS, map_tensors, named_tensors
 from qgs_plugintools.case import Case, expect
 from qgs_plugintools.inputs import Inputs, Sizes, inputs_of, tracked_inputs
 from qgs_plugintools.registry import check
@@ -66,6 +67,51 @@ def check_depth_is_expected(case: Case) -> None:
 
 
 @check({"renderer"})
+def check_colours_depend_on_the_direction(case: Case) -> None:
+    """With `sh`, every view is what Gaussians of the colours seen from there look like.
+
+    Coefficients of zero change nothing.
+    """
+    module, inputs = case.lively(), inputs_of(case, Sizes(views=3))
+    gaussians, cameras = inputs["gaussians"], inputs["cameras"]
+    generator = torch.Generator().manual_seed(0)
+    for count in SH_COUNTS:
+        sh = 0.3 * torch.randn(*gaussians.opacities.shape, count, 3, generator=generator)
+        varying = replace(gaussians, sh=sh.to(gaussians.means))
+        out, colors = module(varying, cameras), seen_colors(varying, cameras)
+        for view in range(cameras.shape[1]):
+            fixed = replace(gaussians, sh=None, colors=colors[:, view])
+            expected = module(fixed, cameras[:, [view]]).rgb
+            off = (out.rgb[:, [view]] - expected).abs().max().item()
+            seen = f"with {count} coefficients, view {view} is off by up to {off:.3g}"
+            expect(off < 1e-4, seen)
+    without, zeros = (replace(gaussians, sh=sh) for sh in (None, 0 * gaussians.sh))
+    off = (module(without, cameras).rgb - module(zeros, cameras).rgb).abs().max().item()
+    expect(off < 1e-4, f"coefficients of zero change the image by up to {off:.3g}")
+
+
+@check({"renderer"})
+def check_features_are_blended_as_colours(case: Case) -> None:
+    """Features, of any number, are what colours of the same numbers give before black.
+
+    They change nothing else, and Gaussians without features have none in their rendering.
+    """
+    module, inputs = case.lively(), inputs_of(case)
+    gaussians, cameras = replace(inputs["gaussians"], sh=None), inputs["cameras"]
+    black = torch.zeros(3).to(gaussians.means)
+    plain, out = (module(replace(gaussians, features=None), cameras), module(gaussians, cameras))
+    expect(plain.features is None, "Gaussians without features have some in their rendering")
+    expect(out.features is not None, "Gaussians with features have none in their rendering")
+    off = (out.rgb - plain.rgb).abs().max().item()
+    expect(off < 1e-4, f"features change the colours by up to {off:.3g}")
+    for first in (0, gaussians.features.shape[-1] - 3):
+        shown = slice(first, first + 3)
+        painted = replace(gaussians, colors=gaussians.features[..., shown], features=None)
+        off = (out.features[:, :, shown] - module(painted, cameras, black).rgb).abs().max().item()
+        expect(off < 1e-4, f"features are off by up to {off:.3g}")
+
+
+@check({"renderer"})
 def check_render_gradients_match_differences(case: Case) -> None:
     """The gradient of an image in the Gaussians agrees with finite differences."""
     module, inputs = case.lively(), _inputs(case, seed=0)
@@ -115,6 +161,7 @@ def _inputs(case: Case, seed: int, views: int = 1) -> Inputs:
     broad = replace(
         gaussians, means=means, scales=uniform(0.85, 1.7, 3), opacities=uniform(0.3, 0.5)
     )
+    broad = replace(broad, colors=uniform(0.5, 1, 3))  # above 0 with `sh` too
     return {**inputs, "gaussians": broad}
 
 
@@ -158,11 +205,10 @@ def _moves(name: str, x: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Ten
 
 
 def _brightness(rendering: Any) -> Tensor:
-    """A smooth number of a rendering: of its colours, of alpha and of depth."""
+    """A smooth number of a rendering: of its colours, of alpha, of depth and of features."""
     y = torch.linspace(-1, 1, rendering.rgb.shape[-2], dtype=torch.float64)[:, None]
     x = torch.linspace(-1, 1, rendering.rgb.shape[-1], dtype=torch.float64)
-    rgb, alpha, depth = (
-        image.double().cpu() for image in (rendering.rgb, rendering.alpha, rendering.depth)
-    )
-    pictures = (rgb * torch.cos(2 * x + y)).mean() + (rgb * torch.sin(x - 2 * y)).mean()
+    rgb, alpha, depth, features = (x.double().cpu() for _, x in named_tensors(rendering))
+    pictures = (features * torch.cos(x - y)).mean() + (features * torch.sin(x + 3 * y)).mean()
+    pictures = pictures + (rgb * torch.cos(2 * x + y)).mean() + (rgb * torch.sin(x - 2 * y)).mean()
     return pictures + (alpha * torch.cos(x + 2 * y)).mean() + (depth * torch.sin(2 * x - y)).mean()

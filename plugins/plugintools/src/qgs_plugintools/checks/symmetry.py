@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import CrossAttention, Encoder
+from qgs.geometry.harmonics import rotated
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import ImageMemory, map_tensors
 from qgs_plugintools.case import Case, expect
@@ -145,6 +146,8 @@ def check_world_frame_makes_no_difference(case: Case) -> None:
     def moved(name: str, x: Tensor) -> Tensor:
         if name.endswith("gaussians.means") or name.partition("fields.")[2] in places:
             return x @ motion[:3, :3].T.to(x) + motion[:3, 3].to(x)
+        if name.endswith("gaussians.sh"):
+            return rotated(x, motion[:3, :3])
         if name.endswith("quats"):
             # Hamilton's product of quaternions w x y z: first the rotation `x`, then TURN.
             a, b, c, d = TURN
