@@ -23,6 +23,22 @@ UNUSED = 52_236
 LOCUSGS = 241_514_780 - UNUSED
 
 
+LATENTS, READ = 4096, 4
+HEAD_NORM = 2 * 64
+EMBEDDINGS = (3 + 6) * 8 * 8 * D + 2 * (D + 2 * D)
+MLP = (D * 4 * D + 4 * D) + (4 * D * D + D)
+SELF_ATTENTION = (D * 3 * D + 3 * D) + (D * D + D) + 2 * HEAD_NORM
+ENCODER_BLOCK = SELF_ATTENTION + MLP + 2 * (2 * D) + 2 * D
+DECODER_BLOCK = (
+    2 * (D * D + D) + HEAD_NORM + SELF_ATTENTION + MLP + 3 * (2 * D) + 3 * D
+)  # as over the latents
+READOUT = READ * 2 * D + (READ * D * 2 * D + 2 * D) + HEAD_NORM
+OF_LATENTS = LATENTS * D + LAYERS * DECODER_BLOCK + (D * 2 * D + 2 * D) + HEAD_NORM
+HEAD = D * 64 * 14 + 64 * 14
+
+TOKENGS_2026_6 = 362_695_680
+
+
 def parameters(recipe: str) -> int:
     path = RECIPES / recipe
     model = qgs.compose(path, overrides=[f"model.queries.count={N}"], device="meta")
@@ -34,6 +50,14 @@ def parameters(recipe: str) -> int:
 def test_tokengs_and_locusgs(recipe: str) -> None:
     assert parameters(f"tokengs/{recipe}.yaml") == TOKENGS
     assert parameters(f"locus/{recipe}.yaml") == LOCUSGS
+
+
+@pytest.mark.parametrize("loss", ["ssim", "lpips"])
+@pytest.mark.parametrize("views", [2, 4, 6])
+def test_tokengs_2026_6(views: int, loss: str) -> None:
+    encoder = EMBEDDINGS + 12 * ENCODER_BLOCK + READOUT + OF_LATENTS
+    assert encoder + N * D + DECODER_BLOCK + HEAD == TOKENGS_2026_6
+    assert parameters(f"tokengs/latent_{views}views_{loss}.yaml") == TOKENGS_2026_6
 
 
 def test_what_locusgs_adds_to_tokengs() -> None:

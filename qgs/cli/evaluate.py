@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from qgs.cli.options import Device, Overrides, Threads, use_threads
+from qgs.cli.options import Device, Overrides, Threads, Tune, tuning_settings, use_threads
 
 if TYPE_CHECKING:
     from qgs.composer import Recipe
@@ -33,9 +33,7 @@ def evaluate(
     index: Annotated[
         str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
     ] = None,
-    tune: Annotated[
-        int | None, typer.Option(min=0, help="Steps of token tuning on a scene's input views.")
-    ] = None,
+    tune: Tune = None,
     batch: Annotated[int, typer.Option(min=1, help="Scenes passed through the model at once.")] = 1,
     out: Annotated[
         Path | None,
@@ -64,8 +62,7 @@ def evaluate(
     settings = list(overrides or ())
     if index is not None:
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
-    if tune is not None:
-        settings.append(f"evaluation.tuning_steps={tune}")
+    settings += tuning_settings(tune)
     console = Console()
     if compare:
         idle = [*settings, *[f"--batch {batch}"] * (batch > 1), *["--strict"] * strict]

@@ -35,6 +35,25 @@ Size: TypeAlias = Annotated[
 ]
 
 
+TUNE_HELP = "Tune queries or latents on the input photos: WHAT, STEPS or WHAT:STEPS; 0 for none."
+Tune: TypeAlias = Annotated[str | None, typer.Option(metavar="[WHAT:]STEPS", help=TUNE_HELP)]
+
+
+def tuning_settings(tune: str | None) -> list[str]:
+    """The settings that --tune stands for; WHAT alone takes 50 steps (TokenGS).
+
+    Raises ValueError for a text that says neither what to tune nor how often.
+    """
+    if tune is None:
+        return []
+    match = re.fullmatch(r"(queries|latents)?:?(\d+)?", tune)
+    if match is None or not tune.strip(":") or tune.endswith(":"):
+        raise ValueError(f"--tune must be STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
+    what, steps = match.groups()
+    settings = [f"evaluation.tuning_steps={steps or 50}"]
+    return [*settings, *([f"evaluation.tuning={what}"] if what else [])]
+
+
 def use_threads(threads: int | None) -> None:
     """Compute on that many CPU threads; None leaves torch's choice."""
     if threads is not None:

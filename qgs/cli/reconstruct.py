@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qgs.cli.options import Checkpoint, Device, Size, parse_size
+from qgs.cli.options import Checkpoint, Device, Size, Tune, parse_size, tuning_settings
 from qgs.wording import listed, numbered
 
 if TYPE_CHECKING:
@@ -42,9 +42,7 @@ def reconstruct(
     holdout: Annotated[
         str | None, typer.Option(help="Photos to compare with; default: six between the inputs.")
     ] = None,
-    tune: Annotated[
-        int, typer.Option(min=0, help="Steps of token tuning on the input photos; 0 for none.")
-    ] = 0,
+    tune: Tune = None,
     refine: Annotated[
         float | None,
         typer.Option(help="Seconds of optimising the Gaussians on all photos not compared with."),
@@ -106,12 +104,14 @@ def reconstruct(
     refuse_too_many(gaussians or 0)
     console = Console()
     model = load(checkpoint, choose_device(device))
-    recipe = resolve(model.recipe or {}, overrides or ())
+    chosen = tuning_settings(tune)
+    recipe = resolve(model.recipe or {}, [*(overrides or ()), *chosen])
     scene, seen = chosen_scene(recipe, photos, pixels, scene_name)
     named = {"--frames": frames, "--holdout": holdout}.items()
     wanted = [None if text is None else frame_list(text, name, scene) for name, text in named]
     sample, world = choose_sample(scene, recipe.views, inputs, *wanted)
-    tuned, record = tuned_tokens(model, recipe, sample, tune, console) if tune else (None, None)
+    tune_it = bool(chosen and recipe.evaluation.tuning_steps)
+    tuned, record = tuned_scene(model, recipe, sample, console) if tune_it else (None, None)
     result = run(model, sample, world, seen, tuned, record)
     result = replace(result, remarks=remarks_on(result, scene, model, recipe.views))
     show(result, "feed-forward" if refine else "", console)
@@ -126,18 +126,25 @@ def reconstruct(
         console.print(f"wrote {path}", soft_wrap=True)
 
 
-def tuned_tokens(
-    model: QueryGaussianModel, recipe: Recipe, sample: Sample, steps: int, console: Console
-) -> tuple[Gaussians, dict[str, float]]:
-    """Gaussians of tokens that are tuned on the inputs of `sample`, and a record of that."""
+def tuned_scene(
+    model: QueryGaussianModel, recipe: Recipe, sample: Sample, console: Console
+) -> tuple[Gaussians, dict[str, Any]]:
+    """Gaussians of queries or latents tuned on the inputs of `sample`, and a record of that."""
     from qgs.engine.tuning import tune, tuning_loss
 
-    rate, inputs = recipe.evaluation.tuning_rate, sample.inputs.to(next(model.parameters()).device)
-    tuning = tune(model, inputs, tuning_loss(recipe), steps, rate)
+    what, steps = recipe.evaluation.tuning, recipe.evaluation.tuning_steps
+    rate, inputs = recipe.evaluation.rate, sample.inputs.to(next(model.parameters()).device)
+    tuning = tune(model, inputs, tuning_loss(recipe), steps, rate, what)
     before, after = tuning.losses[0], tuning.losses[-1]
     losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
-    console.print(f"{steps} steps of token tuning: {losses}", highlight=False)
-    record = {"steps": steps, "rate": rate, "loss_before": before, "loss_after": after}
+    console.print(f"{steps} steps of tuning the {what}: {losses}", highlight=False)
+    record = {
+        "what": what,
+        "steps": steps,
+        "rate": rate,
+        "loss_before": before,
+        "loss_after": after,
+    }
     return tuning.prediction.gaussians, record
 
 

@@ -11,6 +11,8 @@ from qgs.components.decoder import (
 )
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
+from qgs.components.latents import LatentBottleneck
+from qgs.components.multiscale import MultiscaleViT
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
@@ -19,6 +21,8 @@ from qgs.contracts import Component
 
 COMPONENTS: tuple[type[Component], ...] = (
     MultiViewViT,
+    MultiscaleViT,
+    LatentBottleneck,
     LatentQueries,
     CrossSelfMlp,
     ContentCrossAttention,
@@ -41,12 +45,14 @@ __all__ = [
     "CrossSelfMlp",
     "FreeCenters",
     "GaussianHead",
+    "LatentBottleneck",
     "LatentQueries",
     "LayerScale",
     "LayerSupervision",
     "Mlp",
     "MlpFeedForward",
     "MultiViewViT",
+    "MultiscaleViT",
     "NoRefinement",
     "OneCycleAdamW",
     "SelfAttentionCore",

@@ -1,4 +1,4 @@
-"""`qgs/multiview_vit`: a small ViT over the patches of all views together (TokenGS release)."""
+"""ViTs over the patches of all views together; `qgs/multiview_vit` (TokenGS release)."""
 
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
@@ -51,10 +51,11 @@ class EncoderBlock(nn.Module):
         return x_BMD + self.scale2(self.mlp(self.norm2(x_BMD)))
 
 
-class MultiViewViT(Encoder):
-    """RGB and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
+class PatchViT(Encoder):
+    """RGB and Plücker embeddings added, then ViT blocks over the tokens of all views together.
 
-    name: ClassVar[str] = "multiview_vit"
+    Subclasses say what of the blocks' outputs the memory holds.
+    """
 
     class Config(ComponentConfig):
         patch_size: int = Field(default=8, ge=1)
@@ -77,9 +78,6 @@ class MultiViewViT(Encoder):
             EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale, eps)
             for _ in range(config.depth)
         )
-        self.norm = nn.LayerNorm(dims.width, eps)
-        self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
-        self.k_norm = nn.LayerNorm(dims.width // dims.heads, eps)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
@@ -103,34 +101,54 @@ class MultiViewViT(Encoder):
             for name, kernel in learned.items()
         }
 
-    def forward(self, views: Views) -> ImageMemory:
-        """The memory of all views; raises ValueError when the patch does not divide the images."""
+    def grid(self, views: Views) -> tuple[int, int, int]:
+        """(V, H/P, W/P); raises ValueError when the patch does not divide the images."""
         view_count, _, height, width = views.images.shape[1:]
         if height % self.patch_size or width % self.patch_size:
             raise ValueError(
                 f"images of {height} x {width} cannot be cut into patches of {self.patch_size}; "
                 "resize the views, or compose the model with another patch_size"
             )
-        plucker_BV6HW = plucker_rays(views.cameras)
-        x_BMD = self.embed(views.images, plucker_BV6HW)
-        for block in self.blocks:
-            x_BMD = block(x_BMD)
-        x_BMD = self.norm(x_BMD)
-        k_BMD, v_BMD = self.kv_proj(x_BMD).chunk(2, -1)
-        v_BhMd = split_heads(v_BMD, self.dims.heads)
-        return ImageMemory(
-            keys=self.k_norm(split_heads(k_BMD, self.dims.heads)).to(v_BhMd.dtype),
-            values=v_BhMd,
-            features=x_BMD,
-            patch_rays=patch_rays(plucker_BV6HW, self.patch_size),
-            grid=(view_count, height // self.patch_size, width // self.patch_size),
-        )
+        return view_count, height // self.patch_size, width // self.patch_size
 
     def embed(self, images: Tensor, plucker: Tensor) -> Tensor:
         """Images (B, V, 3, H, W) in [0, 1] and Plücker maps (B, V, 6, H, W) -> (B, M, D)."""
         x_XPD = self.rgb_embedding(imagenet_normalised(images).flatten(0, 1))
         x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
         return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=images.shape[0])
+
+
+class MultiViewViT(PatchViT):
+    """RGB and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
+
+    name: ClassVar[str] = "multiview_vit"
+
+    def __init__(self, config: PatchViT.Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
+        self.k_norm = nn.LayerNorm(dims.width // dims.heads, config.norm_eps)
+
+    def forward(self, views: Views) -> ImageMemory:
+        """The memory of all views; raises ValueError when the patch does not divide the images."""
+        grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
+        x_BMD = self.embed(views.images, plucker_BV6HW)
+        for block in self.blocks:
+            x_BMD = block(x_BMD)
+        x_BMD = self.norm(x_BMD)
+        keys, values = keys_and_values(x_BMD, self.kv_proj, self.k_norm)
+        rays = patch_rays(plucker_BV6HW, self.patch_size)
+        return ImageMemory(x_BMD, keys, values, rays, grid)
+
+
+def keys_and_values(
+    features: Tensor, kv_proj: nn.Linear, k_norm: nn.LayerNorm
+) -> tuple[Tensor, Tensor]:
+    """Keys, normalised by head, and values (B, h, M, d) of features (B, M, C), C -> 2 D."""
+    heads = kv_proj.out_features // 2 // k_norm.normalized_shape[0]
+    k_BMD, v_BMD = kv_proj(features).chunk(2, -1)
+    v_BhMd = split_heads(v_BMD, heads)
+    return k_norm(split_heads(k_BMD, heads)).to(v_BhMd.dtype), v_BhMd
 
 
 _PATCH_KERNELS = ("rgb_embedding.proj.weight", "ray_embedding.proj.weight")

@@ -33,6 +33,8 @@ class GaussianHead(Head):
         """Standard deviation of the truncated normal that the weights start from."""
         position_std: float | None = Field(default=None, gt=0)
         """The same for the weights that make positions; null for `init_std`."""
+        z_init: float = 0.0
+        """What the biases of the z of positions start from, raw (TokenGS 2026.6: log 1.1)."""
         norm: bool = False
         """A LayerNorm before the linear layer (in neither release; steadier for small models)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
@@ -59,6 +61,8 @@ class GaussianHead(Head):
             nn.init.trunc_normal_(rows_K3D, std=config.position_std)
             with torch.no_grad():
                 self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
+        with torch.no_grad():
+            self.linear.bias.unflatten(0, (-1, sum(CHANNELS)))[:, CHANNELS[0] - 1] = config.z_init
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:

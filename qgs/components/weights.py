@@ -4,6 +4,7 @@ from typing import Any
 
 from qgs.components.head import CHANNELS
 from qgs.contracts.weights import (
+    LayoutError,
     Rename,
     Shapes,
     WeightLayout,
@@ -15,6 +16,9 @@ from qgs.contracts.weights import (
 
 ENCODER = "enc_dec_backbone.encoder."
 DECODER = "enc_dec_backbone.decoder_blocks."
+READOUT = "enc_dec_backbone.multiscale_norms."
+LATENTS = "enc_dec_backbone.latents"
+LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
 BACKBONE_RENAMES = (
     Rename("encoder.rgb_embedding.", "patch_embed."),
@@ -43,6 +47,29 @@ BACKBONE_RENAMES = (
 )
 """Names that TokenGS and the models built on it share."""
 
+LATENT_RENAMES = (
+    Rename("encoder.norms.{}.", READOUT + "{}."),
+    Rename("encoder.latents", LATENTS),
+    Rename("encoder.feature_kv_proj.", "enc_dec_backbone.latent_feature_kv_proj."),
+    Rename("encoder.feature_k_norm.", "enc_dec_backbone.latent_feature_k_norm."),
+    Rename("encoder.latent_kv_proj.", "enc_dec_backbone.latent_kv_proj."),
+    *(
+        Rename(f"encoder.latent_blocks.{{}}.{ours}", LATENT_BLOCK + f"{{}}.{theirs}")
+        for ours, theirs in (
+            ("cross_attention.norm.", "gs_cross_attn.gs_token_norm."),
+            ("cross_attention.", "gs_cross_attn."),
+            ("cross_scale.", "gs_cross_attn_scale."),
+            ("self_norm.", "gs_self_attn.norm."),
+            ("self_attention.", "gs_self_attn.gs_self_attn."),
+            ("self_scale.", "gs_self_attn_scale."),
+            ("mlp_norm.", "mlp.norm."),
+            ("mlp.", "mlp.mlp."),
+            ("mlp_scale.", "mlp_scale."),
+        )
+    ),
+)
+"""Names of the encoders of TokenGS 2026.6: the readout of several blocks, the latent bottleneck."""
+
 READ_OPTIONS = (
     "model.width",
     "model.heads",
@@ -50,6 +77,9 @@ READ_OPTIONS = (
     "model.encoder.patch_size",
     "model.encoder.depth",
     "model.encoder.mlp_ratio",
+    "model.encoder.blocks",
+    "model.encoder.latents",
+    "model.encoder.latent_depth",
     "model.queries.type",
     "model.queries.count",
     "model.decoder.depth",
@@ -98,6 +128,8 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
 def _read(shapes: Shapes) -> dict[str, Any]:
     model = backbone(shapes, "qgs/latent")
+    later = _encoder_of_2026_6(shapes, model["encoder"]["depth"])
+    model["encoder"] |= later
     model["decoder"] |= {
         "cross_attention": {"type": "qgs/content"},
         "self_attention": {"type": "qgs/content"},
@@ -105,16 +137,34 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     }
     model["head"] |= {"scale_input_limit": None, "quat_eps": 1e-12}
     unlimited = {"input_limit": None, "output_limit": None}
-    model["centers"] = {"type": "qgs/free", "z_offset": 1.0, **unlimited}
+    model["centers"] = {"type": "qgs/free", "z_offset": 0.0 if later else 1.0, **unlimited}
     model["supervision"] = {"type": "qgs/layers", "layers": [model["decoder"]["depth"]]}
-    return {"recipe": 1, "model": model}
+    tree: dict[str, Any] = {"recipe": 1, "model": model}
+    tree |= {"views": {"frame": "mean_cam"}} if later else {}
+    return tree | ({"evaluation": {"tuning": "latents"}} if LATENTS in shapes else {})
+
+
+def _encoder_of_2026_6(shapes: Shapes, depth: int) -> dict[str, Any]:
+    """What the encoder, of `depth` blocks, has besides; nothing if it is none of 2026.6."""
+    scales = layer_count(shapes, READOUT)
+    if not scales:
+        return {}
+    if scales > depth:
+        raise LayoutError(f"{READOUT}: {scales} norms, one for each block read, of {depth} blocks")
+    step = 2 if 2 * scales <= depth + 1 else 1
+    found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
+    if LATENTS not in shapes:
+        return {"type": "qgs/multiscale_vit", **found}
+    blocks = layer_count(shapes, LATENT_BLOCK)
+    found |= {"latents": size_at(shapes, LATENTS, 0), "latent_depth": blocks}
+    return {"type": "qgs/latent_bottleneck", **found}
 
 
 TOKENGS = WeightLayout(
     name="TokenGS",
     source="nv-tlabs/TokenGS",
     components={
-        "encoder": ("qgs/multiview_vit",),
+        "encoder": ("qgs/multiview_vit", "qgs/multiscale_vit", "qgs/latent_bottleneck"),
         "queries": ("qgs/latent",),
         "cross_attention": ("qgs/content",),
         "self_attention": ("qgs/content",),
@@ -125,6 +175,7 @@ TOKENGS = WeightLayout(
     },
     renames=(
         *BACKBONE_RENAMES,
+        *LATENT_RENAMES,
         Rename("decoder.{}.cross_attention.core.q_proj.", DECODER + "{}.gs_cross_attn.q_proj."),
     ),
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
@@ -132,8 +183,10 @@ TOKENGS = WeightLayout(
     read_options=READ_OPTIONS,
     undecided=(
         "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
+        "blocks that an encoder of 2026.6 reads: every second one up to the last",
         "supervised layers: the last",
-        "scale and frame of the world, losses, renderer, training: the framework's defaults",
+        "frame of the world: the mean camera for encoders of 2026.6, else the first",
+        "scale of the world, losses, renderer, training: the framework's defaults",
     ),
 )
-"""The released TokenGS for posed photos, without its dynamic and latent extensions."""
+"""The released TokenGS for posed photos, without its dynamic tokens."""

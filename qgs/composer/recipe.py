@@ -130,6 +130,7 @@ def resolve(
             p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
         }
         check_flow(sound, dims.depth, registry, problems)
+    _check_tuning(tree, settings["evaluation",], parts["model", "encoder"], registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     out = _spell_out(tree, settings, registry, chosen)
@@ -148,6 +149,28 @@ def resolve(
         evaluation=settings["evaluation",],
         plugin_versions={n: registry.plugins[n].version for n in ("qgs", *out.values["plugins"])},
     )
+
+
+def _check_tuning(
+    tree: MapNode,
+    evaluation: contracts.EvaluationConfig,
+    encoder: Chosen | None,
+    registry: Registry,
+    problems: Problems,
+) -> None:
+    """Report latents to be tuned of an encoder that has none."""
+    if evaluation.tuning != "latents" or encoder is None:
+        return
+    known: dict[str, Any] = dict(registry.components("encoder"))
+    if not known[encoder.type].tunable:
+        node = tree.child("evaluation")
+        others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
+        problems.add(
+            node.origins.get("tuning", node.origin),
+            "evaluation.tuning",
+            f"`{encoder.type}` at model.encoder has no latents to tune",
+            f"write `queries`, or use {others} in the slot `encoder`",
+        )
 
 
 def _with_defaults(tree: MapNode) -> MapNode:

@@ -26,10 +26,12 @@ class Encoder(ModelComponent):
 
     ordered_views: whether the order of the views matters. Otherwise, permuting the views permutes
     the tokens.
+    tunable: whether `project` makes a memory of other features, which tuning at test time needs.
     """
 
     slot: ClassVar[str] = "encoder"
     ordered_views: ClassVar[bool] = False
+    tunable: ClassVar[bool] = False
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
@@ -49,3 +51,11 @@ class Encoder(ModelComponent):
     @abstractmethod
     def forward(self, views: Views) -> ImageMemory:
         """Encode all views of each scene together."""
+
+    def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
+        """`memory` made anew from other `features` of its shape: what tuning at test time reads.
+
+        `project(memory.features, memory)` is that memory again. Raises NotImplementedError unless
+        the encoder is `tunable`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} makes no memory of other features")

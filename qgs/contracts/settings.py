@@ -1,10 +1,13 @@
 """Sections of a recipe that are not components: views, training, evaluation."""
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
+
+Tuned: TypeAlias = Literal["queries", "latents"]
+"""What is tuned at test time."""
 
 
 class ViewsConfig(ComponentConfig):
@@ -90,8 +93,16 @@ class EvaluationConfig(ComponentConfig):
     (pixelSplat's format), relative to the working directory; null draws them."""
     protocol: str | None = None
     """Name of these settings in tables; null takes the name of the index file."""
+    tuning: Tuned = "queries"
+    """What tuning fits to a scene's input views: its queries, or the features of its image memory,
+    with an encoder that makes keys and values of them anew (qgs/latent_bottleneck)."""
     tuning_steps: int = Field(default=0, ge=0)
-    """Steps of token tuning on the input views of each scene before it is judged, with the recipe's
+    """Steps of tuning on the input views of each scene before it is judged, with the recipe's
     photometric loss (TokenGS: 50); 0 for none."""
-    tuning_rate: float = Field(default=1e-4, gt=0)
-    """Learning rate of token tuning, by Adam (TokenGS: 1e-4)."""
+    tuning_rate: float | None = Field(default=None, gt=0)
+    """Learning rate of tuning, by Adam; null for TokenGS's, 1e-4 of queries and 1e-2 of latents."""
+
+    @property
+    def rate(self) -> float:
+        """`tuning_rate`, or the default of what is tuned."""
+        return self.tuning_rate or {"queries": 1e-4, "latents": 1e-2}[self.tuning]

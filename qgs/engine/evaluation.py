@@ -180,8 +180,9 @@ class _Judge:
             metric.to(self._device)
         self._tune = None
         if steps := recipe.evaluation.tuning_steps:
-            rate, loss = recipe.evaluation.tuning_rate, tuning_loss(recipe)
-            self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate)
+            rate, what = recipe.evaluation.rate, recipe.evaluation.tuning
+            loss = tuning_loss(recipe)
+            self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate, what=what)
 
     def judged(
         self, samples: Iterable[Sample | SceneFailure], batch: int

@@ -74,9 +74,14 @@ def protocol_of(
         judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
     tuning, metrics = None, {}
     if evaluation.tuning_steps:
-        loss = tuning_loss(recipe).config.model_dump(mode="json")
-        budget = {"steps": evaluation.tuning_steps, "rate": evaluation.tuning_rate}
+        options = tuning_loss(recipe).config
+        loss = options.model_dump(
+            mode="json", exclude=set() if options.l1_weight else {"l1_weight"}
+        )
+        budget = {"steps": evaluation.tuning_steps, "rate": evaluation.rate}
         tuning = {**budget, "optimizer": "Adam", "loss": loss}
+        if evaluation.tuning != "queries":  # which protocols did not name when there was no other
+            tuning["what"] = evaluation.tuning
     for path, chosen in recipe.parts.items():
         metric = chosen.component
         if issubclass(metric, Metric):

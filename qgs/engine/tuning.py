@@ -1,4 +1,4 @@
-"""Test-time token tuning: the queries of one scene, fitted to its input views (TokenGS release)."""
+"""Tuning at test time: the queries or latents of a scene, fitted to its input views (TokenGS)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
+from qgs.contracts.settings import Tuned
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction, Views, map_tensors, named_tensors
@@ -14,7 +15,7 @@ from qgs.types import Prediction, Views, map_tensors, named_tensors
 
 @dataclass(frozen=True)
 class Tuning:
-    """prediction: from the tuned queries. losses: before each step, and after the last one."""
+    """prediction: of what was tuned. losses: before each step, and after the last one."""
 
     prediction: Prediction
     losses: Sequence[float]
@@ -23,31 +24,49 @@ class Tuning:
 def tuning_loss(recipe: Recipe) -> Photometric:
     """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults."""
     for loss in recipe.build_losses().values():
-        if isinstance(loss, Photometric) and (loss.config.mse_weight or loss.config.ssim_weight):
+        if isinstance(loss, Photometric) and any(loss.weights()):
             return loss
     return Photometric(Photometric.Config())
 
 
 def tune(
-    model: QueryGaussianModel, views: Views, loss: Photometric, steps: int, rate: float = 1e-4
+    model: QueryGaussianModel,
+    views: Views,
+    loss: Photometric,
+    steps: int,
+    rate: float = 1e-4,
+    what: Tuned = "queries",
 ) -> Tuning:
-    """Fit the initial queries of `views` (B, V) to these views with Adam; weights stay as they are.
+    """Fit what the model holds of the scenes `views` (B, V) to these views; weights stay.
 
-    All features and floating fields of the state are fitted, so LocusGS's anchors too. `loss`
-    compares the last layer with the photos. TokenGS takes 50 steps at a rate of 1e-4.
-    Raises ValueError for less than one step.
+    what: "queries", all features and floating fields of the initial state, so LocusGS's anchors
+    too; or "latents", the features of the image memory, of which the encoder makes keys and values
+    anew in every step. `loss` compares the last layer with the photos; the optimiser is Adam.
+    TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of latents.
+    Raises ValueError for less than one step, and for latents of an encoder that has none to tune.
     """
     if steps < 1:
-        raise ValueError(f"token tuning takes at least one step, got {steps}")
+        raise ValueError(f"tuning takes at least one step, got {steps}")
+    if what == "latents" and not model.encoder.tunable:
+        raise ValueError(
+            f"there are no latents to tune: the encoder, {type(model.encoder).__name__}, makes no "
+            "memory of other features; tune the queries instead (--tune queries)"
+        )
     with torch.no_grad():
         memory = model.encoder(views)
         start = model.queries(memory, views)
-    state = map_tensors(lambda x: x.detach().clone().requires_grad_(x.is_floating_point()), start)
-    leaves = [tensor for _, tensor in named_tensors(state) if tensor.requires_grad]
+    tuned = map_tensors(
+        lambda x: x.detach().clone().requires_grad_(x.is_floating_point()),
+        start if what == "queries" else memory.features,
+    )
+    leaves = [tensor for _, tensor in named_tensors(tuned) if tensor.requires_grad]
     optimizer = torch.optim.Adam(leaves, lr=rate)
 
     def predicted() -> tuple[Prediction, Tensor]:
-        prediction = model.predict(memory, state, ())
+        if what == "queries":
+            prediction = model.predict(memory, tuned, ())
+        else:
+            prediction = model.predict(model.encoder.project(tuned, memory), start, ())
         rendering = model.render(prediction.gaussians, views.cameras)
         terms = loss(prediction.layers[model.depth], rendering, views)
         return prediction, torch.stack(list(terms.values())).sum()

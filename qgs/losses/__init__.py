@@ -1,13 +1,15 @@
 """What training minimises."""
 
+from qgs.losses.lpips import LpipsLoss
 from qgs.losses.opacity import Mask, Opacity
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import Visibility, VisibilityOptions, view_visibility
 
-COMPONENTS = (Photometric, Visibility, Mask, Opacity)
+COMPONENTS = (Photometric, Visibility, Mask, Opacity, LpipsLoss)
 
 __all__ = [
     "COMPONENTS",
+    "LpipsLoss",
     "Mask",
     "Opacity",
     "Photometric",

@@ -1,4 +1,4 @@
-"""`qgs/photometric`: MSE and SSIM of rendered against true images (TokenGS, LocusGS)."""
+"""`qgs/photometric`: MSE, L1 and SSIM of rendered against true images (TokenGS, LocusGS)."""
 
 from typing import ClassVar, Literal
 
@@ -53,7 +53,7 @@ def _window(size: int, padding: Padding) -> Tensor:
 
 
 class Photometric(Loss):
-    """mse_weight * MSE + ssim_weight * (1 - SSIM) / 2."""
+    """mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2."""
 
     name: ClassVar[str] = "photometric"
     renderings = "each"
@@ -61,6 +61,8 @@ class Photometric(Loss):
     class Config(ComponentConfig):
         mse_weight: float = Field(default=1.0, ge=0)
         """Factor of the mean squared error; 0 leaves the term out."""
+        l1_weight: float = Field(default=0.0, ge=0)
+        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE); 0 leaves it out."""
         ssim_weight: float = Field(default=0.2, ge=0)
         """Factor of (1 - SSIM) / 2; 0 leaves the term out."""
         padding: Padding = "same"
@@ -68,13 +70,19 @@ class Photometric(Loss):
 
     config: Config
 
+    def weights(self) -> tuple[float, float, float]:
+        """Of MSE, L1 and SSIM."""
+        return self.config.mse_weight, self.config.l1_weight, self.config.ssim_weight
+
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views
     ) -> dict[str, Tensor]:
-        """Terms `mse` and `ssim`; raises ValueError for images that are too small for SSIM."""
+        """Terms `mse`, `l1`, `ssim`; raises ValueError for images that are too small for SSIM."""
         terms = {}
         if self.config.mse_weight:
             terms["mse"] = self.config.mse_weight * mean_squared_error(rendering.rgb, target.images)
+        if self.config.l1_weight:
+            terms["l1"] = self.config.l1_weight * mean_absolute_error(rendering.rgb, target.images)
         if self.config.ssim_weight:
             similarity = mean_ssim(rendering.rgb, target.images, self.config.padding)
             terms["ssim"] = self.config.ssim_weight * (1 - similarity) / 2
@@ -85,3 +93,9 @@ class Photometric(Loss):
 def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
     """Mean over everything of (images - truth)^2."""
     return F.mse_loss(images, truth)
+
+
+@full_precision
+def mean_absolute_error(images: Tensor, truth: Tensor) -> Tensor:
+    """Mean over everything of |images - truth|."""
+    return F.l1_loss(images, truth)

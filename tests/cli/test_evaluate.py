@@ -63,7 +63,7 @@ def test_tuning_goes_into_a_folder_of_its_own_and_is_told(runs: Path) -> None:
     before = [file.read_bytes() for file in files]
     result = evaluated(run, "--tune", 2)
     assert result.exit_code == 0, result.output
-    assert "tokens tuned on the input views: 2 steps of Adam" in result.output
+    assert "queries tuned on the input views: 2 steps of Adam" in result.output
     assert summary(run / "evaluation-2")["tuning"]["steps"] == 2
     assert [file.read_bytes() for file in files] == before
 

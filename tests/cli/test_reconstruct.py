@@ -166,7 +166,7 @@ def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tm
     assert run(checkpoint, photos, "--out", tmp_path / "plain").exception is None
     result = run(checkpoint, photos, "--out", tmp_path / "tuned", "--tune", 3)
     assert result.exception is None
-    assert "3 steps of token tuning: photometric loss of the inputs" in result.output
+    assert "3 steps of tuning the queries: photometric loss of the inputs" in result.output
     plain, tuned = (
         json.loads((tmp_path / name / "cameras.json").read_text()) for name in ("plain", "tuned")
     )

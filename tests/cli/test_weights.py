@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from golden_weights import published
-from safetensors.torch import save, save_file
+from safetensors.torch import load_file, save, save_file
 from training_runs import same
 
 import qgs
@@ -54,6 +54,19 @@ def test_there_and_back(run: Callable[..., str], locus: Path, tmp_path: Path) ->
     run("import", back, "--recipe", out.with_suffix(".yaml"), "--out", again)
     assert "knowingly dropped" not in told
     assert same(qgs.load(out).state_dict(), qgs.load(again).state_dict())
+
+
+def test_latents_there_and_back(run: Callable[..., str], tmp_path: Path) -> None:
+    given, out, back = (tmp_path / f"{name}.safetensors" for name in ("given", "ours", "back"))
+    save_file(published("tokengs_latent_a"), given)
+    told = run("import", given, "--recipe", "auto", "--out", out)
+    assert "TokenGS (nv-tlabs/TokenGS): 177 tensors used" in told
+    assert "blocks that an encoder of 2026.6 reads: every second one" in told
+    model = qgs.load(out)
+    assert model.recipe["views"]["frame"] == "mean_cam"
+    assert model.recipe["model"]["encoder"]["blocks"] == [2, 4]
+    run("export", out, "--layout", "published", "--out", back)
+    assert same(load_file(back), load_file(given))
 
 
 def test_set_changes_the_recipe(run: Callable[..., str], locus: Path, tmp_path: Path) -> None:

@@ -84,6 +84,12 @@ def test_head_starts_with_the_spread_it_is_told() -> None:
     assert weight[:, 3:].std() == pytest.approx(0.02, rel=0.05)
 
 
+def test_head_starts_at_the_depth_it_is_told() -> None:
+    head = GaussianHead(GaussianHead.Config(gaussians_per_query=4, z_init=math.log(1.1)), DIMS)
+    offsets = head(QueryState(torch.zeros(1, 1, 16))).offsets
+    torch.testing.assert_close(posact(offsets), torch.tensor([0, 0, 0.1]).expand(1, 1, 4, 3))
+
+
 def test_free_centers_ignore_the_state() -> None:
     centers = FreeCenters(FreeCenters.Config(z_offset=1.0), DIMS)
     offsets = torch.randn(1, 2, 3, 3)

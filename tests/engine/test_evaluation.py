@@ -321,4 +321,4 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(tiny: Tiny) -> None
     assert (told["steps"], told["rate"], told["optimizer"]) == (2, 1e-4, "Adam")
     assert told["loss_after"] < told["loss_before"]
     assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
-    assert "tokens tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)
+    assert "queries tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from training_runs import Tiny
 
-from qgs.composer import Recipe
+from qgs.composer import Recipe, RecipeError
 from qgs.data.evaluation import evaluation_samples
 from qgs.engine.tuning import tune, tuning_loss
 from qgs.losses import Photometric
@@ -94,3 +94,34 @@ def test_a_forward_pass_starts_from_the_given_state(tiny: Tiny) -> None:
     assert not torch.allclose(plain.gaussians.means, moved.gaussians.means)
     with pytest.raises(ValueError, match="the memory is of 1 scenes, the initial state of 2"):
         model(inputs, state=model.queries.start(2))
+
+
+LATENTS = (
+    "model.encoder={type: qgs/latent_bottleneck, depth: 1, blocks: [1], latents: 12, "
+    "latent_depth: 1, patch_size: 8, layer_scale: 0.3}"
+)
+
+
+def test_latents_are_tuned_and_nothing_else(tiny: Tiny) -> None:
+    recipe = tiny("tokengs", LATENTS, "evaluation.tuning=latents")
+    assert recipe.evaluation.rate == 1e-2
+    model, inputs = model_and_inputs(recipe)
+    before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
+    calls = []
+    model.encoder.latent_blocks[0].register_forward_hook(lambda *_: calls.append(1))
+    tuning = tune(model, inputs, tuning_loss(recipe), 8, 0.1, "latents")
+    assert len(calls) == 1
+    assert tuning.losses[-1] < 0.99 * tuning.losses[0]
+    assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
+    untuned = model(inputs).gaussians.means
+    assert not torch.equal(tuning.prediction.gaussians.means, untuned)
+
+
+def test_latents_of_an_encoder_without_any_are_refused(tiny: Tiny) -> None:
+    with pytest.raises(RecipeError, match=r"(?s)`qgs/multiview_vit` .* no latents .*`queries`"):
+        tiny("tokengs", "evaluation.tuning=latents")
+    recipe = tiny("tokengs")
+    assert recipe.evaluation.rate == 1e-4
+    model, inputs = model_and_inputs(recipe)
+    with pytest.raises(ValueError, match="no latents to tune: the encoder, MultiViewViT"):
+        tune(model, inputs, tuning_loss(recipe), 1, what="latents")

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from published.files import read_golden
-from published.models import RECIPES
+from published.models import LAST_NORM, READ_NORM, RECIPES
 from published.recording import model_tensors
 from safetensors.torch import save_file
 from torch import Tensor
@@ -20,7 +20,12 @@ from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
 GOLDEN = Path(__file__).parent
-OF_KIND = {"tokengs": "tokengs_a", "locusgs": "locus_full_a"}
+OF_KIND = {
+    "tokengs": "tokengs_a",
+    "latent": "tokengs_latent_a",
+    "multiscale": "tokengs_multiscale_a",
+    "locusgs": "locus_full_a",
+}
 
 
 @dataclass(frozen=True)
@@ -52,13 +57,18 @@ def write(path: Path, config: dict[str, Any], sizes: Sizes) -> Path:
         torch.manual_seed(0)
         model = perturbed(recipe.build_model().eval(), sizes.saturation)
         views = random_views(sizes, config["options"]["img_size"])
+        tuned = torch.randn_like(model.encoder(views).features) if model.encoder.tunable else None
     weights = {name: tensor.clone() for name, tensor in unique_tensors(model).items()}
     published = exact_names_of(recipe).to_published(weights)
-    computed = model_tensors(model.double(), views.to(torch.float64))
+    if not config["options"].get("use_multiscale_encoder"):
+        published = {name.replace(READ_NORM, LAST_NORM): x for name, x in published.items()}
+    exact = None if tuned is None else tuned.double()
+    computed = model_tensors(model.double(), views.to(torch.float64), exact)
     tensors = {f"weights.{name}": tensor for name, tensor in published.items()}
     tensors |= {name: tensor.float() for name, tensor in computed.items()}
     tensors |= {"rgb": views.images, "c2w": views.cameras.c2w}
     tensors["intrinsics"] = views.cameras.intrinsics
+    tensors |= {} if tuned is None else {"tuned_latents": tuned}
     outputs = sorted(set(computed) - {"images", "rays_o", "rays_d", "plucker"})
     save(path, tensors, config | {"outputs": outputs})
     return path

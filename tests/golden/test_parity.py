@@ -46,6 +46,29 @@ def test_tokengs_of_another_size(tmp_path: Path, sizes: tuple[int, int], saturat
     assert problems(write(tmp_path / "file", config, Sizes(*sizes, saturation))) == {}
 
 
+LATENT = {"num_latents": 9, "latent_cross_attn_depth": 3}
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        ("multiscale", {"enc_depth": 3, "multiscale_encoder_layers": [2]}),
+        ("multiscale", {"enc_depth": 5, "multiscale_encoder_layers": [4, 0, 3]}),
+        ("latent", {"enc_depth": 4, "multiscale_encoder_layers": [0, 1, 3], **LATENT}),
+        ("latent", {"enc_depth": 2, "use_multiscale_encoder": False, **LATENT}),
+    ],
+)
+@pytest.mark.parametrize("sizes", [(1, 1), (2, 3)], ids=str)
+def test_tokengs_of_2026_6_of_another_size(
+    tmp_path: Path, kind: str, changes: dict[str, Any], sizes: tuple[int, int]
+) -> None:
+    config = metadata(kind, **{**BIGGER, "dec_depth": 1, **changes}, dec_patch_size=3)
+    path = write(tmp_path / "file", config, Sizes(*sizes))
+    names = {row.name for row in parity.rows_of(path)}
+    assert ("gaussians_of_tuned_latents" in names) == (kind == "latent")
+    assert problems(path) == {}
+
+
 @pytest.mark.parametrize("saturation", [1.0, 4.0])
 @pytest.mark.parametrize("layers", [[4], [1, 3, 4], [1, 2, 3, 4]], ids=str)
 def test_locusgs_of_another_size(tmp_path: Path, layers: list[int], saturation: float) -> None:
@@ -68,7 +91,7 @@ def test_combinations_of_variants(
     assert problems(write(tmp_path / "file", config, Sizes())) == {}
 
 
-@pytest.mark.parametrize("source", ["locus_full_a", "tokengs_a", "loss_a"])
+@pytest.mark.parametrize("source", ["locus_full_a", "tokengs_a", "tokengs_latent_a", "loss_a"])
 def test_each_altered_tensor_fails_by_name(tmp_path: Path, source: str) -> None:
     golden = read_golden(GOLDEN / f"{source}.safetensors")
     names = [row.name for row in parity.rows_of(GOLDEN / f"{source}.safetensors")]

@@ -56,12 +56,23 @@ LOCUSGS = [
     ({"gaussian_center_variant": "anchor_offset"}, {"centers.type": "locus/anchor_offset"}),
     ({"gaussian_center_variant": "free_center"}, {"centers.type": "qgs/free"}),
 ]  # fmt: skip
+MULTISCALE = [
+    ({"enc_depth": 4, "multiscale_encoder_layers": [3, 1]}, {"encoder.blocks": [2, 4]}),
+    ({"use_multiscale_encoder": False}, {"encoder.type": "qgs/multiview_vit"}),
+]
+LATENT = [
+    ({"num_latents": 5}, {"encoder.latents": 5}),
+    ({"latent_cross_attn_depth": 5}, {"encoder.latent_depth": 5}),
+    ({"use_multiscale_encoder": False}, {"encoder.blocks": [4]}),
+    ({"use_latent_bottleneck": False}, {"encoder.type": "qgs/multiscale_vit"}),
+]
 CASES = [("tokengs", *case) for case in TOKENGS] + [("locusgs", *case) for case in LOCUSGS]
+CASES += [("multiscale", *case) for case in MULTISCALE] + [("latent", *case) for case in LATENT]
 
 
 @pytest.mark.parametrize(("kind", "options", "says"), CASES, ids=str)
 def test_an_option_says(kind: str, options: dict[str, Any], says: dict[str, Any]) -> None:
-    read = {"tokengs": tokengs_recipe, "locusgs": locusgs_recipe}[kind]
+    read = locusgs_recipe if kind == "locusgs" else tokengs_recipe
     unchanged = metadata(kind)["options"]
     recipe = flat(resolve(read(unchanged | options)).tree["model"])
     assert {path: recipe[path] for path in says} == says

@@ -23,7 +23,8 @@ DIFFERENCES, _, RELEASES = REST.partition("## Defaults that are not TokenGS's")
 ROWS = """
 Rays and frames (both papers): Plücker ray of a pixel | ray of a patch | as used for distances |
     world frame | scale of the world | scale of the world, automatic | mirroring
-Encoder (TokenGS): images | tokens | block | keys and values
+Encoder (TokenGS): images | tokens | block | keys and values |
+    several blocks | latents
 Decoder layer (TokenGS): queries | cross-attention | self-attention | MLP | residual
 Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-attention |
     self-attention | PE | refinement | means | means, ablation
@@ -31,8 +32,8 @@ Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in fe
     refinement | means | Gaussians in the anchor's frame
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation
     | colour along a direction d | rendering
-Objective (both papers): photometric | visibility | visibility of anchors | over layers |
-    weight decay | schedule | token tuning | refinement |
+Objective (both papers): photometric | L1, LPIPS | visibility | visibility of anchors |
+    over layers | weight decay | schedule | token tuning | refinement |
     depth of a pixel | splitting a Gaussian | growing queries
 Evaluation: PSNR | SSIM | LPIPS | token dispersion
 """

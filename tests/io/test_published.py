@@ -9,8 +9,8 @@ from golden_weights import published
 
 from qgs.components import TOKENGS
 from qgs.composer import Recipe, resolve
-from qgs.io.differences import shapes_of
-from qgs.io.published import PublishedError, exact_names_of, names_of
+from qgs.io.differences import options_beside_weights, shapes_of
+from qgs.io.published import PublishedError, exact_names_of, fitting_recipe, names_of
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "model.decoder.depth=2")
@@ -34,13 +34,56 @@ def small(tree: dict[str, Any], *overrides: str) -> Recipe:
     return resolve(tree, [*SMALL, "model.supervision.layers=[2]", *overrides])
 
 
-def test_names_survive_both_ways() -> None:
-    weights = published("tokengs_a")
+@pytest.mark.parametrize("file", ["tokengs_a", "tokengs_latent_a", "tokengs_multiscale_a"])
+def test_names_survive_both_ways(file: str) -> None:
+    weights = published(file)
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
     ours = names_of(recipe).from_published(weights)
     back = exact_names_of(recipe).to_published(ours)
     assert back.keys() == weights.keys()
     assert all(back[name] is weights[name] for name in weights)
+
+
+LATENT_PRESETS = [f"{views}views_{loss}" for views in (2, 4, 6) for loss in ("ssim", "lpips")]
+
+
+@pytest.mark.parametrize("preset", LATENT_PRESETS)
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {},
+        {"width": 48, "heads": 3, "queries.count": 5, "encoder.latents": 7, "encoder.depth": 6,
+         "encoder.blocks": [2, 4, 6], "encoder.latent_depth": 2, "encoder.patch_size": 4},
+    ],
+    ids=["published", "reduced"],
+)  # fmt: skip
+def test_a_latent_checkpoint_gives_the_recipe_of_its_preset(
+    preset: str, sizes: dict[str, Any]
+) -> None:
+    overrides = [f"model.{option}={value}" for option, value in sizes.items()]
+    recipe = resolve(RECIPES / f"tokengs/latent_{preset}.yaml", overrides)
+    names = exact_names_of(recipe)
+    theirs = names.published_shapes()
+    assert theirs["enc_dec_backbone.latents"] == (
+        sizes.get("encoder.latents", 4096),
+        names.shapes["queries.features"][1],
+    )
+    layout, tree = fitting_recipe(theirs, "file")
+    assert layout is TOKENGS
+    read = resolve(tree)
+    assert (
+        options_beside_weights({"model": recipe.tree["model"]}, {"model": read.tree["model"]}) == {}
+    )
+    assert read.views.frame == recipe.views.frame == "mean_cam"
+    assert read.views.scale_factor == recipe.views.scale_factor
+    assert read.evaluation.tuning == "latents"
+
+
+def test_a_readout_of_more_blocks_than_there_are_fits_no_recipe() -> None:
+    shapes = shapes_of(published("tokengs_latent_a"))
+    shapes |= {f"enc_dec_backbone.multiscale_norms.{n}.weight": (32,) for n in range(2, 5)}
+    with pytest.raises(PublishedError, match="5 norms, one for each block read, of 4 blocks"):
+        fitting_recipe(shapes, "file")
 
 
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("ablations/*.yaml")), ids=lambda p: p.stem)

@@ -52,6 +52,13 @@ def test_a_term_of_weight_zero_is_left_out(golden: dict[str, Tensor]) -> None:
     assert set(terms_of(rgb, truth, mse_weight=0.0)) == {"ssim"}
 
 
+def test_l1_is_the_mean_absolute_error(golden: dict[str, Tensor]) -> None:
+    rgb, truth = golden["images_pred"], golden["images_gt"]
+    terms = terms_of(rgb, truth, mse_weight=0.0, l1_weight=0.8)
+    assert set(terms) == {"l1", "ssim"}
+    torch.testing.assert_close(terms["l1"], 0.8 * (rgb - truth).abs().mean())
+
+
 def test_images_smaller_than_a_valid_window_are_refused() -> None:
     images = torch.rand(1, 1, 3, 10, 16)
     with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 16"):

@@ -1,15 +1,21 @@
 """LPIPS: the published arithmetic, and why it may be unavailable."""
 
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
+from qgs_plugintools import Case
+from qgs_plugintools.inputs import Sizes, inputs_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from qgs.contracts import MissingExtraError
+from qgs.losses import LpipsLoss
 from qgs.metrics.lpips import Lpips
 
 CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0)
@@ -124,7 +130,7 @@ def test_images_are_clipped_and_small_ones_refused(vgg: Path) -> None:
 
 
 def test_without_the_package_the_reason_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("qgs.metrics.lpips.find_spec", lambda name: None)
+    monkeypatch.setattr("qgs.perceptual.find_spec", lambda name: None)
     reason = 'not installed: pip install "query-gaussians[lpips]"'
     assert lpips_of().unavailable.endswith(reason)
 
@@ -143,3 +149,30 @@ def test_other_weights_are_told(tmp_path: Path) -> None:
     save_file({"conv1.weight": torch.zeros(1)}, tmp_path / "resnet.safetensors")
     found = lpips_of(tmp_path / "resnet.safetensors").unavailable
     assert found.startswith("resnet.safetensors or vgg.pth does not")
+
+
+def loss_and_inputs(weights: object) -> tuple[LpipsLoss, dict[str, Any]]:
+    case = Case(LpipsLoss.Config(weight=0.5, weights=str(weights)))
+    return case.build(), inputs_of(case, Sizes(image=(24, 32)))
+
+
+@pytest.mark.usefixtures("package")
+def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg: Path) -> None:
+    loss, given = loss_and_inputs(vgg)
+    prediction, rendering, target = given.values()
+    value = loss(prediction, rendering, target)["lpips"]
+    expected = lpips_of(vgg).distance(rendering.rgb, target.images).mean() / 2
+    torch.testing.assert_close(value, expected)
+    rgb = rendering.rgb.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(
+        loss(prediction, replace(rendering, rgb=rgb), target)["lpips"], rgb
+    )
+    step = rendering.rgb - 0.01 * gradient / gradient.abs().max()
+    assert loss(prediction, replace(rendering, rgb=step), target)["lpips"] < value
+    assert not any(parameter.requires_grad for parameter in loss.parameters())
+
+
+def test_a_loss_without_its_weights_says_what_to_download() -> None:
+    loss, given = loss_and_inputs("mine.pth")
+    with pytest.raises(MissingExtraError, match=r"(?s)the loss qgs/lpips cannot .*lpips"):
+        loss(*given.values())

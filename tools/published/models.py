@@ -19,6 +19,8 @@ RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "locusgs": locusgs_recipe,
 }
 
+TUNED = "tuned_latents"
+LAST_NORM, READ_NORM = "enc_dec_backbone.encoder_norm.", "enc_dec_backbone.multiscale_norms.0."
 DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
@@ -30,9 +32,13 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()
-    model.load_state_dict(names_of(recipe).from_published(golden.weights()), strict=True)
+    weights = golden.weights()
+    if model.encoder.tunable:  # latents that read the last block alone call its norm otherwise
+        weights = {name.replace(LAST_NORM, READ_NORM): x for name, x in weights.items()}
+    model.load_state_dict(names_of(recipe).from_published(weights), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
-    return model_tensors(model, Views(golden.input("rgb"), cameras))
+    tuned = golden.input(TUNED) if TUNED in golden.tensors else None
+    return model_tensors(model, Views(golden.input("rgb"), cameras), tuned)
 
 
 def recipe_of(golden: GoldenFile) -> dict[str, Any]:

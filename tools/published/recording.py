@@ -15,16 +15,21 @@ from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from torch import Tensor, nn
 
-from qgs.components import CrossSelfMlp, MultiViewViT
-from qgs.components.encoder import imagenet_normalised
+from qgs.components import CrossSelfMlp, LatentBottleneck
+from qgs.components.encoder import PatchViT, imagenet_normalised
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, Views
 
 
 @torch.no_grad()
-def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
-    """Run `model` and return every tensor that a file can hold."""
+def model_tensors(
+    model: QueryGaussianModel, views: Views, tuned_latents: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Run `model` and return every tensor that a file can hold.
+
+    tuned_latents: (B, L, D), to decode in place of those that the photos give.
+    """
     origins, directions = camera_rays(views.cameras)
     found = {
         "images": imagenet_normalised(views.images),
@@ -39,6 +44,10 @@ def model_tensors(model: QueryGaussianModel, views: Views) -> dict[str, Tensor]:
     found["gaussians"] = _packed(prediction.gaussians)
     for number, layer in prediction.layers.items():
         found[f"gaussians_layer.{number}"] = _packed(layer.gaussians)
+    if tuned_latents is not None:
+        state, memory = model.queries(len(tuned_latents)), model.encoder(views)
+        tuned = model.predict(model.encoder.project(tuned_latents, memory), state)
+        found["gaussians_of_tuned_latents"] = _packed(tuned.gaussians)
     return found
 
 
@@ -56,9 +65,20 @@ class _Recorder:
 
     def handles(self) -> Iterator[Any]:
         encoder = self.model.encoder
-        assert isinstance(encoder, MultiViewViT)
-        first = encoder.blocks[0] if len(encoder.blocks) else encoder.norm
+        assert isinstance(encoder, PatchViT)
+        first = encoder.blocks[0] if len(encoder.blocks) else encoder.get_submodule("norm")
         yield first.register_forward_pre_hook(self._encoder_input)
+        if isinstance(encoder, LatentBottleneck):
+            yield encoder.feature_kv_proj.register_forward_pre_hook(self._read_features)
+            for index, block in enumerate(encoder.latent_blocks):
+                yield block.register_forward_pre_hook(partial(self._latents_before, index))
+                for part, name in (("cross_attention", "cross"), ("self_attention", "self")):
+                    key = f"latent_{name}_attn_out.{index}"
+                    hook = partial(self._output, key)
+                    yield block.get_submodule(part).register_forward_hook(hook)
+                yield block.register_forward_hook(
+                    partial(self._output, f"scene_latents.{index + 1}")
+                )
         yield encoder.register_forward_hook(self._memory)
         for index, layer in enumerate(self.model.decoder):
             assert isinstance(layer, CrossSelfMlp)
@@ -75,9 +95,19 @@ class _Recorder:
         self.found["encoder_in"] = args[0]
 
     def _memory(self, module: nn.Module, args: Any, memory: ImageMemory) -> None:
-        self.found["encoder_features"] = memory.features
-        self.found |= {name: memory[name] for name in ("keys", "values")}
-        self.found["plucker_patch"] = memory["patch_rays"]
+        self.found["keys"], self.found["values"] = memory["keys"], memory["values"]
+        if memory.patch_rays is not None:  # then its features are those of image tokens
+            self.found["encoder_features"] = memory.features
+            self.found["plucker_patch"] = memory.patch_rays
+
+    def _read_features(self, module: nn.Module, args: tuple[Tensor]) -> None:
+        self.found["encoder_features"] = args[0]
+
+    def _latents_before(self, index: int, module: nn.Module, args: tuple[Tensor, ...]) -> None:
+        self.found.setdefault(f"scene_latents.{index}", args[0])
+
+    def _output(self, name: str, module: nn.Module, args: Any, output: Tensor) -> None:
+        self.found[name] = output
 
     def _entering(
         self, index: int, module: nn.Module, args: tuple[QueryState, ImageMemory]

@@ -5,13 +5,13 @@ from typing import Any
 
 from published.options import ReleasedOptions
 
-UNSUPPORTED_BUT = {
-    "num_dynamic_gs_tokens": 0,
-    "time_embedding": False,
-    "use_multiscale_encoder": False,
-    "use_latent_bottleneck": False,
-}
-"""Parts of the release that its published models do not use."""
+UNSUPPORTED_BUT = {"num_dynamic_gs_tokens": 0, "time_embedding": False}
+"""Parts of the release that no recipe can express."""
+
+FRAMES = ("first_cam", "mean_cam")
+
+OF_2026_6 = {"use_multiscale_encoder": False, "use_latent_bottleneck": False}
+"""Encoders that LocusGS's release does not have."""
 
 
 def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -21,6 +21,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     released = ReleasedOptions(options)
     model = backbone(released)
+    model["encoder"] |= encoder_options(released)
     model["head"] |= {
         "gaussians_per_query": released.count("dec_patch_size") ** 2,
         "opacity_bias": -released.number("opacity_bias"),
@@ -35,7 +36,8 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
         "output_limit": None,
     }
     model["supervision"] = {"layers": [released.count("dec_depth")]}
-    return {"recipe": 1, "model": model}
+    frame = released.meaning("camera_normalization_method", {name: name for name in FRAMES})
+    return {"recipe": 1, "model": model, "views": {"frame": frame}}
 
 
 def backbone(options: ReleasedOptions) -> dict[str, Any]:
@@ -53,6 +55,25 @@ def backbone(options: ReleasedOptions) -> dict[str, Any]:
         "decoder": {"depth": options.count("dec_depth")},
         "head": {"scale_cap": options.number("gaussian_scale_cap")},
     }
+
+
+def encoder_options(options: ReleasedOptions) -> dict[str, Any]:
+    """Which encoder it is, and the options that only the encoders of TokenGS 2026.6 have."""
+    flags = [name in options and options.flag(name) for name in OF_2026_6]
+    if not any(flags):
+        return {"type": "qgs/multiview_vit"}
+    multiscale, latent = flags
+    depth = options.count("enc_depth")
+    # The release numbers blocks from 0; without the readout it reads the last one.
+    read = sorted(set(options.counts("multiscale_encoder_layers"))) if multiscale else [depth - 1]
+    found: dict[str, Any] = {"type": "qgs/multiscale_vit", "blocks": [n + 1 for n in read]}
+    if latent:
+        found |= {
+            "type": "qgs/latent_bottleneck",
+            "latents": options.count("num_latents"),
+            "latent_depth": options.count("latent_cross_attn_depth"),
+        }
+    return found
 
 
 def query_options(options: ReleasedOptions) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.contracts import FieldSpec, Loss, Renderer
+from qgs.contracts import FieldSpec, Loss, ModelDims, Renderer
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import (
     SH_COUNTS,
@@ -116,9 +116,7 @@ class Maker:
 
     def field(self, name: str, spec: FieldSpec) -> Tensor:
         """A state field; points of the world frame stand in front of the cameras."""
-        dims = self.case.dims
-        named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
-        shape = [size if isinstance(size, int) else named.get(size, 4) for size in spec.shape]
+        shape = sizes_of(spec, self.case.dims)
         values = self.normal(self.sizes.batch, self.sizes.queries, *shape)
         if is_place(spec):
             values = 0.4 * values + torch.tensor([0.0, 0.0, 1.5]).to(values)
@@ -212,6 +210,21 @@ class Maker:
         views = self.views()
         masks = self.uniform(0, 1, *views.images.shape[:2], 1, *self.image).round()
         return Views(views.images, views.cameras, masks)
+
+
+def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
+    """The trailing shape of a field in a model of `dims`; 4 for a size of another name.
+
+    "4*D" is four times the width.
+    """
+    named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
+
+    def size(of: int | str) -> int:
+        factor, times, name = str(of).rpartition("*")
+        count = int(factor) if times and factor.isdigit() else 1
+        return of if isinstance(of, int) else count * named.get(name, 4)
+
+    return [size(of) for of in spec.shape]
 
 
 def is_place(spec: FieldSpec) -> bool:

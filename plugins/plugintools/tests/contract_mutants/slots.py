@@ -10,6 +10,7 @@ from qgs.components import (
     ContentCrossAttention,
     ContentSelfAttention,
     GaussianHead,
+    LatentBottleneck,
     LatentQueries,
     LayerSupervision,
     MultiViewViT,
@@ -229,6 +230,31 @@ class FlipsTallImages(ChangedEncoder):
 class IgnoresImages(ChangedEncoder):
     def given(self, views):
         return replace(views, images=0 * views.images)
+
+
+LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
+
+
+@mutant("project_makes_the_memory_again", "made anew from its own", options=LATENTS)
+class ProjectsDoubles(LatentBottleneck):
+    def project(self, features, memory):
+        return super().project(2 * features, memory)
+
+
+@mutant("project_makes_the_memory_again", "make the same memory", options=LATENTS)
+class ProjectsNothing(LatentBottleneck):
+    def project(self, features, memory):
+        return memory
+
+
+@mutant("project_makes_the_memory_again", "does not declare `tunable`", options=LATENTS)
+class ProjectsInSecret(LatentBottleneck):
+    tunable = False
+
+
+@mutant("project_makes_the_memory_again", "`project` is not implemented")
+class PromisesToProject(ChangedEncoder):
+    tunable = True
 
 
 @mutant("memo_is_of_the_memory_alone", "depends on a weight")

@@ -77,8 +77,20 @@ class Look:
         return SpatialSupport(place.points(found.centers), place.vectors(found.axes))
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
-        """What a query reads in a layer, (1, h, 1, M); None if it tells nothing, or in layer 0."""
+        """What a query reads in a layer, (1, h, 1, M), patches of `grid`.
+
+        None if it tells nothing, in layer 0, and where what is read are no patches of photos.
+        """
+        if self.inside is None or self.inside.memory.grid is None:
+            return None
         return self._told("cross_attention", query, layer)
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """(V, H/P, W/P) of the patches that `attention` is of."""
+        assert self.inside is not None
+        assert self.inside.memory.grid is not None
+        return self.inside.memory.grid
 
     def self_attention(self, query: int, layer: int) -> AttentionWeights | None:
         """The queries that a query reads in a layer, (1, h, 1, N); None as for `attention`."""
@@ -118,10 +130,9 @@ class Look:
         Mean over heads. None where attention tells nothing, or tokens are no patches.
         """
         weights = self.attention(query, layer)
-        grid = self.inside.memory.grid if self.inside else None
-        if weights is None or self.views is None or grid is None:
+        if weights is None or self.views is None:
             return None
-        cameras = self.views.cameras[0]
+        grid, cameras = self.grid, self.views.cameras[0]
         pixels = patch_centers(grid, cameras.size)
         points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
         shares = weights.weights[0, :, 0].float().mean(0).cpu()

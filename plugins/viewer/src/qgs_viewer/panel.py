@@ -226,5 +226,7 @@ def told(look: Look, query: int, layer: int) -> str:
             moved = (found.centers[0, query] - before.centers[0, query]).norm()
             lines.append(f"moved by {float(moved):.3f} in this layer")
     if layer and look.attention(query, layer) is None:
-        lines.append("this component does not report its attention")
+        patches = look.inside is None or look.inside.memory.grid is not None
+        silent = "this component does not report its attention"
+        lines.append(silent if patches else "it reads latents, not patches of the photos")
     return "\n\n".join(lines)

@@ -18,13 +18,12 @@ def attention_parts(look: Look, query: int, layer: int) -> dict[str, Picture]:
     All input photos in one picture, COLUMNS in a row; means over heads.
     """
     weights = look.attention(query, layer)
-    grid = look.inside.memory.grid if look.inside else None
-    if weights is None or look.views is None or grid is None:
+    if weights is None or look.views is None:
         return {}
     photos = [enlarged(rgb_picture(image), SIDE) for image in look.views.images[0]]
     parts = (weights.content, weights.geometry, weights.weights)
     return {
-        name: _sheet(attention_pictures(photos, patch_maps(part[0, :, 0], grid)))
+        name: _sheet(attention_pictures(photos, patch_maps(part[0, :, 0], look.grid)))
         for name, part in zip(PARTS, parts, strict=True)
         if part is not None
     }

@@ -11,7 +11,7 @@ from qgs.composer.flow import fits
 from qgs.composer.registry import file_of
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering, map_tensors
 from qgs_plugintools.case import Case, ContractError, expect
-from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, tracked_inputs
+from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, sizes_of, tracked_inputs
 from qgs_plugintools.modules import each_mode, seeded
 from qgs_plugintools.registry import ALL_SLOTS, MODULES, PARAMETRIC, check
 from qgs_plugintools.running import with_place
@@ -109,16 +109,13 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
     batch, count = sizes.batch, sizes.queries
     match case.slot:
         case "encoder":
-            head: Shape = (batch, heads, None)
-            named: dict[Any, Any] = {"D": width, "D/h": width // heads}
-            provided = case.component.provides(case.config).items()
-            lead = {"memory.keys": head, "memory.values": head}
+            of_heads = ("memory.keys", "memory.values")
             return {
                 name.removeprefix("memory."): (
-                    *lead.get(name, (batch, None)),
-                    *(named.get(size, size) for size in spec.shape),
+                    *((batch, heads, None) if name in of_heads else (batch, None)),
+                    *sizes_of(spec, case.dims),
                 )
-                for name, spec in provided
+                for name, spec in case.component.provides(case.config).items()
             }
         case "queries" | "refinement" | "layer":
             count = module.count if case.slot == "queries" else count

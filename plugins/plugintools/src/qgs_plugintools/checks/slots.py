@@ -311,13 +311,16 @@ class _Optimization:
 
 @check({"encoder"})
 def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
-    """`grid` counts the patches of each view, `patch_rays` are their mean rays, in its order."""
+    """`grid` counts the patches of each view, `patch_rays` are their mean rays, in its order.
+
+    A memory without rays may have no grid.
+    """
     module = case.lively()
     for where, views in _wide_and_tall(case):
         memory = module(views)
-        patch = _patch_size(where, views, memory)
         if memory.patch_rays is None:
             raise CannotCheck("it gives no patch rays")
+        patch = _patch_size(where, views, memory)
         rays = patch_rays(plucker_rays(views.cameras), patch)
         found = difference({"patch_rays": memory.patch_rays}, {"patch_rays": rays}, 1e-4, 1e-5)
         expect(not found, f"{where}, against the mean rays of patches of {patch} pixels, {found}")
@@ -325,7 +328,7 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
 
 @check({"encoder"})
 def check_tokens_are_those_of_the_grid(case: Case) -> None:
-    """What one patch shows changes its own token most: that of its place in `grid`.
+    """What one patch shows changes its own token most: that of its place in `grid`, if any.
 
     True of most of the patches, since a token may see far beyond its own. Keys may be those of the
     rays alone.
@@ -334,6 +337,8 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
     for where, views in _wide_and_tall(case):
         views = map_tensors(lambda x: x[:1], views)
         memory = module(views)
+        if memory.grid is None:
+            continue
         patch, grid = _patch_size(where, views, memory), memory.grid
         tokens = torch.randperm(math.prod(grid), generator=torch.Generator().manual_seed(0))
         places = _places(tokens[:12], grid)
@@ -354,6 +359,26 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
                 f"{where}, a change at view, row, column {one} changes most the token of "
                 f"`{name}` at {other}, and so do {len(astray)} of {len(places)}",
             )
+
+
+@check({"encoder"})
+def check_project_makes_the_memory_again(case: Case) -> None:
+    """Of its own features, a `tunable` encoder makes the memory that they came with.
+
+    Of others it makes another one. An encoder that is not tunable refuses.
+    """
+    module = case.lively()
+    memory = module(inputs_of(case)["views"])
+    try:
+        again = module.project(memory.features, memory)
+        other = module.project(memory.features.roll(1, 1), memory)
+    except NotImplementedError:
+        expect(not module.tunable, "it is declared `tunable`, but `project` is not implemented")
+        return
+    expect(module.tunable, "it has `project`, but does not declare `tunable`")
+    found = difference(memory, again)
+    expect(not found, f"made anew from its own features, {found}")
+    expect(bool(difference(memory, other)), "other features make the same memory")
 
 
 def _wide_and_tall(case: Case) -> Iterator[tuple[str, Views]]:

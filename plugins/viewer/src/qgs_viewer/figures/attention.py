@@ -109,8 +109,7 @@ def _row(axes: Sequence[Axes], shown: Exhibit, query: int, layer: int, views: in
 def part_maps(shown: Exhibit, weights: AttentionWeights | None, part: str) -> np.ndarray | None:
     """Mean over heads of one of PARTS for each view (V, H/P, W/P); None where there is none."""
     values: Tensor | None = getattr(weights, part) if weights is not None else None
-    grid = shown.look.inside.memory.grid if shown.look.inside else None
-    return None if values is None or grid is None else patch_maps(values[0, :, 0], grid)
+    return None if values is None else patch_maps(values[0, :, 0], shown.look.grid)
 
 
 def _anchor(axis: Axes, shown: Exhibit, query: int, layer: int, view: int, width: int) -> None:
