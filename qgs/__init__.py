@@ -32,7 +32,8 @@ __version__ = "0.1.0"
 DISTRIBUTIONS = {
     "qgs.plugins": {name: f"query-gaussians-{name}" for name in ("locus", "ellipsoid", "rooms")},
     "qgs.commands": {"data": "query-gaussians-datatools"}
-    | dict.fromkeys(("view", "figures"), "query-gaussians-viewer"),
+    | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
+    | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
 }
 """This repository's other distributions, by entry point; messages name those that are missing."""
 

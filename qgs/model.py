@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from qgs.components.blocks import LayerScale
 from qgs.contracts import (
     Centers,
-    CrossAttention,
+    DecoderLayer,
     Encoder,
-    FeedForward,
     Head,
     Queries,
     Refinement,
     Renderer,
-    SelfAttention,
     Supervision,
 )
 from qgs.data.domain import Domain, warn_of_unlike
@@ -31,38 +28,11 @@ from qgs.types import (
     QueryState,
     Rendering,
     Views,
+    map_tensors,
 )
 
 if TYPE_CHECKING:
     from qgs import Reconstruction
-
-
-class DecoderLayer(nn.Module):
-    """Cross-attention, self-attention, MLP; each update is scaled and added (TokenGS release)."""
-
-    def __init__(
-        self,
-        cross_attention: CrossAttention,
-        self_attention: SelfAttention,
-        feed_forward: FeedForward,
-        layer_scale: float,
-    ) -> None:
-        super().__init__()
-        width = cross_attention.dims.width
-        self.cross_attention = cross_attention
-        self.cross_scale = LayerScale(width, layer_scale)
-        self.self_attention = self_attention
-        self.self_scale = LayerScale(width, layer_scale)
-        self.feed_forward = feed_forward
-        self.feed_forward_scale = LayerScale(width, layer_scale)
-
-    def forward(self, state: QueryState, memory: ImageMemory) -> QueryState:
-        """The state with updated features (B, N, D) and the same fields."""
-        x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
-        state = state.replace(x_BND)
-        x_BND = x_BND + self.self_scale(self.self_attention(state))
-        x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
-        return state.replace(x_BND)
 
 
 class QueryGaussianModel(nn.Module):
@@ -123,14 +93,15 @@ class QueryGaussianModel(nn.Module):
     ) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's world.
 
-        layers: see `predict`. state: the initial state; None for the learned queries.
+        layers: see `predict`. state: the initial state; None for that of the queries.
         In evaluation, a warning tells once what of `views` is not as it was in training.
         """
         if not (self.training or self._warned or torch.compiler.is_compiling()):
             settings = (self.recipe or {}).get("views")
             self._warned = warn_of_unlike(views, settings, self.trained_on)
-        initial = self.queries(views.images.shape[0]) if state is None else state
-        return self.predict(self.encoder(views), initial, layers)
+        memory = self.encoder(views)
+        initial = self.queries(memory, views) if state is None else state
+        return self.predict(memory, initial, layers)
 
     def reconstruct(
         self, photos: "str | os.PathLike[str] | Views", **options: Any
@@ -144,24 +115,29 @@ class QueryGaussianModel(nn.Module):
         """Run all decoder layers and decode Gaussians after the chosen ones.
 
         memory: the encoder's output. state: the queries before the first layer, of as many scenes.
-        layers: numbers of the layers to decode besides the last (1 is the first); None for the
-            supervised ones in training, and for the last alone in evaluation.
+        layers: numbers of the layers to decode besides the last (1 is the first; a decoder of
+            depth 0 has 0, the state before any layer); None for the supervised ones in training,
+            and for the last alone in evaluation.
         Raises ValueError for a layer that does not exist and for another number of scenes.
         """
         if layers is None:
             layers = self.supervision.weights().keys() if self.training else ()
-        unknown = sorted(n for n in layers if not 1 <= n <= self.depth)
+        known = range(min(1, self.depth), self.depth + 1)
+        unknown = sorted(n for n in layers if n not in known)
         if unknown:
             raise ValueError(
-                f"layers {unknown} do not exist; this model has layers 1..{self.depth}"
+                f"layers {unknown} do not exist; this model has layers {known[0]}..{self.depth}"
             )
         scenes, given = memory.features.shape[0], state.features.shape[0]
         if scenes != given:
             raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
         decoded: dict[int, LayerPrediction] = {}
+        if not self.depth:
+            decoded[0] = LayerPrediction(self.decode(state), state)
         for number, layer in enumerate(self.decoder, start=1):
             refine = self.refinements[self.refinement_of[number - 1]]
-            state = refine(layer(state, memory))
+            state, memory = layer(state, memory)
+            state = refine(state)
             if number in layers or number == self.depth:
                 decoded[number] = LayerPrediction(self.decode(state), state)
         return Prediction(decoded[self.depth].gaussians, state, decoded)
@@ -170,8 +146,12 @@ class QueryGaussianModel(nn.Module):
         """The Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
         means = self.centers(attributes.offsets, state)
-        others = (attributes.scales, attributes.quats, attributes.opacities, attributes.colors)
-        return Gaussians(*(x.flatten(1, 2) for x in (means, *others)))  # N, K -> G
+        flat = map_tensors(lambda x: x.flatten(1, 2), attributes)  # N, K -> G
+        opacities = flat.opacities
+        if state.mask is not None:
+            opacities = (attributes.opacities * state.mask[..., None]).flatten(1, 2)
+        look = flat.colors, flat.sh, flat.features
+        return Gaussians(means.flatten(1, 2), flat.scales, flat.quats, opacities, *look)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None

@@ -12,13 +12,15 @@ Containers are frozen. A component returns a new one and never writes into the o
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
-from typing import Any, Self, cast
+from typing import Any, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
+
+_C = TypeVar("_C", bound="TensorContainer")
 
 
 class TensorContainer:
@@ -58,6 +60,18 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(mapped)
     return getattr(value, "_make", type(value))([item for _, item in mapped])  # _make: namedtuple
+
+
+def concatenated(parts: Sequence[_C], dim: int) -> _C:
+    """One container with the tensors of all `parts` along `dim`.
+
+    Raises ValueError where one has a tensor that another one lacks.
+    """
+    found = [dict(named_tensors(part)) for part in parts]
+    if odd := sorted({name for other in found for name in other.keys() ^ found[0].keys()}):
+        raise ValueError(f"some of what is put together have {', '.join(odd)}, others have not")
+    joined = iter([torch.cat([x[name] for x in found], dim) for name in found[0]])
+    return map_tensors(lambda _: next(joined), parts[0])
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
@@ -243,13 +257,21 @@ class ImageMemory(TensorContainer):
 
 @dataclass(frozen=True)
 class QueryState(TensorContainer):
-    """The state of every query: features (B, N, D) and named fields (B, N, ...)."""
+    """The state of every query: features (B, N, D) and named fields (B, N, ...).
+
+    mask: (B, N) bool, False for places that hold no query where scenes of a batch have different
+        numbers of them; None where every place holds one. What stands there is finite, no other
+        query reads it, and its Gaussians have opacity 0.
+    """
 
     features: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+    mask: Tensor | None = None
 
     def __post_init__(self) -> None:
-        _check_shapes(self, features="B N D")
+        _check_shapes(self, features="B N D", mask="B N")
+        if self.mask is not None and self.mask.dtype != torch.bool:
+            raise ValueError(f"QueryState.mask must be bool, got {self.mask.dtype}")
         count = tuple(self.features.shape[:2])
         for name, tensor in self.fields.items():
             if tuple(tensor.shape[:2]) != count:
@@ -268,12 +290,26 @@ class QueryState(TensorContainer):
         self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
     ) -> "QueryState":
         """A new state with other features and with `fields` added or replaced."""
-        return QueryState(
-            self.features if features is None else features, {**self.fields, **(fields or {})}
-        )
+        features = self.features if features is None else features
+        return QueryState(features, {**self.fields, **(fields or {})}, self.mask)
 
 
 _OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "colors": "... 3"}
+_OF_GAUSSIANS |= {"sh": "... C 3", "features": "... F"}
+
+SH_COUNTS = (3, 8, 15)
+"""Coefficients of spherical harmonics of degrees 1 to 1, 2 and 3; `colors` is degree 0."""
+
+
+def _check_gaussians(container: TensorContainer, **shapes: str) -> None:
+    """Raise ValueError for a wrong shape of what both kinds of Gaussians have, or of `shapes`."""
+    _check_shapes(container, **shapes, **_OF_GAUSSIANS)
+    sh = getattr(container, "sh", None)
+    if sh is not None and sh.shape[-2] not in SH_COUNTS:
+        raise ValueError(
+            f"{type(container).__name__}.sh has {sh.shape[-2]} coefficients per Gaussian; give 3, "
+            "8 or 15, those of degrees 1 to 3 (degree 0 is `colors`)"
+        )
 
 
 @dataclass(frozen=True)
@@ -282,7 +318,8 @@ class GaussianAttributes(TensorContainer):
 
     offsets: (B, N, K, 3) raw, before any activation: a `centers` component turns them into means.
     scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
-    opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1].
+    opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], beside `sh` of any value.
+    sh: (B, N, K, C, 3), features: (B, N, K, F), see `Gaussians`; None for none.
     """
 
     offsets: Tensor
@@ -290,9 +327,11 @@ class GaussianAttributes(TensorContainer):
     quats: Tensor
     opacities: Tensor
     colors: Tensor
+    sh: Tensor | None = None
+    features: Tensor | None = None
 
     def __post_init__(self) -> None:
-        _check_shapes(self, offsets="... 3", **_OF_GAUSSIANS)
+        _check_gaussians(self, offsets="... 3")
 
 
 @dataclass(frozen=True)
@@ -301,6 +340,10 @@ class Gaussians(TensorContainer):
 
     means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
     quats: (B, G, 4) unit, w x y z. opacities: (B, G). colors: (B, G, 3) RGB.
+    sh: (B, G, C, 3) coefficients of real spherical harmonics in the world frame, RGB, of degrees 1
+        to 1, 2 or 3 (C = 3, 8, 15) in the order of `qgs.geometry.harmonics`. Seen along the
+        direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0). None: `colors` from anywhere.
+    features: (B, G, F) whatever else is rendered, over 0; None for nothing.
     """
 
     means: Tensor
@@ -308,9 +351,11 @@ class Gaussians(TensorContainer):
     quats: Tensor
     opacities: Tensor
     colors: Tensor
+    sh: Tensor | None = None
+    features: Tensor | None = None
 
     def __post_init__(self) -> None:
-        _check_shapes(self, means="... 3", **_OF_GAUSSIANS)
+        _check_gaussians(self, means="... 3")
 
     @property
     def count(self) -> int:
@@ -323,12 +368,13 @@ class Gaussians(TensorContainer):
     def most_opaque(self, count: int) -> Self:
         """The `count` most opaque of each scene, all where there are fewer, in their order."""
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
-        parts = {name: getattr(self, name) for name in ("means", "scales", "quats", "colors")}
-        wide = {
-            k: x.gather(-2, chosen[..., None].expand(*chosen.shape, x.shape[-1]))
-            for k, x in parts.items()
-        }
-        return replace(self, opacities=self.opacities.gather(-1, chosen), **wide)
+
+        def kept(x: Tensor) -> Tensor:
+            rest = x.shape[chosen.ndim :]
+            index = chosen.reshape(*chosen.shape, *(1 for _ in rest)).expand(*chosen.shape, *rest)
+            return x.gather(chosen.ndim - 1, index)
+
+        return map_tensors(kept, self)
 
 
 @dataclass(frozen=True)
@@ -336,15 +382,18 @@ class Rendering(TensorContainer):
     """What cameras see: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
 
     `rgb` is over the background, `alpha` in [0, 1], `depth` the expected camera-frame z of what
-    was hit, sum(w z) / sum(w), 0 where nothing was.
+    was hit, sum(w z) / sum(w), 0 where nothing was. `features` (B, V, F, H, W) are sum(w f), over
+    0; None where the Gaussians have none.
     """
 
     rgb: Tensor
     alpha: Tensor
     depth: Tensor
+    features: Tensor | None = None
 
     def __post_init__(self) -> None:
-        _check_shapes(self, rgb="B V 3 H W", alpha="B V 1 H W", depth="B V 1 H W")
+        shapes = {"alpha": "B V 1 H W", "depth": "B V 1 H W", "features": "B V F H W"}
+        _check_shapes(self, rgb="B V 3 H W", **shapes)
 
 
 @dataclass(frozen=True)

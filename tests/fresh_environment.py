@@ -1,4 +1,4 @@
-"""A fresh virtual environment with qgs, LocusGS and the rooms from their wheels.
+"""A fresh virtual environment with qgs, LocusGS, rooms and tools for authors from their wheels.
 
 Installing torch again for every test would take minutes. All packages of the present environment
 but qgs and its plugins are lent through a folder of links, so that qgs can only come from its
@@ -48,10 +48,10 @@ class FreshEnvironment:
 
 
 def make_fresh_environment(folder: Path) -> FreshEnvironment:
-    """Build the wheels of qgs and two plugins and install them into a new environment."""
+    """Build the wheels of qgs and three plugins and install them into a new environment."""
     wheels = folder / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
-    plugins = (str(ROOT / "plugins" / name) for name in ("locus", "rooms"))
+    plugins = (str(ROOT / "plugins" / name) for name in ("locus", "rooms", "plugintools"))
     subprocess.run([*build, str(ROOT), *plugins], check=True)
     venv.create(folder / "venv", with_pip=True)
     environment = FreshEnvironment(folder / "venv")

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from qgs_plugintools.new_command import rendered
 
 import qgs
-from qgs.cli.new_plugin import rendered
 
 ROOT = Path(__file__).parents[1]
-PLUGINS = ("locus", "ellipsoid", "rooms", "datatools", "viewer")
+PLUGINS = ("locus", "ellipsoid", "rooms", "datatools", "viewer", "plugintools")
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "qgs": "query-gaussians",
@@ -47,7 +47,7 @@ AHEAD = {"a new plugin": {"pydantic"}}
 MADE_UP = {"placed-package"}
 """Packages that a test writes for itself."""
 
-FIRST_TO_BE_IMPORTED = ("qgs", "qgs.cli", "qgs.composer.registry", "qgs.engine", "qgs.testing")
+FIRST_TO_BE_IMPORTED = ("qgs", "qgs.cli", "qgs.composer.registry", "qgs.engine")
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def test_the_tests_of_a_new_plugin_require_what_they_import() -> None:
     tests = template("tests")
     used = {found for module in tests.files for found in tests.third_party(module)}
     assert used - tests.required - {"qgs-fresh"} <= tests.extras()
-    assert tests.extras() == {"pytest"}
+    assert tests.extras() == {"pytest", "query-gaussians-plugintools"}
 
 
 def test_the_tests_of_qgs_require_what_they_import() -> None:

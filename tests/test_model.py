@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from varying_head import FEATURES, HARMONICS, VaryingHead
 
 import qgs
 
@@ -36,6 +37,22 @@ def test_the_api_in_five_lines(name: str, tmp_path: Path) -> None:
     qgs.save(model, tmp_path / "model.safetensors")
     again = qgs.load(tmp_path / "model.safetensors").eval()
     assert torch.equal(again(views).gaussians.means, prediction.gaussians.means)
+
+
+def test_harmonics_and_features_of_a_head_come_through() -> None:
+    model, views = small("locus").eval(), photos()
+    plain = model(views)
+    model.head = VaryingHead(model.head).eval()
+    found = model(views)
+    assert found.gaussians.sh is not None
+    attributes = model.head(found.state)
+    assert torch.equal(found.gaussians.sh.unflatten(1, (12, 8)), attributes.sh)
+    assert torch.equal(found.gaussians.features.unflatten(1, (12, 8)), attributes.features)
+    assert found.gaussians.sh.shape == (2, 12 * 8, HARMONICS, 3)
+    assert torch.equal(found.gaussians.colors, plain.gaussians.colors)
+    rendering = model.render(found.gaussians, views.cameras)
+    assert rendering.features.shape == (2, 2, FEATURES, 16, 24)
+    assert not torch.equal(rendering.rgb, model.render(plain.gaussians, views.cameras).rgb)
 
 
 def test_layers_decoded_while_training_and_evaluating() -> None:

@@ -8,11 +8,13 @@ import torch
 from qgs.types import (
     Cameras,
     GaussianAttributes,
+    Gaussians,
     ImageMemory,
     QueryState,
     Rendering,
     SpatialSupport,
     Views,
+    concatenated,
     map_tensors,
     named_tensors,
 )
@@ -20,6 +22,9 @@ from qgs.types import (
 THREE, FOUR, ONE = torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 5, 4), torch.zeros(1, 2, 5)
 CAMERA = Cameras(torch.eye(4)[None, None], torch.ones(1, 1, 4), (8, 8))
 RGB, ALPHA = torch.zeros(1, 2, 3, 4, 5), torch.zeros(1, 2, 1, 4, 5)
+
+CUBES = [THREE, FOUR, ONE, THREE]
+BALLS = [x[:, 0] for x in (THREE, *CUBES)]
 
 
 @pytest.fixture
@@ -47,7 +52,12 @@ def zeros(*shape: int) -> torch.Tensor:
         (Views, [zeros(1, 1, 3, 8, 8).byte(), CAMERA], "divide 8-bit images by 255"),
         (GaussianAttributes, [THREE, THREE, THREE, ONE, THREE], r"GaussianAttributes\.quats"),
         (GaussianAttributes, [THREE, THREE, FOUR, ONE[..., None], THREE], r"utes\.opacities"),
+        (Gaussians, [*BALLS, zeros(1, 5, 3)], r"Gaussians\.sh .*\(1, 5, C, 3\), got"),
+        (Gaussians, [*BALLS, zeros(1, 5, 4, 3)], r"Gaussians\.sh has 4 coefficients.* 3, 8 or 15"),
+        (Gaussians, [*BALLS, zeros(1, 5, 3, 3), zeros(1, 4, 2)], r"Gaussians\.features .*got"),
+        (GaussianAttributes, [THREE, *CUBES, zeros(1, 2, 5, 16, 3)], r"utes\.sh has 16 coeff"),
         (Rendering, [RGB, ALPHA, ALPHA[..., :4]], r"Rendering\.depth"),
+        (Rendering, [RGB, ALPHA, ALPHA, RGB[:, :1]], r"Rendering\.features .*\(1, 2, F, 4, 5\)"),
         (Rendering, [RGB[0], ALPHA[0], ALPHA[0]], r"\.rgb .*add a leading dimension for a single"),
         (SpatialSupport, [zeros(1, 2, 3), zeros(1, 2, 3)], r"SpatialSupport\.axes"),
     ],
@@ -110,3 +120,33 @@ def test_every_nested_tensor_is_mapped_and_named() -> None:
 def test_named_tuples_stay_named_tuples() -> None:
     found = torch.tensor([3.0, 1.0]).sort()
     assert map_tensors(lambda x: x + 1, found).indices.tolist() == [2, 1]
+
+
+def rich_gaussians(count: int, seed: int = 0) -> Gaussians:
+    """Gaussians (2, count) with everything that they may have."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((3,), (3,), (4,), (), (3,), (8, 3), (2,))
+    return Gaussians(*(torch.rand(2, count, *shape, generator=generator) for shape in shapes))
+
+
+def test_the_most_opaque_keep_all_that_they_have() -> None:
+    gaussians = rich_gaussians(9)
+    kept = gaussians.most_opaque(4)
+    for scene in range(2):
+        index = gaussians.opacities[scene].topk(4).indices.sort().values
+        for (_, x), (name, all_of) in zip(
+            named_tensors(kept), named_tensors(gaussians), strict=True
+        ):
+            assert torch.equal(x[scene], all_of[scene, index]), name
+    assert kept[0].sh.shape == (4, 8, 3)
+    assert gaussians[:, :3].features.shape == (2, 3, 2)
+
+
+def test_containers_are_put_together_tensor_by_tensor() -> None:
+    one, other = rich_gaussians(3), rich_gaussians(4, seed=1)
+    both = concatenated([one, other], 1)
+    assert both.count == 7
+    assert torch.equal(both.sh[:, 3:], other.sh)
+    assert torch.equal(both.opacities[:, :3], one.opacities)
+    with pytest.raises(ValueError, match="put together have sh, others have not"):
+        concatenated([replace(one, sh=None), other], 1)

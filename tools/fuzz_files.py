@@ -24,6 +24,7 @@ from rich.console import Console
 
 import qgs
 from qgs.composer import Recipe, resolve
+from qgs.contracts import LearnedQueries
 from qgs.data.domain import Domain, verdict
 from qgs.engine.fit import OutOfMemoryError
 from qgs.engine.guard import TrainingError
@@ -222,8 +223,9 @@ def small(steps: int) -> Recipe:
 
 def use_checkpoint(checkpoint: Path) -> None:
     model = qgs.load(checkpoint)
+    assert isinstance(model.queries, LearnedQueries)
     with torch.no_grad():
-        gaussians = model.decode(model.queries(1))
+        gaussians = model.decode(model.queries.start(1))
     save_ply(gaussians, checkpoint.with_suffix(".ply"))
     load_step(checkpoint)
     verdict(load_domain(checkpoint), Domain())

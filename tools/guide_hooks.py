@@ -12,11 +12,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import qgs_plugintools
 from guide_reference import reference
+from qgs_plugintools import CHECKS
 
-import qgs.testing
 from qgs.composer.slots import SLOTS
-from qgs.testing import CHECKS
 
 PART = re.compile(r"^<!-- from the code: (.*) -->$", re.MULTILINE)
 
@@ -26,7 +26,7 @@ FIRST = ("Case", "parametrize_with_checks", "check_plugin")
 
 def filled(page: str) -> str:
     """`page` with the parts that are written from the code."""
-    parts = {"recipe reference": reference, "checks": check_list, "qgs.testing": testing_names}
+    parts = {"recipe reference": reference, "checks": check_list, "qgs_plugintools": testing_names}
     return PART.sub(lambda found: parts[found[1]](), page)
 
 
@@ -58,14 +58,14 @@ def _slots_in_words(slots: Collection[str]) -> str:
 
 
 def testing_names() -> str:
-    """A section for each public name of `qgs.testing`, for mkdocstrings to fill in."""
+    """A section for each public name of `qgs_plugintools`, for mkdocstrings to fill in."""
     options = (
         "{members: false, show_root_heading: true, show_root_toc_entry: true, heading_level: 2}"
     )
     parts: list[str] = []
-    for name in [*FIRST, *sorted(set(qgs.testing.__all__) - {*FIRST, "CHECKS"})]:
-        home = getattr(qgs.testing, name).__module__
-        if home.startswith("qgs.testing."):
+    for name in [*FIRST, *sorted(set(qgs_plugintools.__all__) - {*FIRST, "CHECKS"})]:
+        home = getattr(qgs_plugintools, name).__module__
+        if home.startswith("qgs_plugintools."):
             parts.append(f"::: {home}.{name}\n    options: {options}\n")
         else:
             parts.append(f"## {name}\n\n[`{home}.{name}`][{home}.{name}], among the contracts.\n")

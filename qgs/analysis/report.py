@@ -18,6 +18,7 @@ from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
 from qgs.drawing.images import (
     Picture,
     checked,
+    color_error,
     data_uri,
     depth_picture,
     depth_range,
@@ -82,14 +83,14 @@ class Report:
 
 
 GROUP = "qgs.report"
-"""Group of entry points NAME = "module:function", each a maker of a section, as `orbit` is."""
+"""Group of entry points NAME = "module:function": as `orbit`, or a generator of sections."""
 SIDE = 256  # pixels on the longer side of pictures that models render for show
 QUERIES = 5
 ANCHORS = 12
 ORBIT_FRAMES = 32
 TARGETS = 2  # target views of each scene that are shown
-Shown = Sequence[tuple[Contender, Prediction]]
-"""Every contender with what it predicts for the sample that most sections picture."""
+Shown = Sequence[tuple[Contender, Sequence[Prediction]]]
+"""Every contender with what it predicts for each of the report's samples."""
 
 
 @dataclass(frozen=True)
@@ -112,26 +113,31 @@ class Tile:
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A heading, a text, and figures by model, at least `width` CSS pixels wide."""
+    """A heading, a text, and tiles by model, `width` CSS pixels wide or more. Raises TypeError."""
 
     title: str
     text: str
     figures: Mapping[str, Sequence[Tile]]
     width: int = 300
 
+    def __post_init__(self) -> None:
+        tiles = [tile for tiles in self.figures.values() for tile in tiles]
+        if wrong := [type(tile).__name__ for tile in tiles if not isinstance(tile, Tile)]:
+            raise TypeError(f"it has {wrong[0]} among its figures, not a Tile")
+
 
 @torch.no_grad()
 def report_html(report: Report) -> str:
     """The whole page; it needs no other file and no network."""
-    first = report.samples[0]
-    shown = [(c, c.model(first.inputs)) for c in report.contenders]
+    samples = report.samples
+    shown = [(c, [c.model(sample.inputs) for sample in samples]) for c in report.contenders]
     # A new section of figures is a function that returns a ReportSection, and its name here.
     makers = (queries, anchors, attention, training_curves)
-    own = [make(shown, first) for make in makers]
-    sections = [orbit(shown, first), *offered_sections(shown, first), *own]
+    own = [make(shown, samples) for make in makers]
+    sections = [orbit(shown, samples), *offered_sections(shown, samples), *own]
     scenes = [
-        pictured_scene(report.contenders, sample, depth)
-        for sample, depth in zip(report.samples, report.depths, strict=True)
+        pictured_scene([(c, predictions[number]) for c, predictions in shown], sample, depth)
+        for number, (sample, depth) in enumerate(zip(samples, report.depths, strict=True))
     ]
     environment = page_environment(uri=data_uri, hex=hex_color)
     template = environment.get_template("report.html")
@@ -139,24 +145,21 @@ def report_html(report: Report) -> str:
     return template.render(report=report, scenes=scenes, sections=sections)
 
 
-def offered_sections(shown: Shown, sample: Sample) -> Iterator[ReportSection]:
+def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[ReportSection]:
     """Sections of installed distributions, in order of their names; what fails is said and left."""
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
-            section = entry.load()(shown, sample)
-            if not isinstance(section, ReportSection):
-                raise TypeError(f"it gives {type(section).__name__}, not a ReportSection")
-            tiles = [tile for tiles in section.figures.values() for tile in tiles]
-            if wrong := [type(tile).__name__ for tile in tiles if not isinstance(tile, Tile)]:
-                raise TypeError(f"it has {wrong[0]} among its figures, not a Tile")
+            made = entry.load()(shown, samples)
+            for section in made if isinstance(made, Iterator | list | tuple) else [made]:
+                if not isinstance(section, ReportSection):
+                    raise TypeError(f"it gives {type(section).__name__}, not a ReportSection")
+                yield section
         except (Exception, SystemExit) as error:
             release = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "no distribution"
             warn_once(
                 f"the report does without the section `{entry.name}` of {release}, `{entry.value}`"
                 f" fails: {type(error).__name__}: {error}; update {release}, or uninstall it"
             )
-        else:
-            yield section
 
 
 def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:
@@ -173,25 +176,24 @@ def page_environment(*packages: str, **filters: Callable[..., str]) -> Environme
 
 
 def pictured_scene(
-    contenders: Sequence[Contender], sample: Sample, depth: Tensor | None
+    shown: Sequence[tuple[Contender, Prediction]], sample: Sample, depth: Tensor | None
 ) -> dict[str, Any]:
     """Name, inputs and pictures of a scene by kind and column. depth: the true one (T, 1, H, W).
 
     most: the error that is brightest, the same for all.
     """
-    shown = sample.targets.select(slice(TARGETS))
-    inputs, truth = sample.input_frames, shown.images[0]
+    views = sample.targets.select(slice(TARGETS))
+    inputs, truth = sample.input_frames, views.images[0]
     frames = [f"frame {sample.label(f)}" for f in (*inputs, *sample.target_frames)]
     colors = {"Truth": _photos(truth, frames[len(inputs) :])}
     depths = {} if depth is None else {"Truth": depth[:TARGETS]}
     errors = {}
-    for contender in contenders:
-        gaussians = contender.model(sample.inputs).gaussians
-        rendering = contender.model.render(gaussians, shown.cameras)
+    for contender, prediction in shown:
+        rendering = contender.model.render(prediction.gaussians, views.cameras)
         scores = psnr(rendering.rgb[0], truth).tolist()
         quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
         colors[contender.name] = _photos(rendering.rgb[0], quality)
-        errors[contender.name] = (rendering.rgb[0].clamp(0, 1) - truth).abs().mean(1, keepdim=True)
+        errors[contender.name] = color_error(rendering.rgb[0], truth)
         depths[contender.name] = rendering.depth[0]
     near, far = depth_range(torch.cat(list(depths.values())))
     most = depth_range(torch.cat(list(errors.values())))[1]
@@ -214,11 +216,11 @@ def _photos(images: Tensor, captions: Sequence[str]) -> list[Tile]:
     return [Tile(rgb_picture(i), caption) for i, caption in zip(images, captions, strict=False)]
 
 
-def orbit(shown: Shown, sample: Sample) -> ReportSection:
+def orbit(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """A loop past the input cameras, around what they see."""
     figures = []
-    for contender, prediction in shown:
-        cameras, render = sample.inputs.cameras, contender.model.render
+    for contender, (prediction, *_) in shown:
+        cameras, render = samples[0].inputs.cameras, contender.model.render
         depths = render(prediction.gaussians, cameras).depth
         path = orbit_path(cameras, depths, ORBIT_FRAMES, SIDE)
         frames = [rgb_picture(image) for image in render(prediction.gaussians, path).rgb[0]]
@@ -230,11 +232,11 @@ def orbit(shown: Shown, sample: Sample) -> ReportSection:
     )
 
 
-def queries(shown: Shown, sample: Sample) -> ReportSection:
+def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """The most notable queries of each model, seen from the first target view."""
     figures = []
-    cameras = finer(sample.targets.cameras[:, :1], SIDE)
-    for contender, prediction in shown:
+    cameras = finer(samples[0].targets.cameras[:, :1], SIDE)
+    for contender, (prediction, *_) in shown:
         chosen = notable_queries(contender.model, prediction.gaussians, cameras, QUERIES)
         picture = query_picture(contender.model, prediction.gaussians, chosen, cameras)
         figures.append(Tile(picture, contender.name, chosen))
@@ -247,9 +249,10 @@ def queries(shown: Shown, sample: Sample) -> ReportSection:
     )
 
 
-def anchors(shown: Shown, sample: Sample) -> ReportSection:
+def anchors(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """Supports on the first input view, before the decoder and after each layer."""
     figures: dict[str, list[Tile]] = {}
+    sample = samples[0]
     camera = sample.inputs.cameras[:, :1]
     photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE)
     for contender, _ in shown:
@@ -257,7 +260,8 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
         prediction = model(sample.inputs, layers=range(1, model.depth + 1))
         chosen = notable_queries(model, prediction.gaussians, camera, ANCHORS)
         colors = {query.index: query.color for query in chosen}
-        states = {"learned start": model.queries(1)} | {
+        start = model.queries(model.encoder(sample.inputs), sample.inputs)
+        states = {"learned start": start} | {
             f"after layer {number}": layer.state for number, layer in prediction.layers.items()
         }
         for caption, state in states.items():
@@ -275,12 +279,13 @@ def anchors(shown: Shown, sample: Sample) -> ReportSection:
     )
 
 
-def attention(shown: Shown, sample: Sample) -> ReportSection:
+def attention(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """Where the heaviest query looks in the input views: content, geometry, both; mean of heads."""
     figures: dict[str, list[Tile]] = {}
+    sample = samples[0]
     photos = [enlarged(rgb_picture(i), SIDE // 2) for i in sample.inputs.images[0]]
     view = sample.targets.cameras[:, :1]
-    for contender, prediction in shown:
+    for contender, (prediction, *_) in shown:
         model = contender.model
         (drawn,) = notable_queries(model, prediction.gaussians, view, 1)
         with trace(model, layers=[model.depth], queries=[drawn.index]) as record:
@@ -308,7 +313,7 @@ def attention(shown: Shown, sample: Sample) -> ReportSection:
     )
 
 
-def training_curves(shown: Shown, sample: Sample) -> ReportSection:
+def training_curves(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """Loss and PSNR for every model whose training has a history."""
     curves = {contender.name: contender.curves for contender, _ in shown if contender.curves}
     tiles = [Tile(figure_picture(curves_figure(curves), dpi=144))] if curves else []

@@ -5,7 +5,8 @@ from html import escape
 import torch
 from torch import nn
 
-from qgs.composer.slots import LAYER_SLOTS
+from qgs.analysis.pipeline import pipeline_svg
+from qgs.composer.slots import LAYER_SLOTS, SUBLAYER_SLOTS
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Prediction
 
@@ -15,18 +16,21 @@ _WIDEST = 1.2  # tangent of half the widest view
 
 
 def parameter_counts(model: QueryGaussianModel) -> dict[str, int]:
-    """Component to its number of parameters, decoder layers summed by slot."""
+    """Component to its number of parameters, decoder layers summed by slot.
+
+    `decoder.layer` has what is not of its sublayers.
+    """
     sublayers = {
-        f"decoder.{slot}": sum(_count(getattr(layer, slot)) for layer in model.decoder)
-        for slot in LAYER_SLOTS
-        if slot != "refinement"
+        f"decoder.{slot}": sum(map(_count, modules))
+        for slot in SUBLAYER_SLOTS
+        if (modules := [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)])
     }
     return {
         "encoder": _count(model.encoder),
         "queries": _count(model.queries),
+        "decoder.layer": _count(model.decoder) - sum(sublayers.values()),
         **sublayers,
         "decoder.refinement": _count(model.refinements),
-        "decoder.layer_scale": _count(model.decoder) - sum(sublayers.values()),
         "head": _count(model.head),
         "centers": _count(model.centers),
     }
@@ -45,11 +49,13 @@ def model_text(model: QueryGaussianModel) -> str:
 
 
 def model_html(model: QueryGaussianModel) -> str:
-    """The same as a table."""
+    """A picture of the way from views to Gaussians, and the same as a table."""
     rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in _rows(model)]
+    kinds = {slot: kind for slot, kind, _ in _rows(model)}
+    picture = pipeline_svg(kinds, parameter_counts(model), model.depth)
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     head = "<tr><th>slot</th><th>component</th><th>parameters</th></tr>"
-    return f"<p>{escape(_heading(model))}</p><table>{head}{body}</table>"
+    return f"<p>{escape(_heading(model))}</p>{picture}<table>{head}{body}</table>"
 
 
 def _heading(model: QueryGaussianModel) -> str:
@@ -73,18 +79,17 @@ def _rows(model: QueryGaussianModel) -> list[tuple[str, str, str]]:
 def _types(model: QueryGaussianModel, slot: str) -> list[str]:
     """What stands in a slot, in one of the decoder by layer."""
     tree = model.recipe["model"] if model.recipe else None
-    if slot == "layer_scale":
-        return []
     if slot not in LAYER_SLOTS:
         return [tree[slot]["type"] if tree else type(getattr(model, slot)).__name__]
     if tree is None:
-        modules = (
-            model.refinements if slot == "refinement" else [getattr(x, slot) for x in model.decoder]
-        )
+        modules = model.refinements if slot == "refinement" else model.decoder
+        if slot in SUBLAYER_SLOTS:
+            modules = [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)]
         return [type(module).__name__ for module in modules]
     own = tree["decoder"].get("layers", {})
     layers = [own.get(str(index), {}) for index in range(model.depth)]
-    return [layer.get(slot, tree["decoder"][slot])["type"] for layer in layers]
+    chosen = [layer.get(slot, tree["decoder"].get(slot)) for layer in layers]
+    return [one["type"] for one in chosen if one]
 
 
 @torch.no_grad()

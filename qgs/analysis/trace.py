@@ -16,8 +16,10 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from qgs.contracts import AttentionWeights
-from qgs.model import DecoderLayer, QueryGaussianModel
+from qgs.model import QueryGaussianModel
 from qgs.types import ImageMemory, QueryState, map_tensors
+
+ATTENTIONS = ("cross_attention", "self_attention")
 
 
 @dataclass
@@ -39,6 +41,10 @@ class Trace:
     grid: tuple[int, int, int] | None = None
     layers: dict[int, LayerTrace] = field(default_factory=dict)
 
+    def choose(self, queries: Sequence[int] | None, count: int) -> None:
+        """Record `queries` of `count`, all for None; raises ValueError for ones there are not."""
+        self.queries = torch.tensor(_checked(queries, range(count), "queries"), dtype=torch.long)
+
 
 @contextmanager
 def trace(
@@ -53,10 +59,11 @@ def trace(
     Raises ValueError for layers or queries that do not exist.
     """
     layers = _checked(layers, range(1, model.depth + 1), "layers")
-    indices = _checked(queries, range(model.queries.count), "queries")
-    record = Trace(torch.tensor(indices, dtype=torch.long))
+    record, count = Trace(torch.tensor([], dtype=torch.long)), model.queries.count
+    if count is not None:
+        record.choose(queries, count)
     with ExitStack() as hooks:
-        for handle in _Recorder(record, layers).hook_into(model):
+        for handle in _Recorder(record, layers, queries).hook_into(model):
             hooks.callback(handle.remove)
         yield record
 
@@ -75,19 +82,21 @@ def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list
 class _Recorder:
     """The hooks of one `trace` block. Layers run in order, so refinements may share a module."""
 
-    def __init__(self, record: Trace, layers: Collection[int]) -> None:
-        self.record, self.layers, self.current = record, layers, 0
+    def __init__(
+        self, record: Trace, layers: Collection[int], queries: Sequence[int] | None
+    ) -> None:
+        self.record, self.layers, self.queries, self.current = record, layers, queries, 0
 
     def hook_into(self, model: QueryGaussianModel) -> Iterator[RemovableHandle]:
         """Register the hooks, each when asked for the next one."""
         yield model.register_forward_pre_hook(self._start)
         for number, layer in enumerate(model.decoder, start=1):
-            assert isinstance(layer, DecoderLayer)
             yield layer.register_forward_pre_hook(partial(self._enter, number))
             if number in self.layers:
-                for part in ("cross_attention", "self_attention"):
-                    hook = partial(self._explain, part)
-                    yield getattr(layer, part).register_forward_pre_hook(hook)
+                for part in ATTENTIONS:
+                    if hasattr(layer, part):
+                        hook = partial(self._explain, part)
+                        yield getattr(layer, part).register_forward_pre_hook(hook)
         for refinement in model.refinements:
             yield refinement.register_forward_hook(self._leave)
 
@@ -99,8 +108,13 @@ class _Recorder:
         state, memory = args
         self.current = number
         self.record.grid = memory.grid
+        if number == 1:
+            self.record.choose(self.queries, state.features.shape[1])
         if number in self.layers:
-            self.record.layers[number] = LayerTrace(before=self._chosen(state))
+            kind = type(module).__name__
+            lacking = [part for part in ATTENTIONS if not hasattr(module, part)]
+            absent = {part: f"{kind} has no slot `{part}`" for part in lacking}
+            self.record.layers[number] = LayerTrace(self._chosen(state), absent=absent)
 
     @torch.no_grad()
     def _explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:

@@ -7,12 +7,10 @@ import typer
 
 from qgs.cli import (
     bench,
-    check_plugin,
     convert,
     demo,
     evaluate,
     inspect,
-    new_plugin,
     recipes,
     reconstruct,
     report,
@@ -45,8 +43,6 @@ COMMANDS = {
     "export": weights.export,
     "bench": bench.bench,
     "demo": demo.demo,
-    "new-plugin": new_plugin.new_plugin,
-    "check-plugin": check_plugin.check_plugin,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

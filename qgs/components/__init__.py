@@ -5,6 +5,7 @@ from qgs.components.centers import FreeCenters, posact
 from qgs.components.decoder import (
     ContentCrossAttention,
     ContentSelfAttention,
+    CrossSelfMlp,
     MlpFeedForward,
     NoRefinement,
 )
@@ -25,6 +26,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     LatentBottleneck,
     LatentQueries,
     DynamicQueries,
+    CrossSelfMlp,
     BlockCausalSelfAttention,
     ContentCrossAttention,
     ContentSelfAttention,
@@ -44,6 +46,7 @@ __all__ = [
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",
+    "CrossSelfMlp",
     "DynamicQueries",
     "FreeCenters",
     "GaussianHead",

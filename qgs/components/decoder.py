@@ -1,23 +1,61 @@
 """The default decoder layer: attention by content alone, an MLP, no refinement (TokenGS)."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components.blocks import NORM_EPS, CrossAttentionCore, Mlp, SelfAttentionCore
+from qgs.components.blocks import (
+    NORM_EPS,
+    CrossAttentionCore,
+    LayerScale,
+    Mlp,
+    SelfAttentionCore,
+)
 from qgs.contracts import (
     MEMORY_FIELDS,
     AttentionWeights,
     ComponentConfig,
     CrossAttention,
+    DecoderLayer,
     FeedForward,
     Fields,
+    ModelComponent,
     ModelDims,
     Refinement,
     SelfAttention,
 )
 from qgs.types import ImageMemory, QueryState
+
+
+class CrossSelfMlp(DecoderLayer):
+    """Cross-attention, self-attention, MLP; each update is scaled and added (TokenGS release)."""
+
+    name: ClassVar[str] = "cross_self_mlp"
+    sublayers = ("cross_attention", "self_attention", "feed_forward")
+
+    def __init__(
+        self,
+        config: ComponentConfig,
+        dims: ModelDims,
+        sublayers: Mapping[str, ModelComponent],
+        layer_scale: float,
+    ) -> None:
+        super().__init__(config, dims, sublayers, layer_scale)
+        self.cross_attention = sublayers["cross_attention"]
+        self.cross_scale = LayerScale(dims.width, layer_scale)
+        self.self_attention = sublayers["self_attention"]
+        self.self_scale = LayerScale(dims.width, layer_scale)
+        self.feed_forward = sublayers["feed_forward"]
+        self.feed_forward_scale = LayerScale(dims.width, layer_scale)
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
+        state = state.replace(x_BND)
+        x_BND = x_BND + self.self_scale(self.self_attention(state))
+        x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
+        return state.replace(x_BND), memory
 
 
 class ContentCrossAttention(CrossAttention):
@@ -63,10 +101,10 @@ class ContentSelfAttention(SelfAttention):
         self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
 
     def forward(self, state: QueryState) -> Tensor:
-        return self.attention(self.norm(state.features))
+        return self.attention(self.norm(state.features), state.mask)
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        return self.attention.explain(self.norm(state.features), queries)
+        return self.attention.explain(self.norm(state.features), queries, state.mask)
 
 
 class MlpFeedForward(FeedForward):

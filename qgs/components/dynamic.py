@@ -76,7 +76,7 @@ class DynamicQueries(Queries):
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """The field `dynamic.moves` (B, N). Raises ValueError for views without a target time."""
         config, batch = self.config, len(memory.features)
-        parts = [self.features, *([self.dynamic] if config.dynamic else [])]
+        parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
         x_BND = torch.cat(parts).expand(batch, -1, -1)
         first = len(self.features) if config.dynamic else 0
         moves_N = torch.arange(config.count, device=x_BND.device) >= first

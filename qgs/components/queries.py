@@ -6,11 +6,11 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from qgs.contracts import ComponentConfig, ModelDims, Queries
+from qgs.contracts import ComponentConfig, LearnedQueries, ModelDims
 from qgs.types import QueryState
 
 
-class LatentQueries(Queries):
+class LatentQueries(LearnedQueries):
     """N learned vectors, shared by all scenes, without a position."""
 
     name: ClassVar[str] = "latent"
@@ -29,5 +29,5 @@ class LatentQueries(Queries):
     def count(self) -> int:
         return self.features.shape[0]
 
-    def forward(self, batch_size: int) -> QueryState:
+    def start(self, batch_size: int) -> QueryState:
         return QueryState(self.features.expand(batch_size, -1, -1))

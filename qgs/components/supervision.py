@@ -15,11 +15,14 @@ class LayerSupervision(Supervision):
 
     class Config(ComponentConfig):
         layers: tuple[int, ...] = Field(default=(12,), min_length=1)
-        """Numbers of the supervised decoder layers, ascending; 1 is the first."""
+        """Numbers of the supervised decoder layers, ascending; 1 is the first, 0 the state before
+        any layer, in a decoder of depth 0."""
 
         @field_validator("layers")
         @classmethod
         def _ascending(cls, layers: tuple[int, ...]) -> tuple[int, ...]:
+            if layers == (0,):
+                return layers
             if list(layers) != sorted(set(layers)) or layers[0] < 1:
                 ascending = sorted({max(number, 1) for number in layers})
                 raise OptionError(
@@ -32,8 +35,12 @@ class LayerSupervision(Supervision):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        beyond = [number for number in config.layers if number > context.dims.depth]
-        if beyond:
+        depth = context.dims.depth
+        beyond = [n for n in config.layers if n > depth or (n == 0 and depth)]
+        if beyond and not depth:
+            reason = f"layers {beyond} do not exist in a decoder of depth 0"
+            yield Problem("layers", reason, "write [0], the queries as they start")
+        elif beyond:
             yield Problem(
                 "layers",
                 f"layers {beyond} do not exist in a decoder of depth {context.dims.depth}",

@@ -14,11 +14,20 @@ from qgs.composer.errors import RecipeError, RecipeProblem
 from qgs.composer.flow import fits
 from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
-from qgs.contracts import ModelComponent, ModelDims, Optimizer, Queries, Refinement, SceneSource
+from qgs.composer.slots import SUBLAYER_SLOTS
+from qgs.contracts import (
+    DecoderLayer,
+    ModelComponent,
+    ModelDims,
+    Optimizer,
+    Queries,
+    Refinement,
+    SceneSource,
+)
 from qgs.contracts.component import MissingExtraError
 from qgs.memory import is_out_of_memory
-from qgs.model import DecoderLayer, QueryGaussianModel
-from qgs.types import QueryState
+from qgs.model import QueryGaussianModel
+from qgs.types import ImageMemory, QueryState
 
 
 def build_model(
@@ -55,9 +64,11 @@ def build_model(
         encoder, queries = at("encoder"), at("queries")
         decoder, refinements = [], []
         for index in map(str, range(dims.depth)):
-            slots = ("cross_attention", "self_attention", "feed_forward")
-            sublayers = {slot: at("decoder", "layers", index, slot) for slot in slots}
-            decoder.append(DecoderLayer(**sublayers, layer_scale=layer_scale))
+            path = ("decoder", "layers", index)
+            has = [slot for slot in SUBLAYER_SLOTS if ("model", *path, slot) in parts]
+            sublayers = {slot: at(*path, slot) for slot in has}
+            layer = parts["model", *path, "layer"]
+            decoder.append(build(layer, dims, sublayers, layer_scale))
             refinements.append(at("decoder", "layers", index, "refinement"))
         model = QueryGaussianModel(
             encoder=encoder,
@@ -137,11 +148,11 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
         raise RecipeError([problem]) from error
-    if issubclass(component, Queries | Refinement):
+    if issubclass(component, Queries | Refinement | DecoderLayer):
 
         def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
             if fault := _state_fault(chosen, arguments, state):
-                place = place_of(component.forward)
+                place = place_of(getattr(component, "start", component.forward))
                 raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
             hook.remove()  # the state is checked until it has once been what it must be
 
@@ -156,7 +167,16 @@ def _too_large(error: Exception) -> bool:
 
 
 def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:
-    """What is wrong with a state that a component returned; "" if nothing is."""
+    """What is wrong with a state that a component returned; "" if nothing is.
+
+    A layer returns it with the memory.
+    """
+    if issubclass(chosen.component, DecoderLayer):
+        pair = state if isinstance(state, tuple) and len(state) == 2 else (state, None)
+        state, memory = pair
+        if not isinstance(memory, ImageMemory):
+            kinds = ", ".join(type(item).__name__ for item in pair if item is not None)
+            return f"returns {kinds}, not a QueryState and an ImageMemory"
     if not isinstance(state, QueryState):
         return f"returns {type(state).__name__}, not a QueryState"
     found = ", ".join(state.fields) or "no field at all"

@@ -41,8 +41,8 @@ class ModelSettings(ComponentConfig):
 class DecoderSettings(ComponentConfig):
     """The decoder, but for the components of its layers."""
 
-    depth: int = Field(default=12, ge=1, le=256)
-    """Number of layers (L in the papers)."""
+    depth: int = Field(default=12, ge=0, le=256)
+    """Number of layers (L in the papers); 0 decodes the queries as they start."""
     layer_scale: float = Field(default=5e-5, gt=0)
     """Initial LayerScale of every sublayer (TokenGS release)."""
 

@@ -8,9 +8,17 @@ from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import KeyPath, MapNode, find
 from qgs.composer.registry import Registry, component_error, component_failure, default_config
-from qgs.composer.slots import LAYER_SLOTS
+from qgs.composer.slots import LAYER_SLOTS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import inline
-from qgs.contracts import MEMORY_FIELDS, Encoder, Queries, Refinement, Renderer, Supervision
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    DecoderLayer,
+    Encoder,
+    Queries,
+    Refinement,
+    Renderer,
+    Supervision,
+)
 from qgs.contracts.component import (
     Component,
     ComponentConfig,
@@ -65,11 +73,43 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
 
 def _writable(component: type[Component], provided: Fields) -> Collection[str]:
     """Names of the fields among `provided` that a component of this slot can write."""
-    if issubclass(component, Queries | Refinement):
+    if issubclass(component, Queries | DecoderLayer | Refinement):
         return provided
     if issubclass(component, Encoder):
         return MEMORY_FIELDS
     return Renderer.provides(Renderer.Config()) if issubclass(component, Renderer) else ()
+
+
+def without_idle_sublayers(parts: Parts, depth: int, problems: Problems) -> Parts:
+    """`parts` without what stands in slots that no layer has; what is written there is reported.
+
+    Around a layer that could not be decoded nothing is known to be idle.
+    """
+    kept, told = dict(parts), set[str]()
+    decoder = ("model", "decoder")
+    places = [(*decoder, "layers", str(index)) for index in range(depth)]
+    for place in places:
+        layer = parts[(*place, "layer")]
+        if layer is None:
+            continue
+        has: Any = layer.component
+        for name in SUBLAYER_SLOTS:
+            if name not in has.sublayers:
+                idle = kept.pop((*place, name))
+                if idle and idle.place.node is not None and idle.path not in told:
+                    told.add(idle.path)
+                    reason = f"`{layer.type}` ({layer.chosen_at}) has no slot `{name}`"
+                    fix = f"remove it; `{name}: null` drops one that is inherited"
+                    problems.add(idle.place.origin, idle.path, reason, fix)
+    for name in LAYER_SLOTS:
+        template = parts[(*decoder, name)]
+        if not any((*place, name) in kept for place in places):
+            del kept[(*decoder, name)]
+            if not depth and template and template.place.node is not None:
+                reason = "a decoder of depth 0 has no layers, so nothing reads it"
+                fix = f"remove it; `{name}: null` drops one that is inherited"
+                problems.add(template.place.origin, template.path, reason, fix)
+    return kept
 
 
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
@@ -151,9 +191,11 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, 
         decoded |= supervision(chosen.config).weights().keys()
     yield parts["model", "encoder"], None
     yield parts["model", "queries"], None
-    for layer in range(1, depth + 1):
-        for name in LAYER_SLOTS:
-            yield parts["model", "decoder", "layers", str(layer - 1), name], None
+    for layer in range(depth + 1):
+        for name in LAYER_SLOTS if layer else ():
+            path = ("model", "decoder", "layers", str(layer - 1), name)
+            if path in parts:
+                yield parts[path], None
         if layer in decoded:
             for name in ("head", "centers", "renderer"):
                 yield parts["model", name], layer

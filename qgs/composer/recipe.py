@@ -13,7 +13,7 @@ from qgs.composer.build import build, build_model
 from qgs.composer.decode import Chosen, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
 from qgs.composer.files import MAX_BYTES, apply_overrides, merge, read_recipe, refuse_beyond_reading
-from qgs.composer.flow import check_flow, check_options, idle_fields
+from qgs.composer.flow import check_flow, check_options, idle_fields, without_idle_sublayers
 from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.rates import rate_factors
@@ -119,7 +119,8 @@ def resolve(
     dims = contracts.ModelDims(model.width, model.heads, decoder.depth)
     registry = load_plugins(tree, problems, plugins)
     places = apply_swaps(tree.child("swap"), expand(tree, dims.depth, problems), problems)
-    parts = {path: decode_place(place, registry, problems) for path, place in places.items()}
+    decoded = {path: decode_place(place, registry, problems) for path, place in places.items()}
+    parts = without_idle_sublayers(decoded, dims.depth, problems)
     if sizes_known:
         data = parts.get(("data",))
         source = data.config if data else None
@@ -228,6 +229,8 @@ def _put_decoder(tree: "_Tree", parts: Mapping[KeyPath, Chosen]) -> None:
     layers = {path: part for path, part in parts.items() if path[:-2] == (*decoder, "layers")}
     templates = {}
     for name in LAYER_SLOTS:
+        if (*decoder, name) not in parts:
+            continue
         alike = [(part.type, part.config) for path, part in layers.items() if path[-1] == name]
         same = alike.count(alike[0]) == len(alike)
         template = parts[(*decoder, "layers", "0", name) if same else (*decoder, name)]

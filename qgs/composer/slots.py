@@ -37,6 +37,7 @@ SLOTS = {
     for slot in (
         Slot(contracts.Encoder, "qgs/multiview_vit"),
         Slot(contracts.Queries, "qgs/latent"),
+        Slot(contracts.DecoderLayer, "qgs/cross_self_mlp"),
         Slot(contracts.CrossAttention, "qgs/content"),
         Slot(contracts.SelfAttention, "qgs/content"),
         Slot(contracts.FeedForward, "qgs/mlp"),
@@ -52,7 +53,8 @@ SLOTS = {
     )
 }
 MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
-LAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward", "refinement")
+SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
+LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 SECTIONS = {name: SLOTS[name] for name in ("losses", "data", "metrics", "optimizer")}
 """Slots that are top-level sections of a recipe."""
 _RATE = ("learning_rate", "warmup", "initial_divisor", "final_divisor")

@@ -18,6 +18,7 @@ from qgs.contracts.data import Scene, SceneSource, SceneSourceConfig, Split
 from qgs.contracts.decoder import (
     AttentionWeights,
     CrossAttention,
+    DecoderLayer,
     FeedForward,
     Refinement,
     SelfAttention,
@@ -28,7 +29,7 @@ from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
 from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
 from qgs.contracts.plugin import CONTRACT_VERSION, Expected, ExpectedError, Plugin
-from qgs.contracts.queries import Queries
+from qgs.contracts.queries import LearnedQueries, Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
 from qgs.contracts.weights import LayoutError, Rename, WeightLayout
@@ -42,6 +43,7 @@ __all__ = [
     "Component",
     "ComponentConfig",
     "CrossAttention",
+    "DecoderLayer",
     "Encoder",
     "EvaluationConfig",
     "Expected",
@@ -51,6 +53,7 @@ __all__ = [
     "Fields",
     "Head",
     "LayoutError",
+    "LearnedQueries",
     "Loss",
     "Metric",
     "MetricInput",

@@ -1,16 +1,17 @@
-"""Slots of a decoder layer: `cross_attention`, `self_attention`, `feed_forward`, `refinement`.
+"""Slots of the decoder: `layer`, what stands inside one, and `refinement` after each.
 
 An attention or feed-forward component holds its norms and its output projection; the decoder layer
 adds LayerScale and the residual sum.
 """
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 from torch import Tensor
 
-from qgs.contracts.component import ModelComponent
+from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
 from qgs.types import ImageMemory, QueryState
 
 
@@ -37,6 +38,35 @@ class AttentionWeights:
             raise ValueError(f"geometry must have shape {shared} or {shape}, {given}")
         if self.weights.shape != shape:
             raise ValueError(f"weights must have shape {shape}, got {tuple(self.weights.shape)}")
+
+
+class DecoderLayer(ModelComponent):
+    """(QueryState, ImageMemory) -> both, as the next layer reads them.
+
+    A layer may update features, write fields that it `provides`, and return a memory with other
+    features where image tokens change from layer to layer. Of a memory it keeps what it does not
+    change, and the fields of a state.
+
+    sublayers: the slots inside this layer, of `cross_attention`, `self_attention` and
+        `feed_forward`; a recipe that fills another one is refused.
+    """
+
+    slot: ClassVar[str] = "layer"
+    sublayers: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(
+        self,
+        config: ComponentConfig,
+        dims: ModelDims,
+        sublayers: Mapping[str, ModelComponent],
+        layer_scale: float,
+    ) -> None:
+        """sublayers: by slot, those named in the class. layer_scale: `decoder.layer_scale`."""
+        super().__init__(config, dims)
+
+    @abstractmethod
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        """One layer, without the refinement."""
 
 
 class CrossAttention(ModelComponent):

@@ -7,7 +7,7 @@ from typing import TypeAlias
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.weights import WeightLayout
 
-CONTRACT_VERSION = 1
+CONTRACT_VERSION = 2
 """Goes up when components written for the old contracts no longer fit."""
 
 ENTRY_POINT_GROUP = "qgs.plugins"
@@ -16,7 +16,7 @@ ENTRY_POINT_GROUP = "qgs.plugins"
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """A check of `qgs.testing` that is expected to raise, for example for want of a kernel.
+    """A check of the contract suite that is expected to raise, for example for want of a kernel.
 
     error: the class of the error, or several; the check fails on any other. reason: why.
     """
@@ -41,8 +41,8 @@ class Plugin:
     models: files of trained models by name, relative to the folder of the module that the entry
         point names; PLUGIN/NAME stands for the path in every command. A card beside the file tells
         what the model is: models/mine.md for models/mine.safetensors.
-    exemptions: checks of `qgs.testing` that a component is known to fail, and why; by class, or by
-        options where it passes with others.
+    exemptions: checks of the contract suite that a component is known to fail, and why; by class,
+        or by options where it passes with others.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Slot `queries`: the learned state that every scene starts from."""
+"""Slot `queries`: the state that a scene starts from."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -8,29 +8,30 @@ import torch
 from torch import Tensor
 
 from qgs.contracts.component import ModelComponent
-from qgs.types import QueryState, SpatialSupport
+from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
 
 GROWTH_NOISE = 0.01
 """Standard deviation of the noise added to the copy of a query (LocusGS release)."""
 
 
 class Queries(ModelComponent):
-    """Batch size -> QueryState of N queries: features (B, N, D) and the fields in `provides`.
+    """(ImageMemory, Views) -> QueryState of N queries: features (B, N, D), fields in `provides`.
 
-    The initial state does not depend on the photos and is shared by all scenes. Spatial fields are
-    float32 in the world frame, (B, N, ...).
+    Spatial fields are float32 in the world frame, (B, N, ...). Queries that read the memory say
+    which parts of it they need in `requires`, as `memory.features`. Scenes are independent; a
+    state whose scenes have different numbers of queries has a mask.
     """
 
     slot: ClassVar[str] = "queries"
 
     @property
     @abstractmethod
-    def count(self) -> int:
-        """N, the number of queries."""
+    def count(self) -> int | None:
+        """N, the number of queries; None where it depends on the views."""
 
     @abstractmethod
-    def forward(self, batch_size: int) -> QueryState:
-        """The initial state, expanded to `batch_size` scenes."""
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """The initial state of every scene."""
 
     def resized(
         self, learned: Mapping[str, Tensor], generator: torch.Generator
@@ -50,6 +51,23 @@ class Queries(ModelComponent):
     def support(self, state: QueryState) -> SpatialSupport | None:
         """Where each query of `state` looks; None for queries without a position."""
         return None
+
+
+class LearnedQueries(Queries):
+    """Queries that start from parameters alone: the same in all scenes, whatever the photos."""
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """N, the number of queries."""
+
+    @abstractmethod
+    def start(self, batch_size: int) -> QueryState:
+        """The initial state, expanded to `batch_size` scenes."""
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """The initial state of as many scenes as the memory has."""
+        return self.start(memory.features.shape[0])
 
 
 def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -46,6 +46,8 @@ class RendererConfig(ComponentConfig):
 class Renderer(Component, torch.nn.Module):
     """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
 
+    Colours are those that `Gaussians.sh` gives along the direction from the camera's centre to the
+    mean. `Gaussians.features` are blended with the weights of the colours, over 0.
     Differentiable in all Gaussian parameters. Images and gradients are finite, also for no
     Gaussians and for Gaussians behind the camera, off screen or huge.
 

@@ -32,6 +32,11 @@ def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
     return picture
 
 
+def color_error(images: Tensor, truth: Tensor) -> Tensor:
+    """Mean over channels of what clipped images are off, (..., 3, H, W) -> (..., 1, H, W)."""
+    return (images.clamp(0, 1) - truth.to(images)).abs().mean(-3, keepdim=True)
+
+
 def error_picture(error: Tensor, most: float) -> Picture:
     """Error (1, H, W) from none (black) to `most` and above (light yellow)."""
     return _shaded(error, 0.0, most, ERROR_MAP)

@@ -148,16 +148,22 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
     """Blending weight (B, G) over all pixels: the gradient of a render's sum by the colours."""
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
-        rgb = model.render(replace(gaussians, colors=colors), cameras).rgb
+        rgb = model.render(_painted(gaussians, colors), cameras).rgb
         (gradient,) = torch.autograd.grad(rgb.sum(), colors)
     return gradient.mean(-1)
+
+
+def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
+    """The Gaussians in `colors`, from everywhere."""
+    return replace(gaussians, colors=colors, sh=None, features=None)
 
 
 def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
     """`count` queries to show in cameras (1, V): heavy, well inside the first view, and apart."""
-    weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().view(model.queries.count, -1)
+    per_query = model.head.gaussians_per_query
+    weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().unflatten(0, (-1, per_query))
     means_NK3 = gaussians.means[0].cpu().view(*weights_NK.shape, 3)
     weights_N = weights_NK.sum(1)
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
@@ -187,13 +193,13 @@ def query_picture(
 ) -> Picture:
     """The Gaussians of `chosen` in colour with lines to centroids, over a grey scene; (1, 1)."""
     scene = washed(rgb_picture(model.render(gaussians, cameras, background).rgb[0, 0]))
-    per_query = gaussians.count // model.queries.count
+    per_query = model.head.gaussians_per_query
     members = [range(q.index * per_query, (q.index + 1) * per_query) for q in chosen]
     index = [i for member in members for i in member]
     shown = gaussians[:, torch.tensor(index, dtype=torch.long, device=gaussians.means.device)]
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
-    visible = replace(shown, colors=colors, opacities=shown.opacities.clamp_min(0.5))
+    visible = replace(_painted(shown, colors), opacities=shown.opacities.clamp_min(0.5))
     painted = model.render(visible, cameras, torch.zeros(3))
     alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
     color = painted.rgb[0, 0].permute(1, 2, 0).cpu().numpy() * 255

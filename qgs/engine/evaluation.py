@@ -68,7 +68,7 @@ def evaluate(
         columns=measures.columns,
         scores=scores,
         wanted=plan.wanted,
-        gaussians=model.queries.count * model.head.gaussians_per_query,
+        gaussians=judge.gaussians,
         missing=missing,
         null=plan.null,
         unlisted=plan.unlisted,
@@ -175,6 +175,7 @@ class _Judge:
         self._device = next(model.parameters()).device
         self._measures = measures
         self.seen = Domain()
+        self.gaussians = 0  # of a scene, the most
         for metric in measures.metrics.values():
             metric.to(self._device)
         self._tune = None
@@ -231,6 +232,7 @@ class _Judge:
 
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
         targets = sample.targets.to(self._device)
+        self.gaussians = max(self.gaussians, gaussians.count)
         rendering = self._model.render(gaussians, targets.cameras)
         depth = true_depth(self._source, sample) if "true_depth" in self._measures.needed else None
         if depth is not None:

@@ -33,15 +33,15 @@ def refuse_unfit(recipe: Recipe, accelerator: Accelerator) -> None:
     """Raise TooLargeError for a training whose least parts do not fit into memory.
 
     Counted are weights and gradients, batches, Gaussians and renderings with their gradients; what
-    layers keep for the backward pass, and moments, come on top. What lies on a GPU is compared with
-    its free memory.
+    layers keep for the backward pass, moments, and Gaussians of queries whose number depends on the
+    views, come on top. What lies on a GPU is compared with its free memory.
     """
     config, views, model = recipe.training, recipe.views, recipe.build_model("meta")
     factors = recipe.rate_factors(model)
     sizes = {name: 4 * tensor.numel() for name, tensor in model.state_dict().items()}
     weights, trained = sum(sizes.values()), sum(s for n, s in sizes.items() if factors.get(n))
     shards = accelerator.num_processes if wants_shards(accelerator) else 1
-    queries, per_query = model.queries.count, model.head.gaussians_per_query
+    queries, per_query = model.queries.count or 0, model.head.gaussians_per_query
     layers = len(model.supervision.weights())
     gaussians = config.batch_size * queries * per_query * layers
     on_device = {

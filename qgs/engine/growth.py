@@ -22,9 +22,14 @@ _MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
 
 
-def refuse_too_many(count: int) -> None:
-    """Raise TooLargeError when memory does not hold `count` Gaussians while they are optimised."""
-    numbers = 14 * 4  # of a Gaussian; each with its gradient and two moments
+def refuse_too_many(count: int, gaussians: Gaussians | None = None) -> None:
+    """Raise TooLargeError when memory does not hold `count` Gaussians while they are optimised.
+
+    gaussians: (1, G), what they are like; None for those without harmonics and features.
+    """
+    given = [] if gaussians is None else [gaussians.sh, gaussians.features]
+    more = sum(x[0, :1].numel() for x in given if x is not None)
+    numbers = (14 + more) * 4  # of a Gaussian; each with its gradient and two moments
     refuse_beyond_memory(
         "a refinement", {f"{count} Gaussians": 4 * numbers * count}, "Take fewer (--gaussians)."
     )
@@ -33,7 +38,8 @@ def refuse_too_many(count: int) -> None:
 class Leaves:
     """Gaussians (1, G) as tensors (G, ...) without bounds, and Adam on them.
 
-    values: means, log_scales, quats, opacity_logits and color_logits, by name.
+    values: means, log_scales, quats, opacity_logits, color_logits, and sh and features if there
+    are, by name.
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
@@ -43,10 +49,13 @@ class Leaves:
             "quats": gaussians.quats,
             "opacity_logits": gaussians.opacities.logit(_OPACITY_MARGIN),
             "color_logits": gaussians.colors.logit(_COLOR_MARGIN),
+            "sh": gaussians.sh,
+            "features": gaussians.features,
         }
-        self.values = {k: v[0].detach().float().clone().requires_grad_() for k, v in values.items()}
+        given = {name: value for name, value in values.items() if value is not None}
+        self.values = {k: v[0].detach().float().clone().requires_grad_() for k, v in given.items()}
         groups = [
-            {"params": [self.values[name]], "name": name, "lr": rates[name]} for name in rates
+            {"params": [self.values[name]], "name": name, "lr": rates[name]} for name in given
         ]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15)
 
@@ -60,7 +69,7 @@ class Leaves:
         v = {name: value[None] for name, value in self.values.items()}
         shape = v["log_scales"].exp(), F.normalize(v["quats"], dim=-1)
         look = v["opacity_logits"].sigmoid(), v["color_logits"].sigmoid()
-        return Gaussians(v["means"], *shape, *look)
+        return Gaussians(v["means"], *shape, *look, v.get("sh"), v.get("features"))
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:

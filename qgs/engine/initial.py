@@ -81,7 +81,9 @@ def _change(name: str, old: Tensor, new: Tensor) -> str:
     return f"{name}: {before} -> {after}, {'the first are kept' if after < before else kept}"
 
 
-def _differences(learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int) -> list[str]:
+def _differences(
+    learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int | None
+) -> list[str]:
     """In what the weights of a model of `count` queries differ, besides that number."""
     own, theirs = shapes_of(unique_tensors(model)), shapes_of(learned)
     for name in own.keys() & theirs.keys():

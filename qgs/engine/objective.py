@@ -17,6 +17,7 @@ from qgs.types import (
     LayerPrediction,
     Rendering,
     Views,
+    concatenated,
     map_tensors,
     named_tensors,
 )
@@ -110,8 +111,7 @@ class Objective(nn.Module):
             checkpoint(self.model.render, gaussians, cameras[:, views], use_reentrant=False)
             for views in _slices(cameras, self.render_views)
         ]
-        images = zip(*((part.rgb, part.alpha, part.depth) for part in parts), strict=True)
-        return Rendering(*(torch.cat(of_parts, 1) for of_parts in images))
+        return concatenated(parts, 1)
 
     def _terms(
         self,

@@ -7,7 +7,7 @@ things; steps of an optimiser are too short to bring them there.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import torch
@@ -22,10 +22,11 @@ from qgs.engine.tracking import TrainingProgress
 from qgs.losses.photometric import mean_squared_error, mean_ssim
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views, map_tensors
+from qgs.types import Cameras, Gaussians, Views, concatenated, map_tensors, named_tensors
 
 _RATES = {"means": 3.5e-3, "log_scales": 2e-2, "quats": 5e-3}  # of means: of the scene's size
 _RATES |= {"opacity_logits": 0.05, "color_logits": 2.5e-2}
+_RATES |= {"sh": 1.25e-3, "features": 0.0}  # a twentieth of the colours', as 3DGS; no photo has any
 _LAST, _LAST_OF_MEANS = 0.1, 0.01  # of the rates, at the end
 _SSIM = 0.25  # weight beside the mean squared error
 _SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos
@@ -85,7 +86,7 @@ def refine(
     """
     wanted = gaussians.count if count is None else count
     _refuse_unusable(gaussians, views, seconds, wanted)
-    refuse_too_many(wanted)
+    refuse_too_many(wanted, gaussians)
     quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
     with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
         renderer = renderer or AutoRenderer(AutoRenderer.Config())
@@ -154,7 +155,7 @@ class _Run:
             self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
         photo = views.select([self.order.pop()])
         gaussians = self.leaves.gaussians()
-        rgb = self.renderer(gaussians, photo.cameras).rgb
+        rgb = self.renderer(replace(gaussians, features=None), photo.cameras).rgb
         error = mean_squared_error(rgb, photo.images)
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
@@ -181,15 +182,17 @@ def half_swept(
 ) -> Gaussians:
     """The most opaque Gaussians (1, G), half of `count`, and as many where the photos agree.
 
-    With one photo, which agrees with none, `count` of the most opaque.
+    With one photo, which agrees with none, `count` of the most opaque. Spherical harmonics and
+    features of those on the photos are 0.
     """
     new = count // 2 if views.images.shape[1] > 1 else 0
     kept = gaussians.most_opaque(count - new)
     if not new:
         return kept
     others = swept(views, new, distance(gaussians, views), generator)
-    pairs = zip(vars(kept).values(), vars(others).values(), strict=True)
-    return Gaussians(*(torch.cat(pair, 1) for pair in pairs))
+    added = (("sh", kept.sh), ("features", kept.features))
+    zeros = {k: x.new_zeros(1, new, *x.shape[2:]) for k, x in added if x is not None}
+    return concatenated([kept, replace(others, **zeros)], 1)
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:
@@ -213,7 +216,7 @@ def resized(views: Views, part: int) -> Views:
 @torch.no_grad()
 def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
     """Mean PSNR in dB of renderings against `views` (1, V)."""
-    rgb: Tensor = renderer(gaussians, views.cameras).rgb
+    rgb: Tensor = renderer(replace(gaussians, features=None), views.cameras).rgb
     return float(psnr(rgb[0], views.images[0]).mean())
 
 
@@ -225,7 +228,7 @@ def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: 
             "{} scenes of {} Gaussians, {} scenes of {} photos".format(*given)
             + f", {seconds:g} seconds, {count} Gaussians wanted: give at least one of each"
         )
-    if not all(bool(tensor.isfinite().all()) for tensor in vars(gaussians).values()):
+    if not all(bool(tensor.isfinite().all()) for _, tensor in named_tensors(gaussians)):
         raise ValueError(
             "some Gaussians are not finite, so they cannot be refined: the model that predicted "
             "them is broken, or its photos are far from what it was trained on"

@@ -63,9 +63,10 @@ class Evaluation:
 
     columns: by name of the value. scores: of the judged scenes. wanted: names of all scenes of the
     protocol. missing: those without a score. null: scenes that the index lists without frames.
-    unlisted: scenes of the data that the index lacks. gaussians: of a scene. incomplete: values
-    that scenes lack, and why. held_out: how many held-out frames were judged, and how many there
-    are; None where the test scenes hold none out. step: optimiser steps behind the weights.
+    unlisted: scenes of the data that the index lacks. gaussians: of a scene, the most of any.
+    incomplete: values that scenes lack, and why. held_out: how many held-out frames were judged,
+    and how many there are; None where the test scenes hold none out. step: optimiser steps behind
+    the weights.
     remarks: sentences on what was judged and what came of it.
     """
 

@@ -54,7 +54,7 @@ def tune(
         )
     with torch.no_grad():
         memory = model.encoder(views)
-        start = model.queries(views.images.shape[0])
+        start = model.queries(memory, views)
     tuned = map_tensors(
         lambda x: x.detach().clone().requires_grad_(x.is_floating_point()),
         start if what == "queries" else memory.features,

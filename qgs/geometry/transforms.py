@@ -1,9 +1,12 @@
 """Points into cameras and pixels, quaternions to rotation matrices and back, worlds to worlds."""
 
+from dataclasses import replace
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.geometry.harmonics import rotated
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, Gaussians
 
@@ -42,12 +45,12 @@ def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     """The Gaussians enlarged by `factor` about the origin, then placed by the rigid pose (4, 4)."""
     pose = pose.to(gaussians.means)
     turn = matrix_to_quat(pose[:3, :3])
-    return Gaussians(
+    return replace(
+        gaussians,
         means=gaussians.means * factor @ pose[:3, :3].T + pose[:3, 3],
         scales=gaussians.scales * factor,
         quats=_product(turn, gaussians.quats),
-        opacities=gaussians.opacities,
-        colors=gaussians.colors,
+        sh=None if gaussians.sh is None else rotated(gaussians.sh, pose[:3, :3]),
     )
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from qgs.data.scenes import warn_once
 from qgs.io.files import replacing
-from qgs.types import Gaussians, map_tensors
+from qgs.types import SH_COUNTS, Gaussians, map_tensors, named_tensors
 from qgs.wording import listed
 
 SH_C0 = 0.28209479177387814
@@ -29,9 +29,10 @@ _MEANS, _COLORS, _SCALES, _QUATS = (
     ("rot_0", "rot_1", "rot_2", "rot_3"),
 )
 NEEDED = (*_MEANS, *_COLORS, "opacity", *_SCALES, *_QUATS)
-REST = tuple(f"f_rest_{index}" for index in range(45))
-"""Higher spherical harmonics, all 0 here. Several readers know no file without all of them: the
-viewer of the 3DGS release, plugins of game engines, versions of PlayCanvas that show black."""
+REST = tuple(f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1]))
+"""Spherical harmonics of degrees 1 to 3, all of red first, then green, then blue; 0 where Gaussians
+have none. Several readers know no file without all of them: the viewer of the 3DGS release, plugins
+of game engines, versions of PlayCanvas that show black."""
 PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *_QUATS)
 
 
@@ -49,7 +50,7 @@ def one_scene(gaussians: Gaussians, kind: str) -> Gaussians:
     scene = map_tensors(Tensor.detach, gaussians[0] if batch else gaussians).to(
         "cpu", torch.float32
     )
-    finite = [part.isfinite()[..., None].flatten(1).all(-1) for part in vars(scene).values()]
+    finite = [part.isfinite()[..., None].flatten(1).all(-1) for _, part in named_tensors(scene)]
     if broken := int((~torch.stack(finite).all(0)).sum()):
         raise ValueError(f"{broken} of {scene.count} Gaussians have numbers that are not finite")
     return scene
@@ -58,17 +59,23 @@ def one_scene(gaussians: Gaussians, kind: str) -> Gaussians:
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), as binary little-endian float32.
 
-    Colours become f_dc, opacities logits, scales logarithms; quaternions stay w x y z; normals and
-    f_rest are zero. The file appears whole or not at all. Raises ValueError for several scenes or
-    for numbers that are not finite.
+    Colours become f_dc, spherical harmonics f_rest, opacities logits, scales logarithms;
+    quaternions stay w x y z; normals are zero. A warning says that features are left out. The file
+    appears whole or not at all. Raises ValueError for several scenes or for numbers that are not
+    finite.
     """
     scene = one_scene(gaussians, "PLY")
+    if scene.features is not None:
+        warn_once("PLY files of Gaussians have no place for `features`: they are left out")
+    sh = scene.means.new_zeros(scene.count, SH_COUNTS[-1], 3) if scene.sh is None else scene.sh
+    rest = F.pad(sh, (0, 0, 0, SH_COUNTS[-1] - sh.shape[1]))
     columns = {
         _MEANS: scene.means,
         _COLORS: (scene.colors - 0.5) / SH_C0,
         ("opacity",): scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
         _SCALES: scene.scales.clamp_min(SCALE_MIN).log(),
         _QUATS: scene.quats,
+        REST: rest.mT.flatten(1),  # channel by channel
     }
     vertices = np.zeros(scene.count, dtype=[(name, "<f4") for name in PROPERTIES])
     for names, values in columns.items():
@@ -81,9 +88,9 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
 def load_ply(path: str | Path) -> Gaussians:
     """The Gaussians (1, G) of a PLY file in the layout of the 3DGS release, whatever wrote it.
 
-    Colours are those of f_dc alone: a warning says so where the file's depend on the direction.
-    Raises FileNotFoundError, and ValueError for another kind of file or of PLY, such as a
-    compressed one, and for numbers that are not finite.
+    `sh` are as many degrees of f_rest as are not zero throughout, None for none. Raises
+    FileNotFoundError, and ValueError for another kind of file or of PLY, such as a compressed one,
+    and for numbers that are not finite.
     """
     try:
         file = PlyData.read(str(path))
@@ -100,9 +107,12 @@ def load_ply(path: str | Path) -> Gaussians:
             "3DGS release, as SuperSplat's uncompressed export writes it"
         )
     vertices = found["vertex"].data
-    rest = [name for name in names if name.startswith("f_rest_")]
-    if any(vertices[name].any() for name in rest):
-        warn_once(f"{path} has colours that depend on the direction; their mean (f_dc) is taken")
+    rest = [f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in names))]
+    if len(rest) not in (0, *(3 * count for count in SH_COUNTS)) or not {*rest} <= {*names}:
+        raise ValueError(
+            f"{path} has {len(rest)} properties f_rest_*; spherical harmonics of degrees 1, 2 or 3 "
+            "are f_rest_0 to f_rest_8, f_rest_23 or f_rest_44: write the file anew, or without them"
+        )
 
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
@@ -113,9 +123,16 @@ def load_ply(path: str | Path) -> Gaussians:
         quats=F.normalize(columns(*_QUATS), dim=-1),
         opacities=columns("opacity")[:, 0].sigmoid(),
         colors=columns(*_COLORS) * SH_C0 + 0.5,
+        sh=_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,
     )
     try:
         one_scene(scene, "PLY")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return scene[None]
+
+
+def _degrees(sh: Tensor) -> Tensor | None:
+    """The coefficients (G, C, 3) without degrees that are zero throughout; None if all are."""
+    used = int(sh.any(0).any(-1).nonzero().max()) + 1 if sh.any() else 0
+    return sh[:, : next(count for count in SH_COUNTS if count >= used)] if used else None

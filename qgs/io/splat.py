@@ -10,9 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.data.scenes import warn_once
 from qgs.io.files import replacing
 from qgs.io.ply import one_scene
 from qgs.types import Gaussians
+from qgs.wording import listed
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -20,10 +22,13 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), (
 def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     """Write one scene, (G, ...) or (1, G, ...), the largest and most opaque Gaussians first.
 
-    Colours, opacities and quaternions, w x y z, get 8 bits. The file appears whole or not at all.
-    Raises as `save_ply`.
+    Colours, opacities and quaternions, w x y z, get 8 bits. A warning says that spherical harmonics
+    and features are left out. The file appears whole or not at all. Raises as `save_ply`.
     """
     scene = one_scene(gaussians, ".splat")
+    left = {"spherical harmonics (`sh`)": scene.sh, "features": scene.features}
+    if lost := [name for name, tensor in left.items() if tensor is not None]:
+        warn_once(f".splat files have no place for {listed(lost)}: left out, `colors` are stored")
     first = (scene.scales.prod(-1) * scene.opacities).argsort(descending=True, stable=True)
     scene = scene[first]
     records = np.empty(scene.count, RECORD)

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import MissingExtraError, Renderer, RendererConfig
-from qgs.renderers.inputs import background_of, check_inputs, raise_precision
+from qgs.renderers.inputs import background_of, check_inputs, colors_of, raise_precision
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -53,17 +54,35 @@ class CpuRenderer(Renderer):
         config = self.config
         with torch.autocast("cpu", enabled=False):
             gaussians, cameras = raise_precision(gaussians, cameras)
-            inputs = (
-                gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities,
-                gaussians.colors, cameras.c2w, cameras.intrinsics,
-            )  # fmt: skip
-            sums = _Splat.apply(*(tensor.float() for tensor in inputs), cameras.size, config)
             backdrop = background_of(background, config.background, gaussians.means)
-            return resolve(sums.to(gaussians.means.dtype), backdrop)
+            sums = self._sums(gaussians, colors_of(gaussians, cameras), cameras)
+            return resolve(sums, backdrop, self._features(gaussians, cameras))
+
+    def _sums(self, gaussians: Gaussians, colors: Tensor, cameras: Cameras) -> Tensor:
+        """Sums (B, V, 5, H, W) with `colors` (B, G, 3) or (B, V, G, 3) in place of theirs."""
+        inputs = (
+            gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities,
+            colors, cameras.c2w, cameras.intrinsics,
+        )  # fmt: skip
+        sums = _Splat.apply(*(tensor.float() for tensor in inputs), cameras.size, self.config)
+        return sums.to(gaussians.means.dtype)
+
+    def _features(self, gaussians: Gaussians, cameras: Cameras) -> Tensor | None:
+        """Sums (B, V, F, H, W) of the features, three at a time as if they were colours."""
+        if gaussians.features is None:
+            return None
+        parts = [
+            self._sums(gaussians, F.pad(part, (0, 3 - part.shape[-1])), cameras)[:, :, :3]
+            for part in gaussians.features.split(3, -1)
+        ]
+        return torch.cat(parts, 2)[:, :, : gaussians.features.shape[-1]]
 
 
 class _Splat(torch.autograd.Function):
-    """means, scales, quats, opacities, colors, c2w, intrinsics -> sums (B, V, 5, H, W)."""
+    """means, scales, quats, opacities, colors, c2w, intrinsics -> sums (B, V, 5, H, W).
+
+    colors: (B, G, 3), or (B, V, G, 3) of every view.
+    """
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:
@@ -86,7 +105,7 @@ class _Splat(torch.autograd.Function):
             )  # fmt: skip
 
         def blend(image: tuple[int, int], stripe: tuple[int, int], part: int) -> None:
-            scene = opacities[image[0]], colors[image[0]]
+            scene = opacities[image[0]], colors[image[: colors.ndim - 2]]
             kernels.forward_unit(rows[image], *scene, stripe, blending, out[image])
 
         stripes = _image_units(batch, views, size[0])
@@ -109,14 +128,14 @@ class _Splat(torch.autograd.Function):
         chunks = 1 + max((part for *_, part in units), default=0)
         grads = saved[0].new_zeros((batch, views, parts, count, kernels.GRADIENTS)).numpy()
         given = slopes[0].contiguous().numpy()
-        of_inputs = [torch.empty_like(tensor) for tensor in saved[:5]]
+        of_inputs = [torch.empty_like(tensor) for tensor in (*saved[:4], saved[0])]
         of_means, of_scales, of_quats, of_opacities, of_colors = _arrays(*of_inputs)
         of_cameras = torch.zeros((batch, chunks, views, CAMERA_GRADIENTS), dtype=torch.float64)
         camera_parts, wants_cameras = of_cameras.numpy(), any(ctx.needs_input_grad[5:7])
         projection, blending = _limits(ctx.config)
 
         def blend(image: tuple[int, int], stripe: tuple[int, int], part: int) -> None:
-            scene = opacities[image[0]], colors[image[0]]
+            scene = opacities[image[0]], colors[image[: colors.ndim - 2]]
             kernels.backward_unit(
                 rows[image], *scene, stripe, blending, sums[image], given[image], grads[image][part]
             )
@@ -130,6 +149,8 @@ class _Splat(torch.autograd.Function):
             )  # fmt: skip
 
         _in_threads((blend, stripes), (project, units))
+        if colors.ndim == 4:  # not to be added up over the views
+            of_inputs[4] = torch.from_numpy(grads[..., -3:].sum(2))
         if not wants_cameras:
             return *of_inputs, None, None, None, None
         rotation, position, lens = of_cameras.sum(1).float().split([9, 3, 4], -1)

@@ -5,11 +5,12 @@ from importlib import import_module
 from importlib.util import find_spec
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
-from qgs.renderers.inputs import background_of, check_inputs
+from qgs.renderers.inputs import background_of, check_inputs, colors_of
 from qgs.types import Cameras, Gaussians, Rendering
 
 
@@ -46,6 +47,11 @@ class GsplatRenderer(Renderer):
         with torch.autocast("cuda", enabled=False):
             gaussians, cameras = gaussians.to(torch.float32), cameras.to(torch.float32)
             backdrop = background_of(background, config.background, gaussians.means)
+            colors, features = colors_of(gaussians, cameras), gaussians.features
+            if features is not None:  # further channels, over 0
+                backdrop = F.pad(backdrop, (0, features.shape[-1]))
+                features = features[:, None] if colors.ndim == 4 else features
+                colors = torch.cat([colors, features.expand(*colors.shape[:-1], -1)], -1)
             height, width = cameras.size
             fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
             o, one = torch.zeros_like(fx), torch.ones_like(fx)
@@ -56,7 +62,7 @@ class GsplatRenderer(Renderer):
                 quats=gaussians.quats,
                 scales=gaussians.scales,
                 opacities=gaussians.opacities,
-                colors=gaussians.colors,
+                colors=colors,
                 viewmats=cameras.w2c,
                 Ks=calibration.unflatten(-1, (3, 3)),
                 width=width,
@@ -65,11 +71,13 @@ class GsplatRenderer(Renderer):
                 far_plane=config.far,
                 eps2d=config.dilation,
                 packed=False,
-                backgrounds=backdrop.expand(*cameras.shape, 3).contiguous(),
+                backgrounds=backdrop.expand(*cameras.shape, -1).contiguous(),
                 render_mode="RGB+ED",
             )
-        rgb, depth = rgbd.movedim(-1, -3).split([3, 1], dim=-3)
-        return Rendering(rgb=rgb, alpha=alpha.movedim(-1, -3), depth=depth)
+        images = rgbd.movedim(-1, -3)
+        shown = None if features is None else images[..., 3:-1, :, :]
+        alpha = alpha.movedim(-1, -3)
+        return Rendering(images[..., :3, :, :], alpha, images[..., -1:, :, :], shown)
 
 
 def _unsupported(config: ComponentConfig) -> list[Problem]:

@@ -1,8 +1,9 @@
-"""What renderers share: checks of their inputs, one precision, the background."""
+"""What renderers share: checks of inputs, one precision, colours that are seen, the background."""
 
 import torch
 from torch import Tensor
 
+from qgs.geometry.harmonics import seen_colors
 from qgs.types import Cameras, Gaussians
 
 
@@ -34,6 +35,11 @@ def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, 
     """Both as float64 if the means are, as float32 otherwise."""
     dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
+
+
+def colors_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """Colours (B, G, 3), or (B, V, G, 3) where they depend on the direction."""
+    return gaussians.colors if gaussians.sh is None else seen_colors(gaussians, cameras)
 
 
 def background_of(

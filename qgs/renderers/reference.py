@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.renderers.inputs import background_of, check_inputs, raise_precision
+from qgs.renderers.inputs import background_of, check_inputs, colors_of, raise_precision
 from qgs.types import Cameras, Gaussians, Rendering
 
 CLAMP_MARGIN = 0.15  # of the image's width or height: beyond it the Jacobian is held constant
@@ -100,36 +100,42 @@ class TorchRenderer(Renderer):
             gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, config.background, gaussians.means)
             splats = project(gaussians, cameras, config.near, config.far, config.dilation)
+            colors = colors_of(gaussians, cameras)
             sums = [
-                _composite(splats, gaussians, image, cameras.size, config)
+                _composite(splats, gaussians, colors, image, cameras.size, config)
                 for image in product(range(cameras.shape[0]), range(cameras.shape[1]))
             ]
-            sums = torch.stack(sums).reshape(*cameras.shape, 5, *cameras.size)
-            return resolve(sums, backdrop)
+            sums = torch.stack(sums).unflatten(0, cameras.shape)
+            features = None if gaussians.features is None else sums[:, :, 5:]
+            return resolve(sums[:, :, :5], backdrop, features)
 
 
-def resolve(sums: Tensor, background: Tensor) -> Rendering:
-    """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w -> Rendering."""
+def resolve(sums: Tensor, background: Tensor, features: Tensor | None = None) -> Rendering:
+    """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w, and those of features -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
     hit = torch.where(alpha > 0, alpha, 1.0)
-    return Rendering(rgb + (1 - alpha) * background[:, None, None], alpha, depth / hit)
+    return Rendering(rgb + (1 - alpha) * background[:, None, None], alpha, depth / hit, features)
 
 
 def _composite(
     splats: Splats,
     gaussians: Gaussians,
+    colors: Tensor,
     image: tuple[int, int],
     size: tuple[int, int],
     config: RendererConfig,
 ) -> Tensor:
-    """Sums (5, H, W) of one image (scene, view), front to back."""
+    """Sums (5 + F, H, W) of one image (scene, view), front to back.
+
+    colors: (B, G, 3) or (B, V, G, 3).
+    """
     height, width = size
     order = splats.depths[image].argsort(stable=True)
     order = order[splats.visible[image][order]]
     means, conics, depths = (
         field[image][order] for field in (splats.means, splats.conics, splats.depths)
     )
-    opacities, colors = gaussians.opacities[image[0]][order], gaussians.colors[image[0]][order]
+    opacities = gaussians.opacities[image[0]][order]
     u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
     v = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
     dx, dy = u - means[:, None, :1], v[:, None] - means[:, 1:, None]  # (G, 1, W), (G, H, 1)
@@ -140,5 +146,8 @@ def _composite(
     after = torch.cumprod(1 - alphas, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(order)]
     weights = torch.where(after > config.transmittance_min, alphas * before, 0.0)
-    features = torch.cat([colors, depths[:, None], torch.ones_like(depths[:, None])], 1)
-    return torch.einsum("ghw,gc->chw", weights, features)
+    colors, z = colors[image[: colors.ndim - 2]][order], depths[:, None]
+    summed = [colors, z, torch.ones_like(z)]
+    if gaussians.features is not None:
+        summed.append(gaussians.features[image[0]][order])
+    return torch.einsum("ghw,gc->chw", weights, torch.cat(summed, 1))

@@ -6,6 +6,7 @@ import torch
 from qgs.components import (
     ContentCrossAttention,
     ContentSelfAttention,
+    CrossSelfMlp,
     FreeCenters,
     GaussianHead,
     LatentQueries,
@@ -15,7 +16,7 @@ from qgs.components import (
     NoRefinement,
 )
 from qgs.contracts import ModelDims
-from qgs.model import DecoderLayer, QueryGaussianModel
+from qgs.model import QueryGaussianModel
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Views
 
@@ -29,12 +30,15 @@ def build_model() -> QueryGaussianModel:
     def make(component, **options):
         return component(component.Config(**options), dims)
 
-    layers = [
-        DecoderLayer(
-            make(ContentCrossAttention), make(ContentSelfAttention), make(MlpFeedForward), 0.1
-        )
-        for _ in range(DEPTH)
-    ]
+    def layer() -> CrossSelfMlp:
+        sublayers = {
+            "cross_attention": make(ContentCrossAttention),
+            "self_attention": make(ContentSelfAttention),
+            "feed_forward": make(MlpFeedForward),
+        }
+        return CrossSelfMlp(CrossSelfMlp.Config(), dims, sublayers, 0.1)
+
+    layers = [layer() for _ in range(DEPTH)]
     refinement = make(NoRefinement)
     head = make(GaussianHead, gaussians_per_query=PER_QUERY, init_std=0.3, scale_cap=0.2)
     return QueryGaussianModel(

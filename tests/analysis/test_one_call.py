@@ -1,6 +1,7 @@
 """`model.reconstruct` and `qgs.read_photos`; warnings of a model given views in another world."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from commands import run_qgs
 from photo_formats import row_of_frames
 from PIL import Image
+from varying_head import VaryingHead
 
 import qgs
 from qgs.geometry.poses import look_at
@@ -113,6 +115,24 @@ def test_gaussians_lie_in_the_world_of_the_photos(model, tmp_path):
         torch.testing.assert_close(rendering.rgb, own.rgb, atol=5e-3, rtol=0)
         torch.testing.assert_close(rendering.depth * factor, own.depth, atol=5e-3, rtol=1e-2)
     assert float((own.rgb - 1).abs().max()) > 0.05, "there is something to see"
+
+
+def test_harmonics_are_turned_into_the_world_of_the_photos(model, tmp_path, monkeypatch):
+    monkeypatch.setattr(model, "head", VaryingHead(model.head).eval())
+    views = somewhere()
+    result = model.reconstruct(views)
+    assert result.gaussians.sh is not None
+    own = model.render(result.gaussians, result.sample.inputs.cameras).rgb
+    with torch.no_grad():
+        plain = model.render(replace(result.gaussians, sh=None), result.sample.inputs.cameras).rgb
+    assert (own - plain).abs().max() > 0.02, "there is something to turn"
+    torch.testing.assert_close(result.render(views.cameras).rgb, own, atol=5e-3, rtol=0)
+    qgs.save_ply(result.in_photos_world, tmp_path / "placed.ply")
+    far = AutoRenderer(AutoRenderer.Config(far=1e5))  # in the unit of the photos
+    again = far(load_ply(tmp_path / "placed.ply"), views.cameras)
+    torch.testing.assert_close(again.rgb, own, atol=5e-3, rtol=0)
+    result.save(tmp_path / "saved")
+    assert torch.equal(load_ply(tmp_path / "saved" / "gaussians.ply").sh, result.gaussians.sh)
 
 
 def test_rotations_become_quaternions():

@@ -93,6 +93,14 @@ def test_rendered_weights_add_up_to_the_coverage(model, gaussians, cameras):
     torch.testing.assert_close(weights.sum(), alpha.sum(), rtol=1e-4, atol=1e-3)
 
 
+def test_paint_does_not_depend_on_the_direction(model, gaussians, cameras):
+    """Nor do weights on colours that harmonics make black."""
+    dark = replace(gaussians, sh=torch.full((1, gaussians.count, 3, 3), -9.0))
+    dark = replace(dark, features=gaussians.means)
+    weights = rendered_weights(model, gaussians, cameras)
+    assert torch.equal(rendered_weights(model, dark, cameras), weights)
+
+
 def test_notable_queries_are_heavy_well_inside_the_picture_and_apart(model, gaussians, cameras):
     queries = model.queries.count
     places = torch.zeros(queries, 2)

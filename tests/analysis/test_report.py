@@ -175,8 +175,8 @@ GREY = np.full((4, 6, 3), 128, np.uint8)
 
 PAGE = '<p title="a">&lt;</p>'
 
-def plugin(shown, sample):
-    names = [f"{c.name}: {p.gaussians.count} of {sample.scene}" for c, p in shown]
+def plugin(shown, samples):
+    names = [f"{c.name}: {p[0].gaussians.count} of {samples[0].scene}" for c, p in shown]
     return ReportSection("Mine <b>", "", {"": [Tile(GREY, names[0], page=PAGE)]})
 """
 
@@ -191,16 +191,49 @@ def test_a_distribution_adds_a_section_with_a_page(install):
     assert pages == ['<p title="a">&lt;</p>']
 
 
+SEVERAL = """
+from qgs.analysis.report import ReportSection, Tile
+import numpy as np
+
+def plugin(shown, samples):
+    for (contender, predictions) in shown:
+        for sample, prediction in zip(samples, predictions, strict=True):
+            picture = np.full((2, 2, 3), prediction.gaussians.count, np.uint8)
+            tile = Tile(picture, f"{prediction.gaussians.count} of {sample.scene}")
+            yield ReportSection(f"Mine of {sample.scene}", "", {contender.name: [tile]})
+    raise ValueError("no more")
+"""
+
+
+def test_one_function_gives_several_sections_of_all_scenes(install, caplog):
+    install("qgs-mine", "mine", SEVERAL, group=GROUP)
+    warn_once.cache_clear()
+    page = page_of(PLAIN, "plain")
+    assert page.index("<h2>Mine of test/000000</h2>") < page.index("<h2>Mine of test/000001</h2>")
+    assert "32 of test/000001" in page
+    assert "fails: ValueError: no more" in caplog.text, "what came before it stays"
+
+
+def test_a_model_reads_each_scene_once_for_all_pictures_but_those_of_its_inside(monkeypatch):
+    calls = []
+    recipe = resolve(PLAIN)
+    kind = type(recipe.build_model())
+    forward = kind.forward
+    monkeypatch.setattr(kind, "forward", lambda *a, **k: calls.append(1) or forward(*a, **k))
+    page_of(PLAIN, "plain")
+    assert len(calls) == PLAIN["evaluation"]["scenes"] + 2, "for anchors, and for attention"
+
+
 @pytest.mark.parametrize(
     ("source", "told"),
     [
         ("import nothing_of_this_name", "ModuleNotFoundError: No module named"),
         ("other = 1", "AttributeError"),
         ("plugin = 3", "TypeError: 'int' object is not callable"),
-        ("def plugin(shown, sample):\n    return 'text'", "it gives str, not a ReportSection"),
+        ("def plugin(shown, samples):\n    return 'text'", "it gives str, not a ReportSection"),
         (OFFERED.replace("[Tile(", "['text', Tile("), "has str among its figures, not a Tile"),
         (OFFERED.replace("Tile(GREY,", "Tile(GREY / 2,"), "must be uint8 (H, W, 3), got float64"),
-        ("def plugin(shown, sample):\n    raise SystemExit('gone')", "SystemExit: gone"),
+        ("def plugin(shown, samples):\n    raise SystemExit('gone')", "SystemExit: gone"),
     ],
 )
 def test_a_section_that_fails_is_said_and_left_out(install, caplog, source, told):

@@ -2,6 +2,7 @@
 
 import re
 from io import BytesIO
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -57,6 +58,39 @@ def test_a_model_says_its_slots_in_a_few_lines(model):
     for word in ("locus/anchored", "qgs/gaussian_head", "qgs/auto"):
         assert word in repr(model)
         assert f"<td>{word}</td>" in model._repr_html_()
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_notebook_shows_the_way_from_views_to_gaussians(model, known):
+    shown = model if known else qgs.compose(SMALL)
+    shown.recipe = shown.recipe if known else None
+    html = shown._repr_html_()
+    svg = ElementTree.fromstring(html[html.index("<svg") : html.index("</svg>") + 6])
+    space = "{http://www.w3.org/2000/svg}"
+    texts = [element.text or "" for element in svg.iter(f"{space}text")]
+    starts = ["views", "encoder: ", "queries: ", "2 decoder layers", "head: ", "Gaussians"]
+    found = [text for text in texts if text.startswith(tuple(starts))]
+    assert [text.startswith(start) for text, start in zip(found, starts, strict=True)] == [True] * 6
+    assert ("encoder: qgs/multiview_vit" in texts) == known
+    read = "qgs/content, locus/ray_biased" if known else "ContentCrossAttention, RayBiased"
+    assert any(text.startswith(f"cross_attention: {read}") for text in texts)
+    counts = [int(t.split()[0].replace(",", "")) for t in texts if t.endswith(" parameters")]
+    assert sum(counts) == sum(parameter.numel() for parameter in model.parameters())
+    boxes = [
+        [float(element.attrib[name]) for name in ("x", "y", "width", "height")]
+        for element in svg.iter(f"{space}rect")
+    ]
+    wide, high = (float(end) for end in svg.attrib["viewBox"].split()[2:])
+    for x, y, width, height in boxes:
+        assert 0 < x < x + width < wide
+        assert 0 < y < y + height < high
+    for text in svg.iter(f"{space}text"):
+        x, y = float(text.attrib["x"]), float(text.attrib["y"])
+        end = x + 6.62 * len(text.text or "")  # of 11 pixels, as monospaced letters are
+        holding = [b for b in boxes if b[0] < x < end < b[0] + b[2] and b[1] < y < b[1] + b[3]]
+        assert len(holding) == 1, text.text
+    assert len(list(svg.iter(f"{space}path"))) == 5, "arrows"
+    assert "#" not in html[: html.index("<table>")], "it takes the colours of its page"
 
 
 def test_a_model_built_by_hand_is_told_by_its_classes(model):

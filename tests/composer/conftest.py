@@ -9,13 +9,13 @@ import pytest
 SPATIAL = """
 from typing import Literal
 from qgs.contracts import (
-    CrossAttention, ComponentConfig, FieldSpec, Plugin, Queries, Refinement, SceneSource)
+    CrossAttention, ComponentConfig, FieldSpec, LearnedQueries, Plugin, Refinement, SceneSource)
 from qgs.types import QueryState
 
 PLACE = {"place.center": FieldSpec((3,), frame="world")}
 RADIUS = {"place.radius": FieldSpec((1,), frame="world")}
 
-class Placed(Queries):
+class Placed(LearnedQueries):
     name = "placed"
     class Config(ComponentConfig):
         count: int = 4
@@ -26,7 +26,7 @@ class Placed(Queries):
     @property
     def count(self):
         return self.config.count
-    def forward(self, batch_size):
+    def start(self, batch_size):
         raise NotImplementedError
 
 class Near(CrossAttention):
@@ -61,7 +61,7 @@ class Scenes(SceneSource):
     def scenes(self, split):
         return []
 
-plugin = Plugin("spatial", 1, (Placed, Near, Measure, Local, Scenes))
+plugin = Plugin("spatial", 2, (Placed, Near, Measure, Local, Scenes))
 """
 
 

@@ -13,12 +13,12 @@ from refusals import refused
 from qgs.composer import PluginError, RecipeError, compose
 from qgs.composer.build import build
 from qgs.composer.recipe import resolve
-from qgs.contracts import Plugin, Queries
+from qgs.contracts import LearnedQueries, Plugin
 from qgs.types import Cameras, QueryState, Views
 
 SOURCE = """
 from pydantic import field_validator
-from qgs.contracts import ComponentConfig, CrossAttention, FieldSpec, Loss, Plugin, Queries
+from qgs.contracts import ComponentConfig, CrossAttention, FieldSpec, Loss, Plugin, LearnedQueries
 from qgs.contracts import Refinement, SceneSource
 from qgs.types import QueryState
 import torch
@@ -65,13 +65,13 @@ class Closed(SceneSource):
 
 PLACE = {"place": FieldSpec((3,))}
 
-class Silent(Queries):
+class Silent(LearnedQueries):
     name = "silent"
     count = 3
     @classmethod
     def provides(cls, config):
         return PLACE
-    def forward(self, batch_size):
+    def start(self, batch_size):
         return QueryState(torch.zeros(batch_size, 3, self.dims.width))
 
 class Shapeless(Refinement):
@@ -85,18 +85,18 @@ class Losing(Refinement):
     def forward(self, state):
         return QueryState(state.features)
 
-class Placed(Queries):
+class Placed(LearnedQueries):
     name = "placed"
     count = 3
     provides = Silent.provides
-    def forward(self, batch_size):
+    def start(self, batch_size):
         place = torch.zeros(batch_size, 3, 3)
         return QueryState(torch.zeros(batch_size, 3, self.dims.width), {"place": place})
 
-class Bare(Queries):
+class Bare(LearnedQueries):
     name = "bare"
     count = 3
-    def forward(self, batch_size):
+    def start(self, batch_size):
         return torch.zeros(batch_size, 3, self.dims.width)
 
 class Boasting(CrossAttention):
@@ -106,7 +106,7 @@ class Boasting(CrossAttention):
         return state.features
 
 STATES = (Silent, Shapeless, Losing, Placed, Bare, Boasting)
-plugin = Plugin("faulty", 1, (Faulty, ExplodingLoss, Closed, *STATES))
+plugin = Plugin("faulty", 2, (Faulty, ExplodingLoss, Closed, *STATES))
 """
 
 HEAD = "recipe: 1\nplugins: [faulty]\n"
@@ -240,7 +240,7 @@ def test_a_broken_promise_is_placed_at_its_forward(write, install):
         def forward(self, state):  # line 9, its decorator 8
             return None
 
-    plugin = Plugin("faulty", 1, (Empty,))
+    plugin = Plugin("faulty", 2, (Empty,))
     """
     install("qgs-faulty", "faulty", source, editable=True)
     recipe = resolve(write(HEAD + "model: {decoder: {refinement: {type: faulty/empty}}}\n"))
@@ -251,11 +251,11 @@ def test_a_broken_promise_is_placed_at_its_forward(write, install):
 
 
 def test_a_plugin_in_memory_is_reported_without_a_distribution():
-    class Silent(Queries):
+    class Silent(LearnedQueries):
         name = "silent"
         count = 3
 
-        def forward(self, batch_size: int) -> QueryState:
+        def start(self, batch_size: int) -> QueryState:
             raise NotImplementedError
 
         @classmethod
@@ -263,7 +263,7 @@ def test_a_plugin_in_memory_is_reported_without_a_distribution():
             raise KeyError("oops")
 
     recipe = {"recipe": 1, "plugins": ["mine"], "model": {"queries": {"type": "mine/silent"}}}
-    problem = refused(recipe, plugins=[Plugin("mine", 1, (Silent,))])
+    problem = refused(recipe, plugins=[Plugin("mine", 2, (Silent,))])
     assert problem.reason.startswith("the plugin `mine` fails: `provides` of `mine/silent` raises")
     place = rf"correct {re.escape(__file__)}:\d+, or choose another component"
     assert re.fullmatch(place, problem.fix)

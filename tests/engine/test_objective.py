@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from training_runs import Tiny
+from varying_head import VaryingHead
 
 from qgs.composer import Recipe
 from qgs.contracts import ComponentConfig, Loss
@@ -179,6 +180,32 @@ def test_gradients_do_not_depend_on_it(
     assert error(objective, *batch) < 1e-6
     outcome = objective(*batch)
     assert float(outcome.total.detach()) == pytest.approx(float(sum(outcome.terms.values())))
+
+
+class Marked(Loss):
+    """The rendered features, which are to be those of the colours' weights."""
+
+    name: ClassVar[str] = "marked"
+    renderings = "each"
+
+    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
+        return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("all_at_once", [False, True])
+def test_harmonics_and_features_get_theirs(
+    setting: Setting, renderer: str, all_at_once: bool
+) -> None:
+    model, losses, *batch = setting(renderer)
+    model.head = VaryingHead(model.head)
+    losses |= {"marked": Marked(ComponentConfig())} | (
+        {"flicker": Flicker()} if all_at_once else {}
+    )
+    objective = Objective(model, losses, render_views=2)
+    assert error(objective, *batch) < 1e-6
+    found = gradients(objective, objective(*batch).total)["model.head.linear.weight"]
+    assert found.unflatten(0, (-1, 28)).abs().amax((0, 2)).gt(0).all(), "all channels"
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")

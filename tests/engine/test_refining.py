@@ -4,6 +4,7 @@ import math
 import os
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -15,7 +16,7 @@ from qgs.engine.growth import DEAD, Leaves
 from qgs.engine.refining import mean_psnr, resized
 from qgs.geometry.poses import look_at
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Gaussians, Views, map_tensors
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 RATES: dict[str, float] = dict.fromkeys(
@@ -101,6 +102,24 @@ def test_there_are_as_many_as_wanted(scene: tuple[Views, Views], wanted: int) ->
         torch.testing.assert_close(two_steps[:, : wanted // 2], kept, atol=0.06, rtol=0)
 
 
+def test_harmonics_are_refined_and_features_kept(scene: tuple[Views, Views]) -> None:
+    """New Gaussians start with none of both, copies with those of their parents."""
+    photos, compared = scene
+    start = cloud(30)
+    marks = torch.arange(1.0, 31)[None, :, None]
+    start = replace(start, sh=torch.zeros(1, 30, 8, 3), features=marks)
+    result = qgs.refine(start, photos, 120, count=50, compared=compared).gaussians
+    assert result.sh is not None
+    assert result.sh.shape == (1, 50, 8, 3)
+    assert result.sh.abs().max() > 1e-3
+    assert {*result.features.flatten().tolist()} <= {*range(31)}
+    kept = start.most_opaque(15).features
+    assert (result.features == kept[0, 0, 0]).any()
+    plain = qgs.refine(cloud(30), photos, 20, count=50).gaussians
+    assert plain.sh is None
+    assert plain.features is None
+
+
 def test_an_interrupt_keeps_what_there_is(
     scene: tuple[Views, Views], clock: Callable[[Callable[[int], Any]], None]
 ) -> None:
@@ -121,14 +140,18 @@ def test_a_coarser_level_shows_the_same_scene() -> None:
 
 def unusable() -> Iterator[Any]:
     photos, one = Views(torch.rand(1, 2, 3, 24, 24), ring(2)), cloud(4)
-    two = Gaussians(*(x.expand(2, *x.shape[1:]) for x in vars(one).values()))
-    broken = Gaussians(*(x * math.nan for x in vars(one).values()))
+    two = map_tensors(lambda x: x.expand(2, *x.shape[1:]), one)
+    broken = map_tensors(lambda x: x * math.nan, one)
     yield pytest.param(two, photos, {}, r"of one scene.*got 2 scenes of 4 Gaussians", id="scenes")
     yield pytest.param(one, photos.select([]), {}, "1 scenes of 0 photos", id="photos")
     yield pytest.param(one, photos, {"seconds": 0}, "0 seconds.*at least one of each", id="seconds")
     yield pytest.param(one, photos, {"count": 0}, "0 Gaussians wanted", id="count")
     yield pytest.param(broken, photos, {}, "not finite", id="nan")
     yield pytest.param(one, photos, {"count": 10**11}, "22.4 TB of memory", id="memory")
+    rich = replace(one, sh=torch.zeros(1, 4, 15, 3))
+    yield pytest.param(rich, photos, {"count": 10**11}, "94.4 TB of memory", id="harmonics")
+    nan = replace(one, sh=torch.full((1, 4, 15, 3), math.nan))
+    yield pytest.param(nan, photos, {}, "not finite", id="nan harmonics")
 
 
 @pytest.mark.parametrize(("gaussians", "views", "options", "message"), [*unusable()])

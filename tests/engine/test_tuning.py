@@ -57,10 +57,10 @@ def test_every_floating_field_is_tuned_and_no_other(
 ) -> None:
     recipe = tiny("locus")
     model, inputs = model_and_inputs(recipe)
-    start = model.queries(1)
+    start = model.queries.start(1)
     numbers = torch.arange(start.features.shape[1])[None]
     labelled = start.replace(fields={"stranger.label": numbers})
-    monkeypatch.setattr(model.queries, "forward", lambda batch_size: labelled)
+    monkeypatch.setattr(model.queries, "forward", lambda memory, views: labelled)
     seen: list[QueryState] = []
     predict = model.predict
 
@@ -86,14 +86,14 @@ def test_recipes_without_a_photometric_loss_take_the_published_one(tiny: Tiny) -
 
 def test_a_forward_pass_starts_from_the_given_state(tiny: Tiny) -> None:
     model, inputs = model_and_inputs(tiny("locus"))
-    start = model.queries(1)
+    start = model.queries.start(1)
     shifted = start.replace(fields={"anchor.center": start["anchor.center"] + 1})
     with torch.no_grad():
         plain, same, moved = model(inputs), model(inputs, state=start), model(inputs, state=shifted)
     assert torch.equal(plain.gaussians.means, same.gaussians.means)
     assert not torch.allclose(plain.gaussians.means, moved.gaussians.means)
     with pytest.raises(ValueError, match="the memory is of 1 scenes, the initial state of 2"):
-        model(inputs, state=model.queries(2))
+        model(inputs, state=model.queries.start(2))
 
 
 LATENTS = (

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import typer
 from guide_pages import DOCS, text_of
+from qgs_plugintools.new_command import rendered
 from typer.core import TyperGroup
 
 from qgs.cli import app
-from qgs.cli.new_plugin import rendered
 
 TEMPLATE = {path.name: text for path, text in rendered("sightline")}
 README = TEMPLATE["README.md"]
@@ -88,5 +88,6 @@ def test_a_plugin_depends_on_qgs_and_on_what_qgs_depends_on() -> None:
         for project in (PROJECT, PLUGIN)
         for extras in [project["optional-dependencies"].values()]
     )
-    assert theirs == {"query-gaussians", "pydantic", "torch", "pytest"}
-    assert theirs <= {"query-gaussians", *ours}
+    of_ours = {"query-gaussians", "query-gaussians-plugintools"}
+    assert theirs == {*of_ours, "pydantic", "torch", "pytest"}
+    assert theirs <= {*of_ours, *ours}

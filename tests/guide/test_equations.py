@@ -30,7 +30,8 @@ Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-at
     self-attention | PE | refinement | means | means, ablation
 Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in features |
     refinement | means | Gaussians in the anchor's frame
-Gaussians (both papers): position | free means | colour, scale, opacity, rotation | rendering
+Gaussians (both papers): position | free means | colour, scale, opacity, rotation
+    | colour along a direction d | rendering
 Objective (both papers): photometric | L1, LPIPS | visibility | visibility of anchors |
     over layers | weight decay | schedule | token tuning | refinement |
     depth of a pixel | splitting a Gaussian | growing queries

@@ -13,12 +13,12 @@ import pytest
 import torch
 import yaml
 from guide_pages import blocks, text_of
+from qgs_plugintools import Case, checks_for, run_check
 
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import load_registry
 from qgs.composer.slots import SLOTS
 from qgs.contracts import ComponentConfig, ModelDims
-from qgs.testing import Case, checks_for, run_check
 from qgs.types import QueryState
 
 

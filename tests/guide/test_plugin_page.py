@@ -14,14 +14,14 @@ import pytest
 import torch
 from guide_pages import blocks
 from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_plugintools import Case, cases_of, checks_for, run_check
+from qgs_plugintools.inputs import inputs_of
+from qgs_plugintools.new_command import rendered
 
-from qgs.cli.new_plugin import rendered
 from qgs.composer import RecipeError
 from qgs.composer.recipe import resolve
 from qgs.composer.registry import InstalledPlugin
 from qgs.contracts import ModelDims
-from qgs.testing import Case, cases_of, checks_for, run_check
-from qgs.testing.inputs import inputs_of
 from qgs.types import QueryState
 
 PACKAGE = "qgs_sightline"
@@ -96,7 +96,7 @@ def test_the_field_starts_changes_and_places(package: ModuleType) -> None:
     queries = depth.DepthQueries(depth.DepthQueries.Config(count=4), dims)
     refinement = depth.DepthRefinement(depth.DepthRefinement.Config(), dims)
     centers = depth.DepthCenters(depth.DepthCenters.Config(), dims)
-    state = refinement(queries(2))
+    state = refinement(queries.start(2))
     learned = queries.log_depth + refinement.step(queries.features)
     means = centers(torch.zeros(2, 4, 1, 3), state)
     torch.testing.assert_close(means[1, :, 0, 2:], learned.clamp(-4, 4).exp())

@@ -9,11 +9,11 @@ from pkgutil import resolve_name
 from posixpath import normpath
 
 import pytest
+import qgs_plugintools
 from guide_pages import DOCS, all_pages
+from qgs_plugintools import CHECKS
 
 import qgs
-import qgs.testing
-from qgs.testing import CHECKS
 
 PAGES = all_pages()
 CODE = re.compile(r"^```.*?^```$|^(?:    .*\n)+|`[^`\n]+`", re.DOTALL | re.MULTILINE)
@@ -82,7 +82,7 @@ def test_every_public_name_of_the_suite_is_documented() -> None:
     page = PAGES["api/testing.md"]
     documented = {name.rpartition(".")[2] for name in DOCUMENTED.findall(page)}
     headings = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
-    assert documented | headings == set(qgs.testing.__all__)
+    assert documented | headings == set(qgs_plugintools.__all__)
 
 
 def test_every_check_is_listed_with_its_contract() -> None:

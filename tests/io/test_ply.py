@@ -1,8 +1,12 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
+from qgs.data.scenes import warn_once
 from qgs.io.ply import OPACITY_EPS, PROPERTIES, SH_C0, load_ply, save_ply
 from qgs.types import Gaussians
 
@@ -114,10 +118,71 @@ def test_files_of_others_are_read(tmp_path, caplog):
     PlyData([PlyElement.describe(smaller, "vertex")], text=True).write(tmp_path / "other.ply")
     torch.testing.assert_close(load_ply(tmp_path / "other.ply").quats[0], gaussians.quats)
     assert caplog.text == ""
-    vertices["f_rest_3"] = 1
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(tmp_path / "rest.ply")
-    torch.testing.assert_close(load_ply(tmp_path / "rest.ply").colors[0], gaussians.colors)
-    assert "rest.ply has colours that depend on the direction" in caplog.text
+
+
+@pytest.mark.parametrize("count", [3, 8, 15])
+def test_harmonics_make_the_round_trip(tmp_path, count):
+    gaussians = replace(random_gaussians(1, 20), sh=torch.randn(1, 20, count, 3))
+    save_ply(gaussians, tmp_path / "scene.ply")
+    again = load_ply(tmp_path / "scene.ply")
+    assert torch.equal(again.sh, gaussians.sh)
+    torch.testing.assert_close(again.colors, gaussians.colors)
+
+
+def test_harmonics_lie_channel_by_channel(tmp_path):
+    """f_rest_0 to 14 are red, 15 to 29 green, 30 to 44 blue, as in the 3DGS release."""
+    gaussians = replace(random_gaussians(5), sh=torch.randn(5, 8, 3))
+    save_ply(gaussians, tmp_path / "scene.ply")
+    vertices = PlyData.read(tmp_path / "scene.ply")["vertex"].data
+    for channel, coefficient in ((0, 0), (1, 7), (2, 3)):
+        column = vertices[f"f_rest_{15 * channel + coefficient}"]
+        np.testing.assert_array_equal(column, gaussians.sh[:, coefficient, channel])
+    assert not any(vertices[f"f_rest_{15 * channel + 8}"].any() for channel in range(3))
+
+
+def test_a_parser_of_others_reads_the_same_harmonics(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="gsply, a reader of splat files, is not installed")
+    gaussians = replace(random_gaussians(1, 20), sh=torch.randn(1, 20, 15, 3))
+    save_ply(gaussians, tmp_path / "scene.ply")
+    read = gsply.plyread(str(tmp_path / "scene.ply")).shN
+    np.testing.assert_array_equal(read.reshape(20, 15, 3), gaussians.sh[0])
+
+
+def test_files_of_fewer_degrees_are_read(tmp_path):
+    gaussians = replace(random_gaussians(4), sh=torch.randn(4, 3, 3))
+    save_ply(gaussians, tmp_path / "scene.ply")
+    vertices = PlyData.read(tmp_path / "scene.ply")["vertex"].data
+
+    def written(name: str, rest: int) -> Path:
+        kept = [n for n in PROPERTIES if not n.startswith("f_rest_")]
+        fewer = np.zeros(4, [(n, "<f4") for n in (*kept, *(f"f_rest_{i}" for i in range(rest)))])
+        for n in kept:
+            fewer[n] = vertices[n]
+        for channel in range(3 if rest == 9 else 0):
+            for i in range(3):
+                fewer[f"f_rest_{3 * channel + i}"] = vertices[f"f_rest_{15 * channel + i}"]
+        PlyData([PlyElement.describe(fewer, "vertex")]).write(tmp_path / name)
+        return tmp_path / name
+
+    assert torch.equal(load_ply(written("first.ply", 9)).sh[0], gaussians.sh)
+    assert load_ply(written("zeros.ply", 24)).sh is None
+    with pytest.raises(ValueError, match=r"odd.ply has 10 properties f_rest_\*; .* f_rest_8, "):
+        load_ply(written("odd.ply", 10))
+
+
+def test_features_are_left_out_with_a_word(tmp_path, caplog):
+    gaussians = replace(random_gaussians(1, 4), features=torch.ones(1, 4, 2))
+    warn_once.cache_clear()
+    save_ply(gaussians, tmp_path / "scene.ply")
+    assert "no place for `features`: they are left out" in caplog.text
+    assert load_ply(tmp_path / "scene.ply").features is None
+
+
+def test_harmonics_that_are_not_finite_are_refused(tmp_path):
+    gaussians = replace(random_gaussians(4), sh=torch.zeros(4, 3, 3))
+    gaussians.sh[1:3, 2, 0] = torch.inf
+    with pytest.raises(ValueError, match="2 of 4 Gaussians"):
+        save_ply(gaussians, tmp_path / "inf.ply")
 
 
 def test_what_is_no_ply_of_gaussians_is_refused(tmp_path):

@@ -1,14 +1,16 @@
 """Files of Gaussians for other viewers: .splat, and `qgs convert`."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import torch
 from commands import run_qgs
 
 import qgs
+from qgs.data.scenes import warn_once
 from qgs.io.splat import RECORD, save_splat
-from qgs.types import Gaussians
+from qgs.types import Gaussians, map_tensors
 
 
 def gaussians(count: int) -> Gaussians:
@@ -52,11 +54,25 @@ def test_the_most_opaque_are_kept(tmp_path):
     assert run_qgs("convert", tmp_path / "all.ply", tmp_path / "same.PLY").exception is None
     assert torch.equal(qgs.load_ply(tmp_path / "same.PLY").means, given.means)
     assert given.most_opaque(99).count == 50
-    both = Gaussians(*(torch.cat([x, x.flip(1)]) for x in vars(given).values()))
+    both = map_tensors(lambda x: torch.cat([x, x.flip(1)]), given)
     halves = both.most_opaque(5)
     torch.testing.assert_close(halves.colors[0], halves.colors[1].flip(0))
     assert run_qgs("convert", tmp_path / "few.ply", tmp_path / "few.splat").exception is None
     assert (tmp_path / "few.splat").stat().st_size == 7 * 32
+
+
+def test_harmonics_survive_convert_and_are_told_of_where_they_cannot(tmp_path, caplog):
+    given = replace(gaussians(9), sh=torch.randn(1, 9, 8, 3))
+    qgs.save_ply(given, tmp_path / "all.ply")
+    done = run_qgs("convert", tmp_path / "all.ply", tmp_path / "few.ply", "--count", 3)
+    assert done.exception is None
+    assert torch.equal(qgs.load_ply(tmp_path / "few.ply").sh, given.most_opaque(3).sh)
+    assert caplog.text == ""
+    warn_once.cache_clear()
+    assert run_qgs("convert", tmp_path / "all.ply", tmp_path / "all.splat").exception is None
+    assert ".splat files have no place for spherical harmonics (`sh`): left out" in caplog.text
+    save_splat(replace(qgs.load_ply(tmp_path / "all.ply"), sh=None), tmp_path / "plain.splat")
+    assert (tmp_path / "plain.splat").read_bytes() == (tmp_path / "all.splat").read_bytes()
 
 
 def test_other_kinds_and_files_that_exist_are_refused(tmp_path):

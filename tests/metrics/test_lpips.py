@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 import torch
+from qgs_plugintools import Case
+from qgs_plugintools.inputs import Sizes, inputs_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from qgs.contracts import MissingExtraError
 from qgs.losses import LpipsLoss
 from qgs.metrics.lpips import Lpips
-from qgs.testing import Case
-from qgs.testing.inputs import Sizes, inputs_of
 
 CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0)
 """VGG-16's convolutions; 0 is a pooling."""

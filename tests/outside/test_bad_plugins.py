@@ -15,10 +15,10 @@ PLUGIN = "from qgs.contracts import Plugin\nplugin = Plugin('{name}', {version},
 
 LIAR = """
 import torch
-from qgs.contracts import FieldSpec, Plugin, Queries
+from qgs.contracts import FieldSpec, Plugin, LearnedQueries
 from qgs.types import QueryState
 
-class Hollow(Queries):
+class Hollow(LearnedQueries):
     name = "hollow"
     count = 4
 
@@ -26,10 +26,10 @@ class Hollow(Queries):
     def provides(cls, config):
         return {"hollow.place": FieldSpec((3,), frame="world")}
 
-    def forward(self, batch_size):
+    def start(self, batch_size):
         return QueryState(torch.zeros(batch_size, self.count, self.dims.width))
 
-plugin = Plugin("liar", 1, (Hollow,))
+plugin = Plugin("liar", 2, (Hollow,))
 """
 
 SOURCES = {
@@ -46,7 +46,7 @@ SOURCES = {
         """
         from qgs.components import LatentQueries
         from qgs.contracts import Plugin
-        plugin = Plugin("repeats", 1, (LatentQueries, LatentQueries))
+        plugin = Plugin("repeats", 2, (LatentQueries, LatentQueries))
         """,
         "registers `latent` twice",
     ),

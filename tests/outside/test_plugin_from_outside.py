@@ -1,4 +1,4 @@
-"""A plugin written outside this repository, beside the wheels of qgs and LocusGS."""
+"""A plugin written outside this repository, beside the wheels of qgs, LocusGS and the tools."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ from fresh_environment import ROOT, FreshEnvironment
 pytestmark = pytest.mark.slow
 
 ORIGIN = """
-import pathlib, qgs, qgs_locus
-for module in (qgs, qgs_locus):
+import pathlib, qgs, qgs_locus, qgs_plugintools
+for module in (qgs, qgs_locus, qgs_plugintools):
     print(pathlib.Path(module.__file__).parents[1])
 """
 

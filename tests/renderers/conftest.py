@@ -1,7 +1,7 @@
 """Scenes with well separated depths, and gradients of everything a renderer differentiates."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from qgs.contracts import Renderer, RendererConfig
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.renderers import CpuRenderer, GsplatRenderer, TorchRenderer
-from qgs.types import Cameras, Gaussians, Rendering
+from qgs.types import Cameras, Gaussians, Rendering, named_tensors
 
 RENDERERS = {"torch": TorchRenderer, "cpu": CpuRenderer, "gsplat": GsplatRenderer}
 HAS_GSPLAT = torch.cuda.is_available() and find_spec("gsplat") is not None
@@ -50,7 +50,10 @@ def build(request: pytest.FixtureRequest) -> Callable[..., Renderer]:
 
 @pytest.fixture
 def make_scene() -> Callable[..., tuple[Gaussians, Cameras]]:
-    """`make_scene(batch, views, count, size)`: float32 Gaussians in front of turned cameras."""
+    """`make_scene(batch, views, count, size)`: float32 Gaussians in front of turned cameras.
+
+    harmonics, features: how many coefficients and further channels they have.
+    """
 
     def make(
         batch: int = 1,
@@ -59,6 +62,8 @@ def make_scene() -> Callable[..., tuple[Gaussians, Cameras]]:
         size: tuple[int, int] = (24, 40),
         scale: float = 0.08,
         seed: int = 0,
+        harmonics: int = 0,
+        features: int = 0,
     ) -> tuple[Gaussians, Cameras]:
         generator = torch.Generator().manual_seed(seed)
         rand = partial(torch.rand, generator=generator, dtype=torch.float64)
@@ -81,6 +86,10 @@ def make_scene() -> Callable[..., tuple[Gaussians, Cameras]]:
         focal = max(size) * (0.9 + 0.2 * rand(batch, views, 2))
         centre = torch.tensor([width / 2, height / 2]) + 0.5 * randn(batch, views, 2)
         cameras = Cameras(c2w, torch.cat([focal, centre], -1), size)
+        if harmonics:
+            gaussians = replace(gaussians, sh=0.1 * randn(batch, count, harmonics, 3))
+        if features:
+            gaussians = replace(gaussians, features=randn(batch, count, features))
         return gaussians.to(torch.float32), cameras.to(torch.float32)
 
     return make
@@ -99,17 +108,17 @@ def differentiate() -> Callable[..., tuple[Rendering, Gradients]]:
     def run(
         renderer: Renderer, gaussians: Gaussians, cameras: Cameras
     ) -> tuple[Rendering, Gradients]:
-        leaves = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+        leaves = dict(named_tensors(gaussians))
         leaves |= {"c2w": cameras.c2w, "intrinsics": cameras.intrinsics}
         leaves = {name: value.detach().clone().requires_grad_() for name, value in leaves.items()}
         if getattr(renderer, "kind", "") == "gsplat":
             leaves["intrinsics"].requires_grad_(False)
         lenses = Cameras(leaves["c2w"], leaves["intrinsics"], cameras.size)
-        scene = Gaussians(**{f.name: leaves[f.name] for f in fields(gaussians)})
+        scene = Gaussians(**{name: leaves[name] for name, _ in named_tensors(gaussians)})
         rendering = renderer(scene, lenses)
         generator = torch.Generator().manual_seed(1)
         loss = torch.zeros((), dtype=rendering.rgb.dtype)
-        for image in (rendering.rgb, rendering.alpha, rendering.depth):
+        for _, image in named_tensors(rendering):
             weights = torch.rand(image.shape, generator=generator, dtype=torch.float64)
             loss = loss + (image * weights.to(image)).sum()
         names = [name for name, leaf in leaves.items() if leaf.requires_grad]

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from qgs.contracts import RendererConfig
-from qgs.geometry.transforms import quat_to_matrix
-from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, Gaussians, Rendering
+from qgs.geometry.harmonics import seen_colors
+from qgs.geometry.transforms import moved, quat_to_matrix
+from qgs.renderers import TorchRenderer, inputs
+from qgs.types import Cameras, Gaussians, Rendering, named_tensors
 
 IMAGES = ("rgb", "alpha", "depth")
 
@@ -19,9 +20,9 @@ def oracle(**options: object) -> TorchRenderer:
 
 
 def assert_images_match(found: Rendering, expected: Rendering, tolerance: float) -> None:
-    for name in IMAGES:
+    for name, image in named_tensors(found):
         torch.testing.assert_close(
-            getattr(found, name).double(), getattr(expected, name), atol=tolerance, rtol=tolerance
+            image.double(), getattr(expected, name), atol=tolerance, rtol=tolerance
         )
 
 
@@ -47,8 +48,8 @@ def compared(differentiate, renderer, scene, tolerances=(2e-5, 2e-5), **options)
 
 
 def assert_finite(rendering: Rendering, gradients: dict) -> None:
-    for name in IMAGES:
-        assert torch.isfinite(getattr(rendering, name)).all(), name
+    for name, image in named_tensors(rendering):
+        assert torch.isfinite(image).all(), name
     for name, grad in gradients.items():
         assert torch.isfinite(grad).all(), name
 
@@ -77,20 +78,70 @@ def test_images_and_gradients_match_the_oracle(build, make_scene, differentiate,
     assert rendering.alpha.max() > 0.05
 
 
-def test_scenes_and_views_do_not_mix(build, make_scene):
-    gaussians, cameras = make_scene(batch=2, views=3)
+@pytest.mark.parametrize(
+    "more", [{"harmonics": 3}, {"harmonics": 8, "features": 1}, {"harmonics": 15}, {"features": 5}]
+)
+def test_harmonics_and_features_match_the_oracle(build, make_scene, differentiate, more):
+    scene = make_scene(batch=2, views=2, **more)
+    (found, gradients), _ = compared(differentiate, build(), scene)
+    assert (found.features is None) is ("features" not in more)
+    assert all(gradients[name].abs().max() > 0 for name in gradients.keys() & {"sh", "features"})
+
+
+def test_harmonics_are_the_colours_of_every_view(build, make_scene):
+    gaussians, cameras = make_scene(views=3, harmonics=15)
+    together = build()(gaussians, cameras)
+    colors = seen_colors(gaussians, cameras)
+    for v in range(3):
+        plain = replace(gaussians, colors=colors[:, v], sh=None)
+        alone = build()(plain, cameras[:, v : v + 1])
+        torch.testing.assert_close(together.rgb[:, v], alone.rgb[:, 0], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(together.depth[:, v], alone.depth[:, 0], rtol=1e-5, atol=1e-6)
+    assert (together.rgb - build()(replace(gaussians, sh=None), cameras).rgb).abs().max() > 0.02
+
+
+def test_harmonics_of_zero_are_none(build, make_scene):
+    gaussians, cameras = make_scene(views=2)
+    none = replace(gaussians, sh=torch.zeros(1, 40, 15, 3))
+    given, plain = (build()(scene, cameras) for scene in (none, gaussians))
+    for name in IMAGES:
+        assert torch.equal(getattr(given, name), getattr(plain, name)), name
+
+
+def test_features_are_blended_as_colours_over_nothing(build, make_scene):
+    gaussians, cameras = make_scene(batch=2, views=2, features=3)
+    rendering = build()(gaussians, cameras)
+    painted = replace(gaussians, colors=gaussians.features, features=None)
+    expected = build()(painted, cameras, torch.zeros(3))
+    torch.testing.assert_close(rendering.features, expected.rgb, rtol=1e-5, atol=1e-6)
+    assert expected.features is None
+    for width in (0, 1, 7):
+        shown = gaussians.features.repeat(1, 1, 3)[..., :width]
+        found = build()(replace(gaussians, features=shown), cameras).features
+        torch.testing.assert_close(found, rendering.features.repeat(1, 1, 3, 1, 1)[:, :, :width])
+
+
+def test_without_harmonics_and_features_nothing_more_is_computed(build, make_scene, monkeypatch):
+    gaussians, cameras = make_scene(views=2)
+    monkeypatch.setattr(inputs, "seen_colors", lambda *_: pytest.fail("there are no harmonics"))
+    assert build()(gaussians, cameras).features is None
+
+
+@pytest.mark.parametrize("more", [{}, {"harmonics": 15, "features": 2}])
+def test_scenes_and_views_do_not_mix(build, make_scene, more):
+    gaussians, cameras = make_scene(batch=2, views=3, **more)
     together = build()(gaussians, cameras)
     for b in range(2):
         for v in range(3):
             alone = build()(gaussians[b : b + 1], cameras[b : b + 1, v : v + 1])
-            for name in IMAGES:
+            for name, image in named_tensors(together):
                 torch.testing.assert_close(
-                    getattr(together, name)[b, v], getattr(alone, name)[0, 0], rtol=1e-5, atol=1e-6
+                    image[b, v], getattr(alone, name)[0, 0], rtol=1e-5, atol=1e-6
                 )
 
 
 def test_zero_gaussians_show_the_background(build, make_scene, differentiate):
-    gaussians, cameras = make_scene(count=4, batch=2, views=2)
+    gaussians, cameras = make_scene(count=4, batch=2, views=2, harmonics=3, features=4)
     rendering, gradients = differentiate(
         build(background=(0.1, 0.2, 0.3)), gaussians[:, :0], cameras
     )
@@ -131,7 +182,7 @@ def extreme(gaussians: Gaussians, change: str) -> Gaussians:
 
 @pytest.mark.parametrize("change", [*FACTORS, *OTHERS])
 def test_extreme_gaussians_stay_finite(build, make_scene, differentiate, change):
-    gaussians, _ = make_scene(batch=2)
+    gaussians, _ = make_scene(batch=2, harmonics=15, features=2)
     camera = identity_camera()
     cameras = Cameras(camera.c2w.repeat(2, 1, 1, 1), camera.intrinsics.repeat(2, 1, 1), camera.size)
     rendering, gradients = differentiate(build(), extreme(gaussians, change), cameras)
@@ -182,25 +233,12 @@ def test_background_can_be_overridden(build, make_scene):
 
 
 def test_rigid_motion_of_everything_changes_nothing(build, make_scene):
-    gaussians, cameras = make_scene(views=2)
+    gaussians, cameras = make_scene(views=2, harmonics=15)
     quat = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8, 0.2]), dim=0)
     motion = torch.eye(4)
     motion[:3, :3], motion[:3, 3] = quat_to_matrix(quat), torch.tensor([0.4, -1.0, 0.7])
-    w, v = quat[0], quat[1:]
-    turned = torch.cat(
-        [
-            w * gaussians.quats[..., :1] - (gaussians.quats[..., 1:] * v).sum(-1, keepdim=True),
-            w * gaussians.quats[..., 1:]
-            + gaussians.quats[..., :1] * v
-            + torch.linalg.cross(v.expand_as(gaussians.quats[..., 1:]), gaussians.quats[..., 1:]),
-        ],
-        -1,
-    )
-    moved = replace(
-        gaussians, means=gaussians.means @ motion[:3, :3].T + motion[:3, 3], quats=turned
-    )
     before = build()(gaussians, cameras)
-    after = build()(moved, replace(cameras, c2w=motion @ cameras.c2w))
+    after = build()(moved(gaussians, motion, 1.0), replace(cameras, c2w=motion @ cameras.c2w))
     for name in IMAGES:
         torch.testing.assert_close(
             getattr(after, name), getattr(before, name), rtol=1e-3, atol=1e-4

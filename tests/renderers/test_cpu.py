@@ -4,7 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ import qgs.renderers
 import qgs.renderers.cpu
 from qgs.contracts import RendererConfig
 from qgs.renderers import COMPONENTS, CpuRenderer
-from qgs.types import Gaussians
+from qgs.types import concatenated, named_tensors
 
 
 @pytest.fixture
@@ -62,22 +62,19 @@ def test_the_projection_has_the_gradients_of_autograd(
         assert error < tolerance, name
 
 
-def test_more_gaussians_than_a_unit_of_work_takes(make_scene, differentiate):
+@pytest.mark.parametrize("more", [{}, {"harmonics": 3, "features": 4}])
+def test_more_gaussians_than_a_unit_of_work_takes(make_scene, differentiate, more):
     """Repeating a scene with opacity 0 changes neither its images nor its gradients."""
-    gaussians, cameras = make_scene(batch=2, views=2, count=300)
+    gaussians, cameras = make_scene(batch=2, views=2, count=300, **more)
     fillers = replace(gaussians, opacities=gaussians.opacities * 0)
-    both = (
-        (getattr(fillers, f.name) for f in fields(fillers)),
-        (getattr(gaussians, f.name) for f in fields(gaussians)),
-    )
-    padded = Gaussians(*(torch.cat(pair, 1) for pair in zip(*both, strict=True)))
+    padded = concatenated([fillers, gaussians], 1)
     renderer = CpuRenderer(RendererConfig())
     rendering, gradients = differentiate(renderer, gaussians, cameras)
     padded_rendering, padded_gradients = differentiate(renderer, padded, cameras)
     assert torch.equal(padded_rendering.rgb, rendering.rgb)
-    for f in fields(gaussians):
-        assert torch.equal(padded_gradients[f.name][:, 300:], gradients[f.name]), f.name
-        assert padded_gradients[f.name][:, :300].eq(0).all(), f.name
+    for name, _ in named_tensors(gaussians):
+        assert torch.equal(padded_gradients[name][:, 300:], gradients[name]), name
+        assert padded_gradients[name][:, :300].eq(0).all(), name
     for name in ("c2w", "intrinsics"):
         torch.testing.assert_close(padded_gradients[name], gradients[name])
 

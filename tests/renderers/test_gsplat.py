@@ -1,5 +1,6 @@
 """`qgs/gsplat` and `qgs/auto` as far as a machine without a GPU can tell."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 import qgs.renderers.auto as auto_module
 import qgs.renderers.gsplat as gsplat_module
 from qgs.contracts import ModelDims, RecipeContext, RendererConfig
+from qgs.geometry.harmonics import seen_colors
 from qgs.renderers import AutoRenderer, CpuRenderer, GsplatRenderer
 from qgs.types import Rendering
 
@@ -22,7 +24,8 @@ def calls(monkeypatch):
     def rasterization(**arguments):
         seen.append(arguments)
         images = (*arguments["viewmats"].shape[:2], arguments["height"], arguments["width"])
-        rgbd = torch.arange(4.0).expand(*images, 4)
+        channels = arguments["colors"].shape[-1] + 1  # and depth
+        rgbd = torch.arange(float(channels)).expand(*images, channels)
         return rgbd, torch.full((*images, 1), 0.25), {}
 
     monkeypatch.setitem(__import__("sys").modules, "gsplat", SimpleNamespace(
@@ -53,6 +56,20 @@ def test_arguments_are_what_gsplat_expects(calls, make_scene):
     assert rendering.depth.shape == (2, 3, 1, 12, 20)
     assert rendering.depth.eq(3).all()
     assert rendering.alpha.shape == (2, 3, 1, 12, 20)
+
+
+def test_harmonics_and_features_reach_gsplat(calls, make_scene):
+    gaussians, cameras = make_scene(batch=2, views=3, count=7, harmonics=8, features=2)
+    rendering = GsplatRenderer(RendererConfig())(gaussians, cameras)
+    GsplatRenderer(RendererConfig())(replace(gaussians, sh=None), cameras)
+    seen, plain = (found["colors"] for found in calls)
+    assert torch.equal(seen[..., :3], seen_colors(gaussians, cameras))
+    assert torch.equal(seen[..., 3:], gaussians.features[:, None].expand(2, 3, 7, 2))
+    assert torch.equal(plain, torch.cat([gaussians.colors, gaussians.features], -1))
+    assert calls[0]["backgrounds"][1, 2].tolist() == [0.5, 0.5, 0.5, 0, 0]
+    assert rendering.rgb[0, 0, :, 0, 0].tolist() == [0, 1, 2]
+    assert rendering.features[0, 0, :, 0, 0].tolist() == [3, 4]
+    assert rendering.depth.eq(5).all()
 
 
 def test_background_override_reaches_gsplat(calls, make_scene):

@@ -15,11 +15,11 @@ from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from torch import Tensor, nn
 
-from qgs.components import LatentBottleneck
+from qgs.components import CrossSelfMlp, LatentBottleneck
 from qgs.components.encoder import PatchViT, imagenet_normalised
 from qgs.components.times import time_features
 from qgs.geometry.rays import camera_rays, plucker_rays
-from qgs.model import DecoderLayer, QueryGaussianModel
+from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, Views
 
 
@@ -39,8 +39,8 @@ def model_tensors(
         "plucker": plucker_rays(views.cameras),
     }
     for name, times in (("input", views.times), ("target", views.target_time)):
-        if times is not None and model.encoder.config.time_channels:
-            channels = model.encoder.config.time_channels
+        channels = getattr(model.encoder.config, "time_channels", 0)
+        if times is not None and channels:
             found[f"time_embedding_{name}"] = time_features(times, channels)
     with ExitStack() as stack:
         for handle in _Recorder(model, found).handles():
@@ -50,8 +50,9 @@ def model_tensors(
     for number, layer in prediction.layers.items():
         found[f"gaussians_layer.{number}"] = _packed(layer.gaussians)
     if tuned_latents is not None:
-        state, memory = model.queries(len(tuned_latents)), model.encoder(views)
-        tuned = model.predict(model.encoder.project(tuned_latents, memory), state)
+        memory = model.encoder(views)
+        other = model.encoder.project(tuned_latents, memory)
+        tuned = model.predict(other, model.queries(memory, views))
         found["gaussians_of_tuned_latents"] = _packed(tuned.gaussians)
     return found
 
@@ -86,7 +87,7 @@ class _Recorder:
                 )
         yield encoder.register_forward_hook(self._memory)
         for index, layer in enumerate(self.model.decoder):
-            assert isinstance(layer, DecoderLayer)
+            assert isinstance(layer, CrossSelfMlp)
             yield layer.register_forward_pre_hook(partial(self._entering, index))
             yield layer.cross_attention.register_forward_hook(self._cross_attention)
             yield layer.self_attention.register_forward_hook(self._self_attention)

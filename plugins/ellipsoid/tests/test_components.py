@@ -60,7 +60,7 @@ def test_a_turn_is_never_half_a_turn(length: float) -> None:
 def test_queries_start_as_configured() -> None:
     config = EllipsoidQueries.Config(count=30, init_radii=(0.1, 0.2, 0.4))
     queries = EllipsoidQueries(config, DIMS)
-    support = queries.support(queries(3))
+    support = queries.support(queries.start(3))
     expected = torch.diag(torch.tensor([0.1, 0.2, 0.4])).expand(3, 30, 3, 3)
     torch.testing.assert_close(support.axes, expected)
     decaying = [name for name, p in queries.named_parameters() if queries.decays(name, p)]
@@ -70,7 +70,7 @@ def test_queries_start_as_configured() -> None:
 def test_support_shows_the_ellipsoid_of_a_turned_anchor() -> None:
     queries = EllipsoidQueries(EllipsoidQueries.Config(count=1, init_radii=(1, 2, 3)), DIMS)
     about_z = torch.tensor([[[HALF, 0.0, 0.0, HALF]]])
-    axes = queries.support(queries(1).replace(fields={ROTATION: about_z})).axes[0, 0]
+    axes = queries.support(queries.start(1).replace(fields={ROTATION: about_z})).axes[0, 0]
     expected = torch.tensor([[0.0, -2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
     torch.testing.assert_close(axes, expected, atol=1e-5, rtol=0)
 

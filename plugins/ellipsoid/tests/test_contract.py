@@ -4,8 +4,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+from qgs_plugintools import cases_of, parametrize_with_checks
+
 from qgs.composer.registry import load_plugin
-from qgs.testing import cases_of, parametrize_with_checks
 
 SNAPSHOT = json.loads((Path(__file__).parent / "state_dicts.json").read_text())
 """Label of a case -> name -> shape in its state dict, so that saved weights stay loadable."""

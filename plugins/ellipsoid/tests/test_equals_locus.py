@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs import Cameras, QueryGaussianModel, Views, compose
 from qgs.contracts import ModelDims
-from qgs.types import LayerPrediction
+from qgs.types import LayerPrediction, named_tensors
 
 
 def _recipe(
@@ -66,7 +66,7 @@ def _pair(
 def _tensors(layer: LayerPrediction) -> dict[str, Tensor]:
     """Everything that both models have."""
     state = {"anchor.center": layer.state["anchor.center"], "features": layer.state.features}
-    return {**vars(layer.gaussians), **state}
+    return {**dict(named_tensors(layer.gaussians)), **state}
 
 
 @pytest.mark.parametrize("bound", ["floor", "offset"])
@@ -83,21 +83,21 @@ def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined: bool, bo
         torch.testing.assert_close(seen.state[RAW_RADII], raw, rtol=1e-5, atol=1e-5)
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 40, 4)
         assert torch.equal(seen.state[ROTATION], identity)
-    moved = theirs.state["anchor.center"] - locus.queries(2)["anchor.center"]
+    moved = theirs.state["anchor.center"] - locus.queries.start(2)["anchor.center"]
     assert moved.abs().max() > 0.01, "the anchors must move for this to say anything"
 
 
 def test_the_bias_of_every_layer_is_that_of_locusgs() -> None:
     locus, ellipsoid = _pair()
     memory = locus.encoder(_photos())
-    ours, theirs = ellipsoid.queries(2), locus.queries(2)
+    ours, theirs = ellipsoid.queries.start(2), locus.queries.start(2)
     for mine, other in zip(ellipsoid.decoder, locus.decoder, strict=True):
         seen = mine.cross_attention.bias(ours, memory)
         expected = other.cross_attention.bias(theirs, memory)
         torch.testing.assert_close(seen, expected, rtol=1e-5, atol=1e-5)
         assert expected.min() < -1
-        ours = ellipsoid.refinements[0](mine(ours, memory))
-        theirs = locus.refinements[0](other(theirs, memory))
+        ours = ellipsoid.refinements[0](mine(ours, memory)[0])
+        theirs = locus.refinements[0](other(theirs, memory)[0])
 
 
 def _like_locus(gradients: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -117,7 +117,7 @@ def test_every_gradient_is_that_of_locusgs() -> None:
     for model in (model.double() for model in _pair()):
         torch.manual_seed(1)
         gaussians = model(_photos().to(torch.float64)).gaussians
-        loss = sum((x * torch.randn_like(x)).sum() for x in vars(gaussians).values())
+        loss = sum((x * torch.randn_like(x)).sum() for _, x in named_tensors(gaussians))
         loss.backward()
         seen.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
     expected, ours = seen[0], _like_locus(seen[1])
@@ -132,7 +132,7 @@ def test_it_is_locusgs_in_half_precision_too() -> None:
     photos = _photos()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         theirs, ours = (model(photos).gaussians for model in (locus, ellipsoid))
-    for name, tensor in vars(theirs).items():
+    for name, tensor in named_tensors(theirs):
         torch.testing.assert_close(getattr(ours, name), tensor, rtol=1e-5, atol=1e-5)
 
 

@@ -45,7 +45,7 @@ def _cameras() -> Cameras:
 def _memory(rays: Tensor, grid: tuple[int, int, int]) -> ImageMemory:
     tokens = rays.shape[1]
     heads = torch.randn(2, 2, tokens, 8)
-    return ImageMemory(heads, heads.flip(0), torch.randn(2, tokens, 16), rays, grid)
+    return ImageMemory(torch.randn(2, tokens, 16), heads, heads.flip(0), rays, grid)
 
 
 def test_attention_pictures_and_decoding_speak_of_one_ellipsoid() -> None:
@@ -142,7 +142,7 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise() -> None:
     with torch.no_grad():
         for parameter in queries.parameters():
             parameter += torch.randn_like(parameter)
-    state = queries(2)
+    state = queries.start(2)
     torch.testing.assert_close(state[ROTATION].norm(dim=-1), torch.ones(2, 500))
     torch.testing.assert_close(state[ROTATION][1], F.normalize(queries.rotation, dim=-1))
     assert torch.equal(state[CENTER][1], queries.center)
@@ -156,4 +156,4 @@ def test_growing_copies_whole_anchors() -> None:
     grown = many.resized(few.state_dict(), torch.Generator().manual_seed(0))
     many.load_state_dict(grown)
     torch.testing.assert_close(many.center[4:8], few.center, atol=0.06, rtol=0)
-    torch.testing.assert_close(many(1)[ROTATION].norm(dim=-1), torch.ones(1, 9))
+    torch.testing.assert_close(many.start(1)[ROTATION].norm(dim=-1), torch.ones(1, 9))

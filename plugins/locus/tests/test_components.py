@@ -48,7 +48,7 @@ def test_queries_start_as_configured() -> None:
         count=4000, init_radius=0.3, center_init=NormalCenters(mean=(0.0, 0.0, 2.0), std=0.5)
     )
     queries = AnchoredQueries(config, DIMS)
-    state = queries(3)
+    state = queries.start(3)
     support = queries.support(state)
     assert state["anchor.center"].shape == (3, 4000, 3)
     torch.testing.assert_close(
@@ -61,7 +61,7 @@ def test_queries_start_as_configured() -> None:
 def test_queries_without_radius_provide_none() -> None:
     config = AnchoredQueries.Config(count=4, radius=False)
     assert set(AnchoredQueries.provides(config)) == {"anchor.center"}
-    assert set(AnchoredQueries(config, DIMS)(1).fields) == {"anchor.center"}
+    assert set(AnchoredQueries(config, DIMS).start(1).fields) == {"anchor.center"}
 
 
 def test_frustum_centers_lie_in_the_frustum() -> None:

@@ -31,7 +31,14 @@ import qgs
 from qgs.contracts import MetricInput
 from qgs.data.sampling import make_sample
 from qgs.drawing.figures import Curves
-from qgs.drawing.images import depth_picture, depth_range, enlarged, rgb_picture
+from qgs.drawing.images import (
+    color_error,
+    depth_picture,
+    depth_range,
+    enlarged,
+    error_picture,
+    rgb_picture,
+)
 from qgs.drawing.queries import attention_pictures
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics import Dispersion
@@ -48,6 +55,24 @@ def words(axes: list[Axes]) -> list[str]:
     return [text.get_text() for axis in axes for text in axis.texts]
 
 
+def errors_of(show: Exhibition) -> torch.Tensor:
+    """Of all models in the middle target of all samples."""
+    found = []
+    for sample in show.samples:
+        views = sample.targets.select(slice(1, 2))
+        for model in show.models.values():
+            with torch.no_grad():
+                image = model.render(model(sample.inputs).gaussians, views.cameras).rgb[0, 0]
+            found.append((image.clamp(0, 1) - views.images[0, 0]).abs().mean(0))
+    return torch.stack(found)
+
+
+def test_colours_beyond_white_and_black_are_no_error() -> None:
+    images = torch.tensor([1.5, -0.5, 0.25]).view(3, 1, 1)
+    truth = torch.tensor([1.0, 0.0, 1.0]).view(3, 1, 1)
+    torch.testing.assert_close(color_error(images, truth), torch.tensor([[[0.25]]]))
+
+
 def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
     show = exhibition_of(*PAIR)
     axes = novel_views.made(show).figure.axes
@@ -59,10 +84,11 @@ def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
     score = -10 * math.log10(float((image.clamp(0, 1) - truth).square().mean()))
     assert f"{score:.2f} dB" in words(axes)
     shown = pictures(axes)
-    error = (image - truth).abs().mean(0)
+    error = (image.clamp(0, 1) - truth).abs().mean(0)
     for expected in (truth, image, sample.inputs.images[0, 1]):
         assert any(np.array_equal(rgb_picture(expected), found) for found in shown)
-    torch.testing.assert_close(novel_views.error_map(image, truth)[0], error)
+    scale = depth_range(errors_of(show))[1]
+    assert any(np.array_equal(error_picture(error[None], scale), found) for found in shown)
 
 
 @pytest.mark.parametrize("kinds", [PAIR, PAIR[:1]])

@@ -18,7 +18,7 @@ def test_supports_are_those_of_the_states_of_each_layer(kind: str) -> None:
     assert look.views is not None
     with torch.no_grad():
         prediction = model(look.views, layers=range(1, model.depth + 1))
-    states = [model.queries(1), *(layer.state for layer in prediction.layers.values())]
+    states = [model.queries.start(1), *(layer.state for layer in prediction.layers.values())]
     for layer, state in enumerate(states):
         expected, found = model.queries.support(state), look.support(layer)
         assert (found is None) == (expected is None) == (kind == "tokengs")

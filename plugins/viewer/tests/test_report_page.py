@@ -2,24 +2,35 @@
 
 import io
 import re
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
 from browser import CHROMIUM, Page, chromium
 from qgs_viewer import section
-from qgs_viewer.look import look_inside
+from qgs_viewer.choice import Choice
+from qgs_viewer.figures import dispersion
+from qgs_viewer.figures.exhibits import Exhibit, exhibit
 from qgs_viewer.page import shared_start
-from qgs_viewer.section import refinement_section, scene_section, self_attention_section
+from qgs_viewer.section import (
+    dispersion_section,
+    refinement_section,
+    scene_section,
+    sections,
+    self_attention_section,
+)
 from small import VIEWS, Walk, model_of
 
-from qgs.analysis.report import GROUP, Contender, Report, report_html
+from qgs.analysis.report import GROUP, Contender, Report, Shown, report_html
 from qgs.contracts import Column
 from qgs.data.sampling import Sample, make_sample
 from qgs.drawing.queries import notable_queries
@@ -49,45 +60,86 @@ def page_of_two_scenes() -> str:
     return report_html(report)
 
 
+def shown_of(samples: Sequence[Sample]) -> Shown:
+    with torch.no_grad():
+        return [(one, [one.model(s.inputs) for s in samples]) for one in contenders()]
+
+
+def exhibits() -> list[Exhibit]:
+    return [exhibit(one.name, one.model, sample_of(1, 2)) for one in contenders()]
+
+
 def test_the_viewer_offers_its_sections() -> None:
-    found = {e.name: e.load() for e in entry_points(group=GROUP) if e.module.startswith("qgs_view")}
-    assert found == {
-        "refinement": refinement_section,
-        "scene": scene_section,
-        "self_attention": self_attention_section,
-    }
+    found = [e.load() for e in entry_points(group=GROUP) if e.module.startswith("qgs_view")]
+    assert found == [sections]
+
+
+def test_sections_share_one_look_at_each_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(section, "scenes_html", lambda looks, choices: "<p>")
+    samples = [sample_of(1, 2), sample_of(3, 4)]
+    shown = shown_of(samples)
+    encoded = {one.name: 0 for one, _ in shown}
+    decoded = dict(encoded)
+
+    def count(table: dict[str, int], name: str) -> Callable[..., None]:
+        return lambda *_: table.update({name: table[name] + 1})
+
+    with ExitStack() as hooks:
+        for one, _ in shown:
+            for part, table in ((one.model.encoder, encoded), (one.model.decoder[0], decoded)):
+                handle = part.register_forward_pre_hook(count(table, one.name))
+                hooks.callback(handle.remove)
+        made = list(sections(shown, samples))
+    assert [len(section.figures[""]) for section in made] == [1, 1, 1, 1]
+    assert encoded == {"tokengs": 1, "locus": 1}
+    assert decoded == {"tokengs": 2, "locus": 2}, "once to look, once to trace five queries"
 
 
 def test_refinement_is_shown_of_models_with_anchors() -> None:
-    sample = sample_of(1, 2)
-    shown = [(one, one.model(sample.inputs)) for one in contenders()]
-    (tile,) = refinement_section(shown, sample).figures[""]
-    (single,) = refinement_section(shown[1:], sample).figures[""]
+    plain, anchored = exhibits()
+    (tile,) = refinement_section([plain, anchored]).figures[""]
+    (single,) = refinement_section([anchored]).figures[""]
     np.testing.assert_array_equal(tile.image, single.image)
-    assert not refinement_section(shown[:1], sample).figures
+    assert not refinement_section([plain]).figures
 
 
 def test_self_attention_is_shown_of_models_that_tell_it() -> None:
-    sample = sample_of(1, 2)
-    shown = [(one, one.model(sample.inputs)) for one in contenders()]
-    (tile,) = self_attention_section(shown, sample).figures[""]
-    (single,) = self_attention_section(shown[:1], sample).figures[""]
+    both = exhibits()
+    (tile,) = self_attention_section(both).figures[""]
+    (single,) = self_attention_section(both[:1]).figures[""]
     assert np.asarray(tile.image).shape[1] > 1.5 * np.asarray(single.image).shape[1]
-    silent = contenders()[:1]
+    silent = exhibits()[:1]
     for layer in silent[0].model.decoder:
         layer.self_attention.explain = lambda *parts: None
     try:
-        assert not self_attention_section([(silent[0], shown[0][1])], sample).figures
+        assert not self_attention_section(silent).figures
     finally:
         for layer in silent[0].model.decoder:
             del layer.self_attention.explain
 
 
+def test_bars_are_of_every_scene_of_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, draw = [], dispersion.figure
+    monkeypatch.setattr(
+        dispersion, "figure", lambda *given: drawn.append(draw(*given)) or drawn[-1]
+    )
+    samples = [sample_of(1, 2), make_sample(Walk(), (0, 4), (1, 2), VIEWS, mirror=False)]
+    shown = shown_of(samples)
+    assert dispersion_section(shown, samples).figures
+    (mean, median) = drawn[0].axes
+    for number, (_, predictions) in enumerate(shown):
+        for axis, middle in ((mean, np.mean), (median, np.median)):
+            for bar, prediction in zip(axis.containers[number], predictions, strict=True):
+                queries = prediction.gaussians.means.view(12, -1, 3)
+                distances = (queries - queries.mean(1, keepdim=True)).norm(dim=-1).numpy()
+                assert bar.get_height() == pytest.approx(float(middle(distances)), rel=1e-4)
+    assert not dispersion_section(shown_of(samples[:1]), samples[:1]).figures, "the table says it"
+
+
 def test_the_section_has_all_models_and_the_code_of_the_viewer_once() -> None:
-    sample = sample_of(1, 2)
-    shown = [(one, one.model(sample.inputs)) for one in contenders()]
-    (tile,) = scene_section(shown, sample).figures[""]
-    one = scene_section(shown[:1], sample).figures[""][0]
+    both = exhibits()
+    (tile,) = scene_section(both).figures[""]
+    one = scene_section(both[:1]).figures[""][0]
     assert tile.caption == "tokengs, locus"
     assert np.asarray(tile.image).shape == (240, 2 * 320 + 4, 3)
     assert len(tile.page) - len(one.page) < 100_000 < len(one.page)
@@ -96,14 +148,13 @@ def test_the_section_has_all_models_and_the_code_of_the_viewer_once() -> None:
 
 
 def test_a_notable_query_of_a_model_with_anchors_is_picked(monkeypatch: pytest.MonkeyPatch) -> None:
-    sample, chosen = sample_of(1, 2), {}
+    chosen: dict[str, Choice] = {}
     monkeypatch.setattr(section, "scenes_html", lambda _, choices: chosen.update(choices) or "")
-    shown = [(one, one.model(sample.inputs)) for one in contenders()]
-    scene_section(shown, sample)
-    (locus, prediction) = shown[1]
-    looks = [look_inside(one.model, sample.inputs) for one, _ in shown]
-    view = section._first_camera(shared_start(looks))
-    (notable,) = notable_queries(locus.model, prediction.gaussians, view, 1)
+    both = exhibits()
+    scene_section(both)
+    locus = both[1]
+    view = section._first_camera(shared_start([shown.look for shown in both]))
+    (notable,) = notable_queries(locus.model, locus.gaussians, view, 1)
     assert [*chosen] == ["locus"]
     assert (chosen["locus"].query, chosen["locus"].layer) == (notable.index, locus.model.depth)
     assert chosen["locus"].others == "shown"

@@ -87,8 +87,8 @@ def bench(
         {
             "recipe": subject.name,
             **asdict(subject.workload),
-            "queries": model.queries.count,
-            "gaussians": model.queries.count * model.head.gaussians_per_query,
+            "queries": (queries := model.queries.count),
+            "gaussians": queries and queries * model.head.gaussians_per_query,
             "parameters": {"count": count, "weight_bytes": size, "ratio": count / counts[0]},
             "seconds": {
                 operation: {

@@ -9,14 +9,14 @@ from qgs_locus.anchors import FrustumCenters, NormalCenters
 from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, raw_radius_of
 from torch import nn
 
-from qgs.contracts import Fields, ModelDims, Queries
+from qgs.contracts import Fields, LearnedQueries, ModelDims
 from qgs.types import QueryState, SpatialSupport
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
 
 Radius = Annotated[float, Field(gt=0)]
 
 
-class EllipsoidQueries(Queries):
+class EllipsoidQueries(LearnedQueries):
     """N learned vectors, centres mu, rotations and raw radii, shared by all scenes."""
 
     name: ClassVar[str] = "anchored"
@@ -58,7 +58,7 @@ class EllipsoidQueries(Queries):
         """No weight decay on rotations, whose length has no effect."""
         return name != "rotation" and super().decays(name, parameter)
 
-    def forward(self, batch_size: int) -> QueryState:
+    def start(self, batch_size: int) -> QueryState:
         """Features (B, N, D); fields centre (B, N, 3), rotation (B, N, 4), raw radii (B, N, 3)."""
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}

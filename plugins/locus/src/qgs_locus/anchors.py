@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from qgs.contracts import (
     ComponentConfig,
     Fields,
+    LearnedQueries,
     ModelDims,
     OptionError,
     Problem,
-    Queries,
     RecipeContext,
     without_effect,
 )
@@ -72,7 +72,7 @@ class FrustumCenters(ComponentConfig):
         return torch.cat([(2 * torch.rand(count, 2) - 1) * self.slope * z, z], -1)
 
 
-class AnchoredQueries(Queries):
+class AnchoredQueries(LearnedQueries):
     """N learned vectors, centres mu and raw radii rho, shared by all scenes (LocusGS)."""
 
     name: ClassVar[str] = "anchored"
@@ -118,7 +118,7 @@ class AnchoredQueries(Queries):
         """N."""
         return self.features.shape[0]
 
-    def forward(self, batch_size: int) -> QueryState:
+    def start(self, batch_size: int) -> QueryState:
         """Features (B, N, D), `anchor.center` (B, N, 3) and `anchor.raw_radius` (B, N, 1)."""
         fields = {CENTER: self.center.expand(batch_size, -1, -1)}
         if self.config.radius:

@@ -73,9 +73,10 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     def forward(self, state: QueryState) -> Tensor:
         """The update (B, N, D)."""
-        return self.attention(self.norm(state.features + self.position_embedding(state)))
+        x_BND = self.norm(state.features + self.position_embedding(state))
+        return self.attention(x_BND, state.mask)
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
         """Attention over queries."""
         x_BND = self.norm(state.features + self.position_embedding(state))
-        return self.attention.explain(x_BND, queries)
+        return self.attention.explain(x_BND, queries, state.mask)

@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from qgs.analysis.trace import LayerTrace, Trace, trace
+from qgs.analysis.trace import Trace, trace
 from qgs.contracts import AttentionWeights
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
@@ -37,12 +37,12 @@ class Look:
     frames: Sequence[int] = ()
     placement: Placement = field(default_factory=Placement.identity)
     inside: Inside | None = None
-    _traces: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
+    _traces: dict[int, tuple[Trace, int]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def queries(self) -> int:
         """How many queries there are to pick; 0 without a model."""
-        return self.inside.model.queries.count if self.inside else 0
+        return self.inside.states[0].features.shape[1] if self.inside else 0
 
     @property
     def depth(self) -> int:
@@ -81,9 +81,9 @@ class Look:
 
         None if it tells nothing, in layer 0, and where what is read are no patches of photos.
         """
-        if self.inside is None or self.inside.memory.grid is None or not layer:
+        if self.inside is None or self.inside.memory.grid is None:
             return None
-        return self._traced(query, layer).cross_attention
+        return self._told("cross_attention", query, layer)
 
     @property
     def grid(self) -> tuple[int, int, int]:
@@ -94,16 +94,28 @@ class Look:
 
     def self_attention(self, query: int, layer: int) -> AttentionWeights | None:
         """The queries that a query reads in a layer, (1, h, 1, N); None as for `attention`."""
-        return self._traced(query, layer).self_attention if self.inside and layer else None
+        return self._told("self_attention", query, layer)
 
-    def _traced(self, query: int, layer: int) -> LayerTrace:
-        assert self.inside is not None
-        if query not in self._traces:
+    def _told(self, part: str, query: int, layer: int) -> AttentionWeights | None:
+        if self.inside is None or not layer:
+            return None
+        self.trace([query])
+        record, place = self._traces[query]
+        found: AttentionWeights | None = getattr(record.layers[layer], part)
+        if found is None:
+            return None
+        only = slice(place, place + 1)
+        geometry = None if found.geometry is None else found.geometry[:, :, only]
+        return AttentionWeights(found.content[:, :, only], geometry, found.weights[:, :, only])
+
+    def trace(self, queries: Sequence[int]) -> None:
+        """Have the attention of `queries` at hand, by one pass through the decoder for all."""
+        missing = [query for query in dict.fromkeys(queries) if query not in self._traces]
+        if missing and self.inside is not None:
             model, memory = self.inside.model, self.inside.memory
-            with torch.no_grad(), trace(model, queries=[query]) as record:
+            with torch.no_grad(), trace(model, queries=missing) as record:
                 model.predict(memory, self.inside.states[0])
-            self._traces[query] = record
-        return self._traces[query].layers[layer]
+            self._traces.update({query: (record, at) for at, query in enumerate(missing)})
 
     def hub(self, query: int, layer: int) -> Tensor:
         """Where lines of a query start, (3,): its support's centre, or its Gaussians' mean."""
@@ -115,7 +127,7 @@ class Look:
     def strongest(self, query: int, layer: int, count: int, depth: float) -> "Reading | None":
         """The `count` patches that a query attends to most, on photos `depth` from their cameras.
 
-        Mean over heads. None where attention tells nothing.
+        Mean over heads. None where attention tells nothing, or tokens are no patches.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
@@ -151,7 +163,8 @@ def look_inside(
     placement: Placement | None = None,
 ) -> Look:
     """What `model` makes of views (1, V), with all that can be asked of it."""
-    memory, start = model.encoder(views), model.queries(1)
+    memory = model.encoder(views)
+    start = model.queries(memory, views)
     prediction = model.predict(memory, start, range(1, model.depth + 1))
     states = [start, *(layer.state for layer in prediction.layers.values())]
     inside = Inside(model, memory, states)

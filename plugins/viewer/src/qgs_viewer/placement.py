@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from qgs.data.scenes import warn_once
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
@@ -65,7 +66,9 @@ class Splats:
 
 @full_precision
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """The Gaussians (1, G) of one scene, placed."""
+    """The Gaussians (1, G) of one scene, placed; a warning tells where `sh` is not shown."""
+    if gaussians.sh is not None:
+        warn_once("colours of these Gaussians depend on the direction; those of degree 0 are shown")
     rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))
     axes_G33 = rotated * gaussians.scales[0].detach().cpu().double()[:, None, :]
     parts = (

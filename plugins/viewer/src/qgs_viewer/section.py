@@ -1,47 +1,50 @@
-"""Sections of report.html: the scene to turn, refinement by layer, which queries read which."""
+"""Sections of report.html: the scene to turn, refinement, self-attention, dispersion by scene."""
+
+from collections.abc import Iterator, Sequence
 
 import torch
+from matplotlib.figure import Figure
 
 from qgs.analysis.report import ReportSection, Shown, Tile
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import rgb_picture, side_by_side
-from qgs.drawing.queries import notable_queries
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras
 from qgs_viewer.choice import Choice
-from qgs_viewer.figures import graph, refinement
-from qgs_viewer.figures.exhibits import exhibit
-from qgs_viewer.look import Look, look_inside
+from qgs_viewer.figures import dispersion, graph, refinement
+from qgs_viewer.figures.exhibits import Exhibit, exhibit
+from qgs_viewer.look import Look
 from qgs_viewer.page import scenes_html, shared_start
 from qgs_viewer.server import FIELD_OF_VIEW, first_eye, up_of
 
 _SIZE = 240, 320  # of each scene's picture, H, W
 
 
-def scene_section(shown: Shown, sample: Sample) -> ReportSection:
-    """What every model makes of `sample`, side by side, as it can be turned."""
-    labels = [sample.label(frame) for frame in sample.input_frames]
-    looks = {
-        contender.name: look_inside(contender.model, sample.inputs, labels, sample.input_frames)
-        for contender, _ in shown
-    }
+def sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[ReportSection]:
+    """All of them, of one look at what every model makes of the first of `samples`."""
+    exhibits = [exhibit(contender.name, contender.model, samples[0]) for contender, _ in shown]
+    yield scene_section(exhibits)
+    yield refinement_section(exhibits)
+    yield self_attention_section(exhibits)
+    yield dispersion_section(shown, samples)
+
+
+def scene_section(exhibits: Sequence[Exhibit]) -> ReportSection:
+    """What every model makes of the scene, side by side, as it can be turned."""
+    looks = {shown.name: shown.look for shown in exhibits}
     camera = _first_camera(shared_start(looks.values()))
-    pictures = [
-        rgb_picture(contender.model.render(prediction.gaussians, camera).rgb[0, 0])
-        for contender, prediction in shown
-    ]
-    names = ", ".join(looks)
+    with torch.no_grad():
+        views = [shown.model.render(shown.gaussians, camera).rgb[0, 0] for shown in exhibits]
     choices = {
-        contender.name: Choice(
-            query=notable_queries(contender.model, prediction.gaussians, camera, 1)[0].index,
-            layer=contender.model.depth,
-            others="shown",
+        shown.name: Choice(
+            query=shown.notable(1, camera)[0].index, layer=shown.look.depth, others="shown"
         )
-        for contender, prediction in shown
-        if looks[contender.name].support(0) is not None
+        for shown in exhibits
+        if shown.look.support(0) is not None
     }
-    tile = Tile(side_by_side(pictures), names, page=scenes_html(looks, choices))
+    pictures = side_by_side([rgb_picture(view) for view in views])
+    tile = Tile(pictures, ", ".join(looks), page=scenes_html(looks, choices))
     return ReportSection(
         "The scene, to turn",
         "The Gaussians of the first scene above in 3D, with the input photos where they were "
@@ -54,36 +57,53 @@ def scene_section(shown: Shown, sample: Sample) -> ReportSection:
     )
 
 
-def self_attention_section(shown: Shown, sample: Sample) -> ReportSection:
-    """Self-attention of some queries as a graph, first and last layer, of models that tell it."""
-    exhibits = [exhibit(contender.name, contender.model, sample) for contender, _ in shown]
-    told = [e for e in exhibits if e.look.self_attention(0, e.look.depth) is not None]
-    view = sample.targets.cameras[:, :1]
-    chosen = {e.name: e.notable(graph.QUERIES, view) for e in told}
-    tiles = [Tile(figure_picture(graph.figure(told, chosen), dpi=144))] if told else []
-    return ReportSection(
-        "Which queries read which",
-        f"The first scene from above, input cameras as triangles. Every dark dot is a query: its "
-        f"anchor before the layer, or where it has none, the place of what it adds to the photos. "
-        f"Lines lead from {graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
-        {"": tiles} if tiles else {},
-        width=600,
-    )
-
-
-def refinement_section(shown: Shown, sample: Sample) -> ReportSection:
+def refinement_section(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Ways, radii and steps of the anchors from layer to layer, of models that have anchors."""
-    exhibits = [exhibit(contender.name, contender.model, sample) for contender, _ in shown]
-    anchored = [e for e in exhibits if e.look.support(0) is not None]
-    tiles = [Tile(figure_picture(refinement.figure(anchored), dpi=144))] if anchored else []
-    return ReportSection(
+    anchored = [shown for shown in exhibits if shown.look.support(0) is not None]
+    return _drawn(
         "How layers move and size anchors",
         "The first scene from above, with the way of every anchor from its learned start (circle) "
         "to the last layer (dot); then the radius of the supports, and how far each layer moves "
         "the anchors: the line is the median over queries, bands hold half and 90 % of them.",
-        {"": tiles} if tiles else {},
-        width=600,
+        refinement.figure(anchored) if anchored else None,
     )
+
+
+def self_attention_section(exhibits: Sequence[Exhibit]) -> ReportSection:
+    """Self-attention of some queries as a graph, first and last layer, of models that tell it."""
+    told, chosen = graph.telling(exhibits)
+    return _drawn(
+        "Which queries read which",
+        f"The first scene from above, input cameras as triangles. Every dark dot is a query: its "
+        f"anchor before the layer, or where it has none, the place of what it adds to the photos. "
+        f"Lines lead from {graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
+        graph.figure(told, chosen) if told else None,
+    )
+
+
+def dispersion_section(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
+    """Bars for every scene of the report, where there are several: one says what the table does."""
+    found = {
+        contender.name: dispersion.dispersions(
+            [prediction.gaussians for prediction in predictions],
+            contender.model.head.gaussians_per_query,
+        )
+        for contender, predictions in shown
+    }
+    labels = dispersion.scene_labels(samples)
+    return _drawn(
+        "How far the Gaussians of a query scatter",
+        "Their distance to the centroid of those of their query, in every scene above: its mean, "
+        "which a few far Gaussians rule, and its median, in units of the models’ world; dashed the "
+        "mean over these scenes. Small where a query stands for one place. Where the values lie "
+        "far apart the scale is logarithmic: then the ends of bars count, not their lengths.",
+        dispersion.figure(found, labels) if len(samples) > 1 else None,
+    )
+
+
+def _drawn(title: str, text: str, figure: Figure | None) -> ReportSection:
+    tiles = [Tile(figure_picture(figure, dpi=144))] if figure else []
+    return ReportSection(title, text, {"": tiles} if tiles else {}, width=600)
 
 
 def _first_camera(look: Look) -> Cameras:

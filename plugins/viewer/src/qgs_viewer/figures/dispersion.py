@@ -1,7 +1,7 @@
 """Figure: how far the Gaussians of a query scatter, scene by scene."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from qgs.data.sampling import Sample
 from qgs.drawing.figures import categorical, hex_color
 from qgs.metrics.dispersion import token_dispersion
 from qgs.model import QueryGaussianModel
+from qgs.types import Gaussians
 from qgs_viewer.figures.exhibits import Exhibition, sample_name
 from qgs_viewer.figures.paper import Made, new_figure, paper_style
 
@@ -27,7 +28,10 @@ LETTERS = 110
 
 def made(show: Exhibition) -> Made:
     """See `figure`."""
-    found = {name: dispersions(model, show.samples) for name, model in show.models.items()}
+    found = {
+        name: dispersions(_made_of(model, show.samples), model.head.gaussians_per_query)
+        for name, model in show.models.items()
+    }
     caption = (
         f"Dispersion of queries on {len(show.samples)} test samples: the distance of Gaussians to "
         "the centroid of those of their query, its mean (above; a few far Gaussians rule it) and "
@@ -40,16 +44,20 @@ def made(show: Exhibition) -> Made:
 
 
 @torch.no_grad()
-def dispersions(model: QueryGaussianModel, samples: Sequence[Sample]) -> dict[str, list[float]]:
-    """The values of the metric `qgs/dispersion`, "mean" and "median", of each sample."""
-    device = next(model.parameters()).device
+def dispersions(made: Iterable[Gaussians], per_query: int) -> dict[str, list[float]]:
+    """The values of the metric `qgs/dispersion`, "mean" and "median", of what each scene became."""
     values: dict[str, list[float]] = {"mean": [], "median": []}
-    for sample in samples:
-        means = model(sample.inputs.to(device)).gaussians.means
-        distances = token_dispersion(means, means.shape[1] // model.queries.count)
+    for gaussians in made:
+        distances = token_dispersion(gaussians.means, per_query)
         values["mean"].append(float(distances.mean()))
         values["median"].append(float(torch.quantile(distances, 0.5)))
     return values
+
+
+def _made_of(model: QueryGaussianModel, samples: Sequence[Sample]) -> Iterator[Gaussians]:
+    device = next(model.parameters()).device
+    for sample in samples:
+        yield model(sample.inputs.to(device)).gaussians
 
 
 def scene_labels(samples: Sequence[Sample]) -> list[str]:

@@ -24,11 +24,10 @@ EDGES = 10
 
 def made(show: Exhibition) -> Made:
     """See `figure`. Raises NothingToShowError where no model explains its self-attention."""
-    shown = [e for e in show.exhibits if e.look.self_attention(0, e.look.depth) is not None]
+    shown, chosen = telling(show.exhibits, show.query)
     if not shown:
         raise NothingToShowError("none of these models reports its self-attention")
     count = QUERIES if show.query is None else 1
-    chosen = {e.name: e.notable(count, e.sample.targets.cameras[:, :1], show.query) for e in shown}
     nodes = "at its anchor before the layer where it has one, else amid those of "
     nodes += "its Gaussians that the inputs see"
     caption = (
@@ -41,6 +40,19 @@ def made(show: Exhibition) -> Made:
     if any(_parts(e) != ["weights"] for e in shown):
         caption += " Where geometry adds a bias, content and bias have their own panels."
     return Made(figure(shown, chosen), caption)
+
+
+def telling(
+    exhibits: Sequence[Exhibit], query: int | None = None
+) -> tuple[list[Exhibit], dict[str, list[DrawnQuery]]]:
+    """The models that report their self-attention, and by name the queries to show of each."""
+    count, chosen = QUERIES if query is None else 1, dict[str, list[DrawnQuery]]()
+    for shown in exhibits:
+        drawn = shown.notable(count, shown.sample.targets.cameras[:, :1], query)
+        shown.look.trace([0, *(one.index for one in drawn)])
+        if shown.look.self_attention(0, shown.look.depth) is not None:
+            chosen[shown.name] = drawn
+    return [shown for shown in exhibits if shown.name in chosen], chosen
 
 
 @torch.no_grad()

@@ -13,6 +13,7 @@ from qgs.data.sampling import Sample
 from qgs.drawing.images import (
     DEPTH_MAP,
     ERROR_MAP,
+    color_error,
     depth_picture,
     depth_range,
     error_picture,
@@ -39,8 +40,6 @@ INPUTS = 2
 TITLES = ("error", "depth", "true depth", "render", "truth", *["inputs"] * INPUTS)
 """Of columns, from the right; the true depth has one only where it is known."""
 TRUE = " of the models' and the true depth, which is shown where it is known"
-BRIGHTEST = 0.99
-"""Quantile of all errors at which the colour scale ends."""
 
 
 def made(show: Exhibition) -> Made:
@@ -55,7 +54,7 @@ def made(show: Exhibition) -> Made:
         "light is near, dark is far; all maps of a scene have the scale told in the first of them "
         f"(2nd to 98th percentile{TRUE * _known(depths)}, units of the models' world); grey is "
         "nothing. Error: mean over channels of the absolute difference from the truth, one scale "
-        "in all. Pixels as rendered."
+        "in all, to their 98th percentile. Pixels as rendered."
     )
     return Made(figure(show.models, samples, depths), caption)
 
@@ -71,8 +70,8 @@ def figure(
     depths: for each sample the true depth (T, 1, H, W) of its targets, where known.
     """
     scenes = [_rendered(models, sample) for sample in samples]
-    errors = [error_map(r.rgb[0, 0], truth) for seen, truth in scenes for r in seen.values()]
-    brightest = float(torch.quantile(torch.cat([e.flatten() for e in errors]), BRIGHTEST))
+    errors = [color_error(r.rgb[0, 0], truth) for seen, truth in scenes for r in seen.values()]
+    brightest = depth_range(torch.cat([error.flatten() for error in errors]))[1]
     titles = [title for title in TITLES if title != "true depth" or _known(depths)]
     columns = ceil(INPUTS / len(models)) + len(titles) - INPUTS
     rows = len(samples) * len(models)
@@ -90,11 +89,6 @@ def figure(
             axis.set_title(title)
         _scales(scales, brightest)
     return drawn
-
-
-def error_map(image: Tensor, truth: Tensor) -> Tensor:
-    """Mean over channels of |image - truth|, (3, H, W) each -> (1, H, W)."""
-    return (image - truth.to(image)).abs().mean(0, keepdim=True).float().cpu()
 
 
 def _known(depths: Sequence[Tensor | None]) -> bool:
@@ -149,7 +143,7 @@ def _scene(
         picture_panel(line[first + 1], rgb_picture(rendering.rgb[0, 0]))
         tag(line[first + 1], f"{score} {Psnr.column.unit}")
         row_label(line[first + 1], name)
-        error = error_map(rendering.rgb[0, 0], truth)
+        error = color_error(rendering.rgb[0, 0], truth)
         picture_panel(line[-1], error_picture(error, brightest))
 
 

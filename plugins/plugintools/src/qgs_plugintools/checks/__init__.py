@@ -1,0 +1,14 @@
+"""The checks, by subject. Importing this package registers them all."""
+
+from qgs_plugintools.checks import (  # noqa: F401
+    basics,
+    fields,
+    gradients,
+    options,
+    parameters,
+    precision,
+    rendering,
+    slots,
+    state,
+    symmetry,
+)

@@ -1,0 +1,290 @@
+"""Fields of the state: what a component reads and writes is what it declares, and recipes obey."""
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from qgs.components import LatentQueries, MultiViewViT
+from qgs.composer import RecipeError
+from qgs.composer.recipe import Recipe, resolve
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
+from qgs.contracts import (
+    CONTRACT_VERSION,
+    MEMORY_FIELDS,
+    Component,
+    ComponentConfig,
+    DecoderLayer,
+    Fields,
+    FieldSpec,
+    Loss,
+    Plugin,
+)
+from qgs.types import ImageMemory, LayerPrediction, QueryState, Views, map_tensors
+from qgs_plugintools.case import Case, expect
+from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
+from qgs_plugintools.modules import each_mode, seeded
+from qgs_plugintools.registry import ALL_SLOTS, MODULES, READERS, check
+from qgs_plugintools.trees import (
+    described,
+    difference,
+    gradients,
+    leaves,
+    mapped,
+    not_finite,
+    scalar,
+)
+
+PLUGIN = "under_test"
+GIVEN = "given_fields"
+"""Names of the plugin that offers the component, and of the queries that give it its fields."""
+
+
+@check(READERS)
+def check_reads_within_requires(case: Case) -> None:
+    """Only fields in `requires` are asked for, of the state and of the image memory.
+
+    Looking whether a field is there is asking for it. The other fields are passed on with
+    `QueryState.replace`. A loss looks at no rendering if it declares that it needs none.
+    """
+    module, inputs, required = case.lively(), inputs_of(case), case.component.requires(case.config)
+    unread = {name for name in leaves(inputs) if name.startswith("memory.")} - set(required)
+    if issubclass(case.component, DecoderLayer) and case.component.sublayers:
+        unread = set()  # what stands in its slots may read them
+    if issubclass(case.component, Loss) and case.component.renderings == "none":
+        inputs["rendering"] = Maker(case, Sizes(), torch.Generator()).rendering(views=2)
+        unread = {name for name in leaves(inputs) if name.startswith("rendering.")}
+    poisoned = mapped(inputs, lambda name, x: x + torch.nan if name in unread else x)
+    names = ", ".join(sorted(unread))
+    for mode in each_mode(module):
+        asked: set[str] = set()
+        with seeded(0):
+            first = _read_off(case, module, _with_asked_fields(inputs, asked))
+        beyond = sorted(asked - set(required))
+        expect(not beyond, f"in {mode} it reads {', '.join(beyond)}, which it does not require")
+        with seeded(0):
+            found = difference(first, _read_off(case, module, poisoned)) if unread else ""
+        expect(not found, f"in {mode} it reads some of {names}, which it declares not to: {found}")
+
+
+def _read_off(case: Case, module: Any, inputs: Inputs) -> Any:
+    """The output; of a layer the state, since it passes on a memory that it does not read."""
+    output = module(*inputs.values())
+    return output[0] if case.slot == "layer" else output
+
+
+class AskedFields(dict[str, Tensor]):
+    """Fields of a state that add the names they are asked for to `asked`."""
+
+    asked: set[str]
+
+    def __getitem__(self, name: str) -> Tensor:
+        self.asked.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        self.asked.add(str(name))
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """As of any dict."""
+        self.asked.add(name)
+        return super().get(name, default)
+
+
+def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
+    def changed(value: Any) -> Any:
+        if isinstance(value, LayerPrediction):
+            return replace(value, state=changed(value.state))
+        if not isinstance(value, QueryState):
+            return value
+        fields = AskedFields(value.fields)
+        fields.asked = asked
+        return replace(value, fields=fields)
+
+    return {name: changed(value) for name, value in inputs.items()}
+
+
+@check(READERS)
+def check_requires_are_read(case: Case) -> None:
+    """Every field in `requires` is read: else recipes that lack it are refused for nothing."""
+    module, inputs = case.lively(), inputs_of(case)
+    outputs = module(*inputs.values())
+    for field in case.component.requires(case.config):
+        full = next(name for name in leaves(inputs) if name.endswith(field))
+        others = [leaves(inputs_of(case, seed=seed))[full] for seed in (1, 2, 3)]
+        others.append(leaves(inputs)[full].roll(1, 1))  # rays are the same for every seed
+        changed = [mapped(inputs, lambda n, x, o=o, f=full: o if n == f else x) for o in others]
+        read = any(difference(outputs, module(*given.values())) for given in changed)
+        expect(read, f"it requires {field}, which changes nothing")
+
+
+@check({"layer", "refinement", "queries"})
+def check_writes_equal_provides(case: Case) -> None:
+    """The fields that are written are those in `provides`, in the shape and dtype given there.
+
+    A layer and a refinement pass on all other fields as they are, a refinement the features too.
+    """
+    module = case.lively()
+    for mode in each_mode(module):
+        inputs, before = inputs_of(case), {}
+        if case.slot != "queries":
+            state = inputs["state"]
+            before = {"unrelated.center": torch.randn(*state.features.shape[:2], 3), **state.fields}
+            inputs = {**inputs, "state": QueryState(state.features, before)}
+        with seeded(0):
+            output = module(*inputs.values())
+        output = output[0] if case.slot == "layer" else output
+        provided = case.component.provides(case.config)
+        kept = {n for n, x in output.fields.items() if n in before and _same(x, before[n])}
+        written = set(output.fields) - kept
+        for told, names in (
+            ("it writes {} besides", written - set(provided)),
+            ("it does not write {}", set(provided) - written),
+            ("it loses {}", set(before) - set(output.fields)),
+        ):
+            expect(not names, f"in {mode} {told.format(', '.join(sorted(names)))}")
+        if case.slot == "refinement":
+            passed = _same(output.features, inputs["state"].features)
+            expect(passed, f"in {mode} it changes the features, which a refinement passes on")
+        for name, spec in provided.items():
+            right = output[name].dtype == spec.dtype
+            expect(right, f"in {mode} `{name}` is {described(output[name])}, declared as {spec}")
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    return one is other or (one.data_ptr() == other.data_ptr() and one.shape == other.shape)
+
+
+@check(ALL_SLOTS)
+def check_unmet_requirement_fails_at_compose(case: Case) -> None:
+    """A recipe that lacks one thing a component needs is refused by name; one with all runs."""
+    needed = required_fields(case)
+    for missing in needed:
+        refusal = _refusal(case, {name: spec for name, spec in needed.items() if name != missing})
+        expect(bool(refusal), f"a recipe without {missing} is composed")
+        expect(missing in refusal, f"the refusal does not name the missing {missing}: {refusal}")
+    refusal = _refusal(case, needed)
+    expect(not refusal, f"a recipe that gives it all it requires is refused: {refusal}")
+    if case.slot in MODULES - {"renderer"}:
+        run_training_step(_resolved(case, needed), case)
+
+
+def _refusal(case: Case, given: Fields) -> str:
+    """The message about a recipe in which the queries provide `given` alone; "" if accepted."""
+    try:
+        _resolved(case, given)
+    except RecipeError as error:
+        return str(error)
+    return ""
+
+
+def _resolved(case: Case, given: Fields) -> Recipe:
+    components = [case.component]
+    recipe = _recipe_with(case)
+    if given:
+        components.append(_queries_with(case, given))
+        recipe["model"]["queries"]["type"] = f"{PLUGIN}/{GIVEN}"
+    features = case.component.requires(case.config).get("memory.features")
+    if features and features != MEMORY_FIELDS["memory.features"]:
+        components.append(_encoder_with(case, features))
+        recipe["model"]["encoder"]["type"] = f"{PLUGIN}/{GIVEN}"
+    return resolve(recipe, plugins=(Plugin(PLUGIN, CONTRACT_VERSION, components),))
+
+
+def _encoder_with(case: Case, spec: FieldSpec) -> type[Component]:
+    """An encoder whose features have a width of their own."""
+
+    class GivenEncoder(MultiViewViT):
+        name: ClassVar[str] = GIVEN
+
+        @classmethod
+        def provides(cls, config: ComponentConfig) -> Fields:
+            return {**MEMORY_FIELDS, "memory.features": spec}
+
+        def forward(self, views: Views) -> ImageMemory:
+            memory, wide = super().forward(views), memory_width(case)
+            repeats = -(-wide // memory.features.shape[-1])
+            return replace(memory, features=memory.features.repeat(1, 1, repeats)[..., :wide])
+
+    return GivenEncoder
+
+
+def _queries_with(case: Case, given: Fields) -> type[Component]:
+    """Queries that provide the fields `given`, of one scene, expanded to all of them."""
+
+    class GivenQueries(LatentQueries):
+        name: ClassVar[str] = GIVEN
+
+        @classmethod
+        def provides(cls, config: ComponentConfig) -> Fields:
+            return given
+
+        def start(self, batch_size: int) -> QueryState:
+            sizes = Sizes(batch=1, queries=self.count)
+            maker = Maker(case, sizes, torch.Generator().manual_seed(0))
+            fields = {name: maker.field(name, spec) for name, spec in given.items()}
+            fields = map_tensors(lambda x: x.expand(batch_size, *x.shape[1:]), fields)
+            return super().start(batch_size).replace(fields=fields)
+
+    return GivenQueries
+
+
+def _recipe_with(case: Case) -> dict[str, Any]:
+    """A small recipe of built-in components, but for the one under test."""
+    dims, slot = case.dims, case.slot
+    chosen = {"type": f"{PLUGIN}/{case.component.name}", **case.config.model_dump(mode="json")}
+    model: dict[str, Any] = {
+        "width": dims.width,
+        "heads": dims.heads,
+        "encoder": {"depth": 1},
+        "queries": {"count": 6},
+        "head": {"gaussians_per_query": 2},
+        "supervision": {"layers": [dims.depth]},
+        "renderer": {"type": "qgs/torch"},
+        "decoder": {"depth": dims.depth},
+    }
+    losses = {"photometric": {"type": "qgs/photometric"}}
+    recipe: dict[str, Any] = {"recipe": 1, "plugins": [PLUGIN], "model": model, "losses": losses}
+    if slot in LAYER_SLOTS:
+        model["decoder"][slot] = chosen
+    elif slot in MODEL_SLOTS:
+        model[slot] = chosen
+    elif SECTIONS[slot].named:
+        recipe[slot] = {**recipe.get(slot, {}), "case": chosen}
+    else:
+        recipe[slot] = chosen
+    return recipe
+
+
+@seeded(0)
+def run_training_step(recipe: Recipe, case: Case, sizes: Sizes | None = None) -> None:
+    """A forward pass, one view rendered and compared with the target, and the backward pass.
+
+    sizes: of the views; None for the usual ones.
+    Raises ContractError for predictions, images, losses or gradients that are not finite.
+    """
+    maker = Maker(case, sizes or Sizes(), torch.Generator().manual_seed(0))
+    model, losses = recipe.build_model().train(), recipe.build_losses()
+    views = maker.target()
+    target = views.select([0])
+    total = torch.zeros((), dtype=torch.float64)
+    for prediction in model(views).layers.values():
+        _expect_finite("prediction", prediction)
+        rendering = model.render(prediction.gaussians, target.cameras)
+        _expect_finite("rendering", rendering)
+        for loss in losses.values():
+            none = loss.renderings == "none"
+            seen = map_tensors(lambda x: x[:, :0], rendering) if none else rendering
+            terms = loss(prediction, seen, target)
+            _expect_finite("losses", terms)
+            total = total + scalar(terms)
+    found = gradients(total, dict(model.named_parameters()))
+    expect(bool(found), "in the model that it is composed into nothing gets a gradient")
+    _expect_finite("gradients", found)
+
+
+def _expect_finite(what: str, tree: Any) -> None:
+    broken = not_finite(tree)
+    expect(not broken, f"composed into a model, {what} are not finite: {', '.join(broken)}")

@@ -1,0 +1,73 @@
+"""Options: what a user writes is what the component gets."""
+
+from dataclasses import replace
+
+from pydantic import BaseModel
+
+from qgs.composer.decode import decode_config, models_in
+from qgs.composer.errors import Problems, RecipeError
+from qgs.composer.flow import variants
+from qgs.composer.yaml_text import dump, load_mapping
+from qgs.contracts import ComponentConfig
+from qgs_plugintools.case import Case, expect
+from qgs_plugintools.registry import ALL_SLOTS, check
+
+
+@check(ALL_SLOTS)
+def check_config_round_trip(case: Case) -> None:
+    """Options written as YAML and read again are the same options, with other choices too."""
+    for config in (case.config, *(other for _, _, other in variants(case.config))):
+        options = config.model_dump(mode="json")
+        lost = sorted(type(config).model_fields.keys() - options)
+        expect(not lost, f"{', '.join(lost)} is not written")
+        again, message = _decoded(case, dump(options))
+        expect(again is not None, f"{options} is refused: {message}")
+        expect(again == config, f"{config!r} is read again as {again!r}")
+
+
+@check(ALL_SLOTS)
+def check_misspelt_option_is_refused(case: Case) -> None:
+    """An option that does not exist is refused, and the nearest one that does is suggested.
+
+    The same holds for options inside of an option.
+    """
+    names = list(type(case.config).model_fields)
+    wrong = f"{names[0]}_x" if names else "no_such_option"
+    config, message = _decoded(case, dump({**case.config.model_dump(mode="json"), wrong: 1}))
+    expect(config is None, f"the option `{wrong}` is accepted")
+    expect(not names or f"did you mean `{names[0]}`" in message, f"the message is: {message}")
+    for model in _nested(type(case.config)):
+        strict = model.model_config.get("extra") == "forbid"
+        expect(strict, f"{model.__qualname__} accepts any option; derive it from ComponentConfig")
+
+
+@check(ALL_SLOTS - {"data"})
+def check_options_are_left_alone(case: Case) -> None:
+    """Building a component changes nothing in its options."""
+    own = replace(case, config=case.config.model_copy(deep=True))
+    own.build()
+    expect(own.config == case.config, f"when it is built, {case.config!r} becomes {own.config!r}")
+
+
+def _nested(config: type[BaseModel]) -> set[type[BaseModel]]:
+    """The models that options of `config`, or options in these, can hold."""
+    found: set[type[BaseModel]] = set()
+    left = [config]
+    while left:
+        fields = left.pop().model_fields.values()
+        models = {model for field in fields for model in models_in(field.annotation)} - found
+        found |= models
+        left += models
+    return found
+
+
+def _decoded(case: Case, text: str) -> tuple[ComponentConfig | None, str]:
+    """The options that the composer reads from `text`, and the message if it refuses them."""
+    problems = Problems()
+    node = load_mapping(text, "case", problems)
+    config = decode_config(case.component.Config, node, (), problems)
+    try:
+        problems.raise_any()
+    except RecipeError as error:
+        return config, str(error)
+    return config, ""

@@ -1,0 +1,117 @@
+"""The contract suite on all components of an installed plugin."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from qgs.composer.registry import (
+    InstalledPlugin,
+    PluginError,
+    default_config,
+    file_of,
+    load_plugin,
+)
+from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
+from qgs_plugintools.case import Case
+from qgs_plugintools.registry import TIERS, Tier, checked_tiers, checks_for
+from qgs_plugintools.running import CaseRun, CheckResult, refuse_unexpectable, with_place
+
+DEPTHS = (2, 12)
+"""Decoder depths that are tried in turn until the component's `problems` accepts one."""
+
+
+def cases_of(installed: InstalledPlugin) -> list[Case]:
+    """Every component of the plugin with its default options, and the plugin's examples.
+
+    Raises PluginError for `examples` that are not options of its components.
+    """
+    plugin = installed.plugin
+    for example in plugin.examples:
+        component = getattr(type(example), "__component__", None)
+        if component is None or component not in plugin.components:
+            fault = f"{example!r} is not options of its components, such as MyComponent.Config()"
+            raise _unsound(installed, "examples", fault)
+    defaults = [default_config(component) for component in plugin.components]
+    configs = [config for config in defaults if config is not None]
+    configs += [example for example in plugin.examples if example not in configs]
+    return [_case(config) for config in configs]
+
+
+def without_case(installed: InstalledPlugin) -> dict[type[Component], str]:
+    """Components that have no example and no usable default options, and why."""
+    checked = {case.component for case in cases_of(installed)}
+    return {c: _why_no_default(c) for c in installed.plugin.components if c not in checked}
+
+
+def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping[str, Expected]]:
+    """The known failures of each of the `cases`: those of its class and those of its options.
+
+    Raises PluginError for exemptions that no check of the cases can have.
+    """
+    exemptions = installed.plugin.exemptions
+    for owner, exempted in exemptions.items():
+        concerned = [case for case in cases if _concerns(owner, case)]
+        if not concerned:
+            fault = f"{owner!r} is neither a component of the plugin nor the options of a case"
+            raise _unsound(installed, "exemptions", fault)
+        try:
+            refuse_unexpectable(exempted, concerned)
+        except (ValueError, AttributeError) as error:
+            raise _unsound(installed, "exemptions", f"those of {owner!r}: {error}") from error
+    return [
+        {
+            name: expected
+            for owner, exempted in exemptions.items()
+            if _concerns(owner, case)
+            for name, expected in exempted.items()
+        }
+        for case in cases
+    ]
+
+
+def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
+    """Run every check on every case of the plugin `name`, case by case.
+
+    Raises PluginError for a plugin that is unusable or has unsound examples or exemptions, and
+    ValueError for no tiers and for unknown ones.
+    """
+    wanted, installed = checked_tiers(tiers), load_plugin(name)
+    cases = cases_of(installed)
+    runs = map(CaseRun, cases, exemptions_of(installed, cases))
+    return (run.make(check) for run in runs for check in checks_for(run.case, wanted))
+
+
+def _case(config: ComponentConfig) -> Case:
+    """A case with as few decoder layers as the options allow."""
+    cases = [Case(config, ModelDims(width=32, heads=2, depth=depth)) for depth in DEPTHS]
+    return next((case for case in cases if _accepts(case)), cases[0])
+
+
+def _accepts(case: Case) -> bool:
+    """Whether `problems` finds none; if it raises, the checks of the case report that."""
+    try:
+        return not case.problems(case.size)
+    except (Exception, SystemExit):
+        return False
+
+
+def _why_no_default(component: type[Component]) -> str:
+    options = component.Config.model_fields.items()
+    required = [f"`{name}`" for name, option in options if option.is_required()]
+    if required:
+        return f"there is no default for {', '.join(required)}"
+    try:
+        component.Config()
+    except (Exception, SystemExit) as error:
+        return f"its default options are refused: {with_place(error, file_of(component))}"
+    raise AssertionError("a component with default options has a case")
+
+
+def _concerns(owner: Any, case: Case) -> bool:
+    return owner is case.component or (isinstance(owner, ComponentConfig) and owner == case.config)
+
+
+def _unsound(installed: InstalledPlugin, what: str, fault: str) -> PluginError:
+    return PluginError(
+        f"the `{what}` of the plugin `{installed.plugin.name}` of {installed.released_as}: {fault}",
+        f"correct the `{what}` of its Plugin",
+    )

@@ -1,0 +1,332 @@
+"""Heads, queries, supervisions, losses, data, encoders and attention that break their contracts."""
+
+from dataclasses import replace
+
+import torch
+from contract_mutants.mutant import mutant
+from torch import Tensor, nn
+
+from qgs.components import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    GaussianHead,
+    LatentBottleneck,
+    LatentQueries,
+    LayerSupervision,
+    MultiViewViT,
+    OneCycleAdamW,
+)
+from qgs.components.blocks import CrossAttentionCore, split_heads
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    AttentionWeights,
+    Column,
+    CrossAttention,
+    Loss,
+    Scene,
+    SceneSource,
+)
+from qgs.metrics.images import Psnr
+from qgs.types import Cameras, ImageMemory, LayerPrediction, Rendering, Views
+
+
+class OneTerm(Loss):
+    """A loss of one term, which mutants define."""
+
+    def term(self, prediction: LayerPrediction, rendering: Rendering, target: Views) -> Tensor:
+        raise NotImplementedError
+
+    def forward(self, prediction, rendering, target):
+        return {"term": self.term(prediction, rendering, target)}
+
+
+class ChangedEncoder(MultiViewViT):
+    """A sound encoder, whose input or output mutants change."""
+
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
+    def given(self, views: Views) -> Views:
+        return views
+
+    def result(self, memory: ImageMemory) -> ImageMemory:
+        return memory
+
+    def forward(self, views):
+        return self.result(super().forward(self.given(views)))
+
+
+@mutant("head_gives_gaussians", "quaternions are 2")
+class GivesLongQuaternions(GaussianHead):
+    def activate(self, raw):
+        good = super().activate(raw)
+        return replace(good, quats=2 * good.quats)
+
+
+@mutant("head_gives_gaussians", "with initial parameters")
+class StartsWithZeroQuaternions(GaussianHead):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        nn.init.zeros_(self.linear.weight)
+
+
+@mutant("queries_are_shared_by_scenes", "scene 1 of 3", options={"count": 6})
+class NumbersScenes(LatentQueries):
+    def start(self, batch_size):
+        state = super().start(batch_size)
+        scene = torch.arange(batch_size).to(state.features)[:, None, None]
+        return state.replace(state.features + scene)
+
+
+@mutant("queries_resize", "cannot be loaded", options={"count": 6})
+class NeverResizes(LatentQueries):
+    def resized(self, learned, generator):
+        return dict(learned)
+
+
+@mutant("supervision_weights", "weights sum to 2", options={"layers": (1, 2)})
+class WeighsTwice(LayerSupervision):
+    def weights(self):
+        return {layer: 2 * weight for layer, weight in super().weights().items()}
+
+
+class NoiseScene(Scene):
+    """Two frames of another noise each time."""
+
+    name = "noise"
+
+    @property
+    def cameras(self):
+        lens = torch.tensor([16.0, 16.0, 12.0, 8.0]).expand(2, 4)
+        return Cameras(torch.eye(4).expand(2, 4, 4), lens, (16, 24))
+
+    def images(self, frames):
+        return torch.rand(len(frames), 3, 16, 24)
+
+
+@mutant("scenes_repeat", "opened again, 1: values differ")
+class DrawsItsImages(SceneSource):
+    def scenes(self, split):
+        return [NoiseScene()]
+
+
+@mutant("scenes_are_as_listed", "is `noise`, not place 0", also="scenes_repeat")
+class NamesPlaces(DrawsItsImages):
+    def names(self, split):
+        return ["place 0"]
+
+
+@mutant("scenes_are_as_listed", "hold not each of 1 scenes once: 0, 0", also="scenes_repeat")
+class GroupsASceneTwice(DrawsItsImages):
+    def groups(self, split):
+        return [[0], [0]]
+
+
+@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]", also="scenes_repeat")
+class HoldsOutTooMuch(DrawsItsImages):
+    def scenes(self, split):
+        (scene,) = super().scenes(split)
+        scene.held_out = (1, 2)
+        return [scene]
+
+
+@mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
+class SumsOverScenes(OneTerm):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target):
+        return (rendering.rgb - target.images).square().mean((1, 2, 3, 4)).sum()
+
+
+@mutant("renderings_as_declared", "against the mean over views")
+class TakesTheWorstView(OneTerm):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target):
+        return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
+
+
+@mutant("metric_gives_its_columns", "the values of the columns [''] are not finite")
+class DividesByTheError(Psnr):
+    def forward(self, given):
+        return 1 / (given.images - given.targets.images).square().mean((2, 3, 4))
+
+
+@mutant("metric_gives_its_columns", "it has values for ['', 'lost'], columns for ['']")
+class GivesAValueWithoutColumn(Psnr):
+    def forward(self, given):
+        return {"": super().forward(given), "lost": given.images.mean()}
+
+
+@mutant("truth_scores_best", "lower is better, but PSNR is 100 for the truth")
+class ReversesItsDirection(Psnr):
+    column = Column("PSNR", "lower")
+
+
+@mutant("optimizer_steps", "it leaves out parameters")
+class OptimizesDecayingGroups(OneCycleAdamW):
+    def build(self, groups):
+        return super().build([group for group in groups if group["decays"]])
+
+
+@mutant("optimizer_continues", "three and three from a checkpoint")
+class CountsItsOwnSteps(OneCycleAdamW):
+    calls = 0
+
+    def learning_rate(self, step, seconds):
+        self.calls += 1
+        return 0.1 / self.calls
+
+
+@mutant("patch_rays_are_those_of_the_grid", "differ by up to 0.9")
+class GivesZerosAsRays(ChangedEncoder):
+    def result(self, memory):
+        return replace(memory, patch_rays=torch.zeros_like(memory.patch_rays))
+
+
+@mutant("patch_rays_are_those_of_the_grid", "of patches of 8 pixels")
+class RoundsItsRays(ChangedEncoder):
+    def result(self, memory):
+        return replace(memory, patch_rays=memory.patch_rays.bfloat16().to(memory.patch_rays))
+
+
+@mutant(
+    "patch_rays_are_those_of_the_grid",
+    "`grid` is (2, 3, 2), whi",
+    also="tokens_are_those_of_the_grid",
+)
+class SwapsRowsAndColumns(ChangedEncoder):
+    def result(self, memory):
+        views, rows, columns = memory.grid
+        return replace(memory, grid=(views, columns, rows))
+
+
+@mutant("tokens_are_those_of_the_grid", "token of `keys` at (1, 1, 1)")
+class OrdersTokensByColumn(ChangedEncoder):
+    def result(self, memory):
+        def turned(x: Tensor, tokens: int) -> Tensor:
+            x = x.unflatten(tokens, memory.grid).transpose(tokens + 1, tokens + 2)
+            return x.flatten(tokens, tokens + 2)
+
+        keys, values = turned(memory.keys, 2), turned(memory.values, 2)
+        return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
+
+
+@mutant("tokens_are_those_of_the_grid", "`values` at (0, 0, 2)", also="view_permutation")
+class ReversesItsViews(ChangedEncoder):
+    def result(self, memory):
+        values = memory.values.unflatten(2, (memory.grid[0], -1)).flip(2)
+        return replace(memory, values=values.flatten(2, 3))
+
+
+@mutant("tokens_are_those_of_the_grid", "with images of 24 x 16, a")
+class FlipsTallImages(ChangedEncoder):
+    def given(self, views):
+        height, width = views.cameras.size
+        return replace(views, images=views.images.flip(-2)) if height > width else views
+
+
+@mutant("tokens_are_those_of_the_grid", "`values` stays as it is")
+class IgnoresImages(ChangedEncoder):
+    def given(self, views):
+        return replace(views, images=0 * views.images)
+
+
+LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
+
+
+@mutant("project_makes_the_memory_again", "made anew from its own", options=LATENTS)
+class ProjectsDoubles(LatentBottleneck):
+    def project(self, features, memory):
+        return super().project(2 * features, memory)
+
+
+@mutant("project_makes_the_memory_again", "make the same memory", options=LATENTS)
+class ProjectsNothing(LatentBottleneck):
+    def project(self, features, memory):
+        return memory
+
+
+@mutant("project_makes_the_memory_again", "does not declare `tunable`", options=LATENTS)
+class ProjectsInSecret(LatentBottleneck):
+    tunable = False
+
+
+@mutant("project_makes_the_memory_again", "`project` is not implemented")
+class PromisesToProject(ChangedEncoder):
+    tunable = True
+
+
+@mutant("memo_is_of_the_memory_alone", "depends on a weight")
+class SharesItsProjection(CrossAttention):
+    """Keys and values by the weights of whichever layer comes first."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.core = CrossAttentionCore(dims.width, dims.heads)
+        self.kv = nn.Linear(dims.width, 2 * dims.width)
+
+    @classmethod
+    def requires(cls, config):
+        return {"memory.features": MEMORY_FIELDS["memory.features"]}
+
+    def forward(self, state, memory):
+        both = memory.once("mutants.kv", lambda: self.kv(memory.features))
+        keys, values = (split_heads(x, self.dims.heads) for x in both.chunk(2, -1))
+        return self.core(state.features, keys, values)
+
+
+@mutant("memo_is_of_the_memory_alone", "depends on the state")
+class KeepsTheFirstState(ContentCrossAttention):
+    def forward(self, state, memory):
+        mean = memory.once("mutants.mean", lambda: state.features.mean(1, keepdim=True))
+        return super().forward(state, memory) + mean
+
+
+@mutant("explanation_is_a_softmax", "off the softmax")
+class ExplainsBySigmoid(ContentSelfAttention):
+    def explain(self, state, queries):
+        content = super().explain(state, queries).content
+        return AttentionWeights(content, None, torch.sigmoid(content))
+
+
+@mutant(
+    "explanation_is_a_softmax",
+    "geometry must have shape (2, 1, 6, 12) or (2, 2, 6, 12), got (2, 6, 12)",
+    also="explanation_is_of_the_forward_pass geometry_is_float32_under_autocast",
+)
+class ExplainsGeometryWithoutHeads(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        given = super().explain(state, memory, queries)
+        return AttentionWeights(given.content, 0 * given.content[:, 0], given.weights)
+
+
+@mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")
+class MasksItsContent(ContentSelfAttention):
+    def explain(self, state, queries):
+        content = super().explain(state, queries).content
+        content = content.masked_fill(content < content.mean(), -torch.inf)
+        return AttentionWeights(content, None, content.softmax(-1))
+
+
+@mutant("explanation_is_a_softmax", "asked for queries 2 and 0 alone, it gives other weights")
+class ExplainsAllQueries(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        return super().explain(state, memory, torch.arange(state.features.shape[1]))
+
+
+@mutant(
+    "explanation_is_a_softmax",
+    "content is (2, 2, 6, 11), not (B, h, Q, T) = (2, h, 6, 12)",
+    also="explanation_is_of_the_forward_pass",
+)
+class ExplainsToFewTokens(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        content = super().explain(state, memory, queries).content[..., 1:]
+        return AttentionWeights(content, None, content.softmax(-1))
+
+
+@mutant("masked_queries_are_not_read", "of the others")
+class IgnoresTheMask(ContentSelfAttention):
+    def forward(self, state):
+        return self.attention(self.norm(state.features))

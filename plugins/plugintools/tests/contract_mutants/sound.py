@@ -1,0 +1,227 @@
+"""Components that keep the contract in ways that a check could take for a fault."""
+
+from dataclasses import replace
+from functools import cached_property
+
+import torch
+import torch.nn.functional as F
+from contract_mutants.fields import PlacesByALayer
+from contract_mutants.mutant import named
+from contract_mutants.renderers import RefusesWhatItDeclares
+from torch import nn
+
+from qgs.components import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    MlpFeedForward,
+    MultiViewViT,
+)
+from qgs.components.blocks import merge_heads
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    ComponentConfig,
+    FeedForward,
+    FieldSpec,
+    LearnedQueries,
+    SelfAttention,
+)
+from qgs.losses import Opacity
+from qgs.renderers import TorchRenderer
+from qgs.types import QueryState
+
+
+@named
+class DropsOut(MlpFeedForward):
+    def forward(self, features):
+        return F.dropout(super().forward(features), 0.2, self.training)
+
+
+@named
+class LeavesItselfOut(MlpFeedForward):
+    """Stochastic depth: half of its training passes update nothing."""
+
+    def forward(self, features):
+        update = super().forward(features)
+        return update * (torch.rand(()) > 0.5).to(update) if self.training else update
+
+
+@named
+class Recurrent(FeedForward):
+    """A layer of torch that lists its weights a second time."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.gru = nn.GRU(dims.width, dims.width, batch_first=True)
+
+    def forward(self, features):
+        twice = features.flatten(0, 1)[:, None].expand(-1, 2, -1)
+        return self.gru(twice)[0][:, -1].unflatten(0, features.shape[:2])
+
+
+@named
+class LooksNowhere(SelfAttention):
+    """The ablation of a slot: queries exchange nothing."""
+
+    def forward(self, state):
+        return torch.zeros_like(state.features)
+
+
+@named
+class MovesItsState(ContentSelfAttention):
+    """`QueryState.to` goes through all fields, and sees none."""
+
+    def forward(self, state):
+        return super().forward(state.to(state.features.device))
+
+
+@named
+class KeepsAConstant(MlpFeedForward):
+    @cached_property
+    def half(self):
+        return 0.5
+
+    def forward(self, features):
+        return self.half * super().forward(features)
+
+
+@named
+class PassesFieldsOn(ContentSelfAttention):
+    """It makes states by hand, with fields that it does not look at."""
+
+    def forward(self, state):
+        doubled = replace(state, features=2 * state.features)
+        return super().forward(
+            QueryState(doubled.features, doubled.fields | {}, state.mask).replace()
+        )
+
+
+@named
+class TurnsAutocastOff(PlacesByALayer):
+    """PyTorch's own idiom for float32 geometry, which torch refuses on meta."""
+
+    def forward(self, state):
+        center = state["place.center"]
+        with torch.autocast(center.device.type, enabled=False):
+            bounded = center / (1 + center.norm(dim=-1, keepdim=True))
+        return self.attention(self.norm(state.features + self.place(bounded)), state.mask)
+
+
+@named
+class ReadsTheFirstViewMost(ContentCrossAttention):
+    ordered_views = True
+
+    def forward(self, state, memory):
+        views = memory.grid[0]
+        values = memory.values.unflatten(2, (views, -1))
+        first = (values[:, :, :1] + values).flatten(2, 3)
+        return self.core(state.features, memory.keys, first)
+
+
+@named
+class FusesInHalf(ContentCrossAttention):
+    """Attention by one kernel in half precision, spelled out in any other."""
+
+    def forward(self, state, memory):
+        keys, values = memory.keys, memory.values
+        query = self.core.project(state.features).to(values.dtype)
+        if values.dtype == torch.bfloat16:
+            read = F.scaled_dot_product_attention(query, keys, values)
+        else:
+            read = (query @ keys.mT * query.shape[-1] ** -0.5).softmax(-1) @ values
+        return self.core.out_proj(merge_heads(read))
+
+
+@named
+class DecodesItsQueries(LearnedQueries):
+    """Codes of each query, and what all share: a layer, and the logarithm of a size."""
+
+    class Config(ComponentConfig):
+        count: int = 8
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.code = nn.Parameter(torch.randn(config.count, 16))
+        self.log_size = nn.Parameter(torch.zeros(()))
+        self.up = nn.Linear(16, dims.width)
+
+    @property
+    def count(self) -> int:
+        return self.code.shape[0]
+
+    @classmethod
+    def provides(cls, config):
+        return {"place.size": FieldSpec((1,))}
+
+    def start(self, batch_size):
+        size = self.log_size.exp().expand(batch_size, self.count, 1)
+        return QueryState(
+            self.up(self.code).expand(batch_size, -1, -1), {"place.size": size.clone()}
+        )
+
+    def resized(self, learned, generator):
+        codes = super().resized({"code": learned["code"]}, generator)
+        return {**learned, **codes}
+
+
+@named
+class SeesFar(MultiViewViT):
+    """Convolutions over 19 pixels, before patches of 8 are cut."""
+
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        layers = [(3, 16), (16, 16), (16, 3)]
+        self.stem = nn.Sequential(
+            *(nn.Sequential(nn.Conv2d(i, o, 7, padding=3), nn.Tanh()) for i, o in layers)
+        )
+
+    def embed(self, views, plucker):
+        seen = self.stem(views.images.flatten(0, 1)).unflatten(0, views.images.shape[:2])
+        return super().embed(replace(views, images=seen), plucker)
+
+
+@named
+class WeighsNothing(Opacity):
+    """The ablation of a loss."""
+
+    class Config(Opacity.Config):
+        """A weight of 0."""
+
+        weight: float = 0.0
+
+
+@named
+class RefusesIntrinsics(RefusesWhatItDeclares):
+    camera_gradients = ("c2w",)
+
+
+@named
+class Fades(TorchRenderer):
+    def forward(self, gaussians, cameras, background=None):
+        faded = replace(gaussians, opacities=0.7 * gaussians.opacities)
+        return super().forward(faded, cameras, background)
+
+
+@named
+class EachHeadSeesASide(ContentCrossAttention):
+    """A bias for each head that hides what lies left, or right, of the camera's axis."""
+
+    @classmethod
+    def requires(cls, config):
+        return {**super().requires(config), "memory.patch_rays": MEMORY_FIELDS["memory.patch_rays"]}
+
+    def bias(self, state, memory):
+        side_B1M = memory.patch_rays[:, None, :, 3]
+        heads = torch.arange(self.dims.heads).to(side_B1M.device) % 2 == 1
+        bias_BhM = side_B1M.square().masked_fill((side_B1M < 0.05) == heads[:, None], -torch.inf)
+        return bias_BhM[:, :, None].expand(-1, -1, state.features.shape[1], -1)
+
+    def forward(self, state, memory):
+        bias = self.bias(state, memory)
+        return self.core(state.features, memory.keys, memory.values, bias)
+
+    def explain(self, state, memory, queries):
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias)

@@ -1,0 +1,87 @@
+"""Every check catches the components that are broken in the way it is for, and no sound one."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from contract_mutants import precision, sound
+from contract_mutants.mutant import MUTANTS, Mutant
+from qgs_plugintools import CHECKS, Case, checks_for, run_check
+
+from qgs.components import ContentCrossAttention
+from qgs.contracts import Component, ModelDims
+from qgs.renderers import TorchRenderer
+
+for file in sorted(Path(sound.__file__).parent.glob("*.py")):
+    import_module(f"contract_mutants.{file.stem}")
+
+SLOW = {"loops_over_queries", "loops_over_views"}
+
+
+def _parameters() -> list:
+    return [
+        pytest.param(m, marks=[pytest.mark.slow] if m.component.name in SLOW else [], id=str(m))
+        for m in MUTANTS
+    ]
+
+
+def test_every_check_has_a_mutant() -> None:
+    assert {mutant.check for mutant in MUTANTS} == set(CHECKS)
+
+
+def test_no_two_mutants_share_a_name() -> None:
+    assert len({mutant.component.name for mutant in MUTANTS}) == len(
+        {mutant.component for mutant in MUTANTS}
+    )
+
+
+@pytest.mark.parametrize("mutant", _parameters())
+def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
+    case, meant = mutant.to_case(), CHECKS[mutant.check]
+    result = run_check(meant, case)
+    assert result.verdict == "failed", result
+    assert mutant.seen in result.message
+    assert mutant.component.name in result.message
+    assert meant.contract in result.message
+    if mutant.also is None:
+        return
+    alike = {m.check for m in MUTANTS if m.component is mutant.component}
+    others = [c for c in checks_for(case, ["core"]) if c.name not in alike]
+    failed = {r.check.name: r.message for r in (run_check(c, case) for c in others) if not r.ok}
+    assert failed.keys() == mutant.also, list(failed.values())
+
+
+SOUND = [
+    component
+    for component in vars(sound).values()
+    if getattr(component, "__module__", "") == sound.__name__
+]
+
+
+@pytest.mark.parametrize("component", [*SOUND, precision.TurnsInFull])
+def test_a_sound_component_passes(component: type[Component]) -> None:
+    case = Case(component.Config())
+    results = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert not [result.message for result in results if not result.ok]
+
+
+FAR = sound.SeesFar.Config(depth=8, layer_scale=1.0)
+GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_differences")
+
+
+@pytest.mark.parametrize(
+    ("checks", "case"),
+    [
+        (["tokens_are_those_of_the_grid"], Case(FAR)),
+        (["saved_weights_load"], Case(ContentCrossAttention.Config(), ModelDims(48, 3, 1))),
+        (GRADIENTS, Case(TorchRenderer.Config(dilation=0.1))),
+        (GRADIENTS, Case(TorchRenderer.Config(dilation=1.0))),
+        (GRADIENTS, Case(TorchRenderer.Config(alpha_min=1 / 128))),
+        (GRADIENTS, Case(TorchRenderer.Config(background=(0, 0, 0)))),
+        (GRADIENTS, Case(TorchRenderer.Config(), image_size=(17, 23))),
+    ],
+)
+def test_a_sound_component_of_unusual_options_passes(checks: list[str], case: Case) -> None:
+    for name in checks:
+        result = run_check(CHECKS[name], case)
+        assert result.verdict == "passed", result.message

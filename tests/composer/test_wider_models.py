@@ -1,0 +1,270 @@
+"""Models of other builds: queries of the photos, layers of their own, memories without rays."""
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from qgs.components import MultiViewViT
+from qgs.composer import RecipeError, resolve
+from qgs.composer.registry import PluginError
+from qgs.contracts import (
+    CONTRACT_VERSION,
+    MEMORY_FIELDS,
+    ComponentConfig,
+    DecoderLayer,
+    Fields,
+    FieldSpec,
+    ModelDims,
+    Plugin,
+    Queries,
+)
+from qgs.types import Cameras, ImageMemory, QueryState, Views
+
+FEATURES = {"memory.features": MEMORY_FIELDS["memory.features"]}
+
+
+class TokenQueries(Queries):
+    """A query for every image token."""
+
+    name: ClassVar[str] = "tokens"
+    count = None
+
+    def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width)
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return FEATURES
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        return QueryState(self.norm(memory.features))
+
+
+class BrightQueries(TokenQueries):
+    """Queries of the tokens, of which dark ones are left out: their number varies by scene."""
+
+    name: ClassVar[str] = "bright"
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        light_BM = nn.functional.avg_pool2d(views.images.mean(2).flatten(0, 1), 8)
+        return replace(
+            super().forward(memory, views),
+            mask=light_BM.reshape(len(memory.features), -1) > 0.5,
+        )
+
+
+class JointLayer(DecoderLayer):
+    """Queries and image tokens attend to each other; both change."""
+
+    name: ClassVar[str] = "joint"
+
+    def __init__(self, config: Any, dims: ModelDims, sublayers: Any, layer_scale: float) -> None:
+        super().__init__(config, dims, sublayers, layer_scale)
+        self.attention = nn.MultiheadAttention(dims.width, dims.heads, batch_first=True)
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return FEATURES
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        tokens = memory.features.shape[1]
+        x = torch.cat([memory.features, state.features], 1)
+        x = x + self.attention(x, x, x, need_weights=False)[0]
+        return state.replace(x[:, tokens:]), replace(memory, features=x[:, :tokens])
+
+
+class BlindEncoder(MultiViewViT):
+    """It has features alone, twice as wide as the model."""
+
+    name: ClassVar[str] = "blind"
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        return {"memory.features": FieldSpec((32,))}
+
+    def forward(self, views: Views) -> ImageMemory:
+        x_BMD = super().forward(views).features
+        return ImageMemory(torch.cat([x_BMD, -x_BMD], -1))
+
+
+class WideQueries(TokenQueries):
+    """Queries of tokens that are 32 wide."""
+
+    name: ClassVar[str] = "wide"
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return {"memory.features": FieldSpec((32,))}
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        return QueryState(self.norm(memory.features[..., :16]))
+
+
+COMPONENTS = (TokenQueries, BrightQueries, JointLayer, BlindEncoder, WideQueries)
+PLUGIN = Plugin("other", CONTRACT_VERSION, COMPONENTS)
+NO_LAYERS = {"depth": 0}
+
+
+def recipe(**model: Any) -> dict[str, Any]:
+    sizes = {"width": 16, "heads": 2, "head": {"gaussians_per_query": 2}}
+    small = {
+        "encoder": {"patch_size": 8, "depth": 1},
+        "decoder": {"depth": 2},
+        "supervision": {"layers": [2]},
+        "renderer": {"type": "qgs/torch"},
+    }
+    return {"recipe": 1, "plugins": ["other"], "model": {**sizes, **small, **model}}
+
+
+def views(scenes: int = 2) -> Views:
+    c2w = torch.eye(4).repeat(scenes, 2, 1, 1)
+    lens = torch.tensor([16.0, 16.0, 8.0, 12.0]).expand(scenes, 2, 4)
+    images = torch.rand(scenes, 2, 3, 24, 16, generator=torch.Generator().manual_seed(0))
+    return Views(images, Cameras(c2w, lens, (24, 16)))
+
+
+def made(**model: Any) -> Any:
+    return resolve(recipe(**model), plugins=[PLUGIN]).build_model().eval()
+
+
+def refused(**model: Any) -> list[str]:
+    with pytest.raises(RecipeError) as caught:
+        resolve(recipe(**model), plugins=[PLUGIN])
+    return [f"{p.option}: {p.reason}; {p.fix}" for p in caught.value.problems]
+
+
+def test_a_query_for_each_token_and_no_layer() -> None:
+    model = made(queries={"type": "other/tokens"}, decoder=NO_LAYERS, supervision={"layers": [0]})
+    prediction = model.train()(views())
+    assert prediction.gaussians.count == 2 * 3 * 2 * 2  # views, rows, columns, K
+    assert list(prediction.layers) == [0]
+    prediction.gaussians.means.sum().backward()
+    assert model.encoder.rgb_embedding.proj.weight.grad.any()
+    one = views(1)
+    assert (
+        model(replace(one, images=1 - one.images))
+        .gaussians.means.ne(prediction.gaussians.means[:1])
+        .any()
+    )
+    with pytest.raises(
+        ValueError, match=r"layers \[1\] do not exist; this model has layers 0\.\.0"
+    ):
+        model(one, layers=[1])
+
+
+def test_a_resolved_recipe_without_layers_resolves_to_itself() -> None:
+    first = resolve(recipe(decoder=NO_LAYERS, supervision={"layers": [0]}), plugins=[PLUGIN]).tree
+    assert first["model"]["decoder"] == {"depth": 0, "layer_scale": 5e-5}
+    assert resolve(first, plugins=[PLUGIN]).tree == first
+
+
+def test_scenes_may_have_different_numbers_of_queries() -> None:
+    model = made(queries={"type": "other/bright"}, decoder={"depth": 2, "layer_scale": 0.5})
+    given = views()
+    prediction = model(given)
+    mask = prediction.state.mask
+    assert len({int(scene.sum()) for scene in mask}) == 2
+    per_query = prediction.gaussians.opacities.view(*mask.shape, -1)
+    assert not per_query[~mask].any()
+    assert (per_query[mask] > 0).all()
+
+    def kept(scene: int, state: QueryState) -> Tensor:
+        return model.predict(
+            model.encoder(map_scene(given, scene)), state
+        ).gaussians.means.unflatten(1, (-1, 2))
+
+    for scene in range(2):
+        start = model.queries(model.encoder(map_scene(given, scene)), map_scene(given, scene))
+        alone = QueryState(start.features[:, mask[scene]])
+        means = prediction.gaussians.means[scene : scene + 1].unflatten(1, (-1, 2))[:, mask[scene]]
+        torch.testing.assert_close(kept(scene, alone), means, rtol=1e-4, atol=1e-5)
+
+
+def map_scene(given: Views, scene: int) -> Views:
+    cameras = given.cameras[scene : scene + 1]
+    return Views(given.images[scene : scene + 1], cameras)
+
+
+def test_a_layer_of_its_own_changes_the_memory_that_the_next_one_reads() -> None:
+    model = made(decoder={"depth": 2, "layer": {"type": "other/joint"}})
+    seen: list[Tensor] = []
+    for layer in model.decoder:
+        layer.register_forward_pre_hook(lambda _, args: seen.append(args[1].features))
+    model(views())
+    assert not torch.equal(*seen)
+    assert "decoder.cross_attention" not in repr(model)
+    assert {name.split(".")[2] for name, _ in model.decoder.named_parameters(prefix="decoder")} == {
+        "attention"
+    }
+
+
+def test_what_fills_a_slot_that_the_layer_lacks_is_refused_and_null_drops_it() -> None:
+    layer = {"depth": 2, "layer": {"type": "other/joint"}}
+    (told,) = refused(decoder={**layer, "self_attention": {"type": "qgs/content"}})
+    assert told.startswith("model.decoder.self_attention: `other/joint` ")
+    assert "has no slot `self_attention`; remove it; `self_attention: null` drops one" in told
+    assert made(decoder={**layer, "self_attention": None}).depth == 2
+    swap = {"decoder.layers.0.feed_forward": {"type": "qgs/mlp"}}
+    with pytest.raises(RecipeError, match="has no slot `feed_forward`"):
+        resolve({**recipe(decoder=layer), "swap": swap}, plugins=[PLUGIN])
+
+
+def test_one_layer_may_be_of_another_build() -> None:
+    model = made(decoder={"depth": 2, "layers": {"1": {"layer": {"type": "other/joint"}}}})
+    assert [type(layer).__name__ for layer in model.decoder] == ["CrossSelfMlp", "JointLayer"]
+    assert model(views()).gaussians.count == 4096 * 2
+
+
+def test_a_decoder_without_layers_refuses_what_would_stand_in_them() -> None:
+    told = refused(decoder={"depth": 0, "feed_forward": {"ratio": 2}}, supervision={"layers": [0]})
+    reason = "a decoder of depth 0 has no layers, so nothing reads it"
+    assert told == [
+        f"model.decoder.feed_forward: {reason}; remove it; `feed_forward: null` drops one that is "
+        "inherited"
+    ]
+    (told,) = refused(decoder=NO_LAYERS)
+    assert "layers [2] do not exist in a decoder of depth 0; write [0]" in told
+    (told,) = refused(supervision={"layers": [0]})
+    assert "layers [0] do not exist in a decoder of depth 2; choose layers from 1 to 2" in told
+
+
+def test_what_needs_keys_or_rays_is_refused_beside_an_encoder_without() -> None:
+    blind = {"type": "other/blind", "patch_size": 8, "depth": 1}
+    (told,) = refused(encoder=blind)
+    assert "`qgs/content` needs memory.keys (D/h float32) and memory.values" in told
+    told = " ".join(refused(encoder=blind, decoder={"depth": 2, "layer": {"type": "other/joint"}}))
+    assert (
+        "`other/joint` reads memory.features as D float32, `other/blind` at model.encoder" in told
+    )
+    assert "writes it as 32 float32" in told
+    wide = made(
+        encoder=blind,
+        queries={"type": "other/wide"},
+        decoder=NO_LAYERS,
+        supervision={"layers": [0]},
+    )
+    assert wide(views()).gaussians.count == 24
+    with pytest.raises(KeyError, match="the image memory has no keys; its encoder does not"):
+        wide.encoder(views())["keys"]
+
+
+def test_a_layer_that_forgets_the_memory_is_reported() -> None:
+    class Forgetful(JointLayer):
+        name: ClassVar[str] = "forgetful"
+
+        def forward(self, state: QueryState, memory: ImageMemory) -> Any:
+            return super().forward(state, memory)[0]
+
+    plugin = Plugin("mine", CONTRACT_VERSION, (Forgetful,))
+    wanted = {
+        **recipe(decoder={"depth": 1, "layer": {"type": "mine/forgetful"}}),
+        "plugins": ["mine"],
+    }
+    wanted["model"]["supervision"] = {"layers": [1]}
+    model = resolve(wanted, plugins=[plugin]).build_model()
+    with pytest.raises(PluginError, match="returns QueryState, not a QueryState and an ImageM"):
+        model(views())

@@ -1,0 +1,41 @@
+"""A fixture that installs distributions in a folder of their own, for as long as a test runs."""
+
+import json
+import sys
+from collections.abc import Callable
+from textwrap import dedent
+
+import pytest
+
+
+@pytest.fixture
+def install(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., None]:
+    """Make a distribution importable: install(distribution, plugin name, module source).
+
+    editable: as `pip install -e` leaves it. group: of its entry point.
+    """
+
+    def install(
+        distribution: str,
+        plugin: str,
+        source: str,
+        version: str = "1.2",
+        editable: bool = False,
+        group: str = "qgs.plugins",
+    ) -> None:
+        folder, safe = tmp_path_factory.mktemp("site"), distribution.replace("-", "_")
+        (folder / f"_test_{safe}.py").write_text(dedent(source))
+        info = folder / f"{safe}-{version}.dist-info"
+        info.mkdir()
+        metadata = f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
+        (info / "METADATA").write_text(metadata)
+        (info / "entry_points.txt").write_text(f"[{group}]\n{plugin} = _test_{safe}:plugin\n")
+        if editable:
+            record = {"url": folder.as_uri(), "dir_info": {"editable": True}}
+            (info / "direct_url.json").write_text(json.dumps(record))
+        monkeypatch.syspath_prepend(folder)
+        monkeypatch.delitem(sys.modules, f"_test_{safe}", raising=False)
+
+    return install

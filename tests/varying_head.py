@@ -1,0 +1,30 @@
+"""A head whose Gaussians have colours that depend on the direction, and features."""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from qgs.components import GaussianHead
+from qgs.types import GaussianAttributes, QueryState
+
+HARMONICS, FEATURES = 8, 4
+
+
+class VaryingHead(nn.Module):
+    """What `head` decodes, with `sh` (B, N, K, 8, 3) and `features` (B, N, K, 4) in addition."""
+
+    def __init__(self, head: GaussianHead) -> None:
+        super().__init__()
+        self.head, self.config = head, head.config
+        channels = head.gaussians_per_query * (3 * HARMONICS + FEATURES)
+        generator = torch.Generator().manual_seed(4)
+        self.linear = nn.Linear(head.linear.in_features, channels, bias=False)
+        nn.init.normal_(self.linear.weight, std=0.1, generator=generator)
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        normed = F.layer_norm(state.features, state.features.shape[-1:])
+        raw = self.linear(normed).unflatten(-1, (self.head.gaussians_per_query, -1))
+        sh, features = raw.split([3 * HARMONICS, FEATURES], -1)
+        return replace(self.head(state), sh=sh.unflatten(-1, (HARMONICS, 3)), features=features)
