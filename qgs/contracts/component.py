@@ -1,6 +1,6 @@
 """What all components share: a name, a Config, the fields they read and write, problems."""
 
-from abc import ABC
+from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeAlias
@@ -107,7 +107,7 @@ def without_effect(
             yield Problem(option, f"`{option}` has no effect: {because}", fix)
 
 
-class Component(ABC):
+class Component(metaclass=ABCMeta):
     """Base of everything that a recipe selects with `type: PLUGIN/NAME`.
 
     A slot's contract sets `slot`; a component sets `name` and nests its `Config`. Classmethods are
