@@ -80,11 +80,13 @@ class Objective(nn.Module):
                 rendering = self._render(layer.prediction.gaussians, part.cameras)
                 self.hook(f"rendering of layer {number}", rendering)
                 signs.append((views / count, self._signs(rendering, part)))
-                found = self._terms(self._of_images, layer.prediction, rendering, part, number)
+                seen = rendering, part, inputs
+                found = self._terms(self._of_images, layer.prediction, *seen, number)
                 layer.add(found, weight * views / count)
             if self._of_gaussians:
                 no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
-                found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, number)
+                seen = no_views, targets, inputs
+                found = self._terms(self._of_gaussians, layer.prediction, *seen, number)
                 layer.add(found, weight)
             self.hook(f"gradient of layer {number}", layer.gradients)
             total = total + layer.total()
@@ -119,12 +121,13 @@ class Objective(nn.Module):
         layer: LayerPrediction,
         rendering: Rendering,
         target: Views,
+        inputs: Views,
         number: int,
     ) -> dict[str, Tensor]:
         """The terms of the losses `names`."""
         terms: dict[str, Tensor] = {}
         for name in names:
-            new = self.losses[name](layer, rendering, target)
+            new = self.losses[name](layer, rendering, target, inputs)
             repeated = sorted(term for term in new if self.owners.setdefault(term, name) != name)
             if repeated:
                 raise ValueError(

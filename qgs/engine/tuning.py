@@ -49,7 +49,7 @@ def tune(
     def predicted() -> tuple[Prediction, Tensor]:
         prediction = model.predict(memory, state, ())
         rendering = model.render(prediction.gaussians, views.cameras)
-        terms = loss(prediction.layers[model.depth], rendering, views)
+        terms = loss(prediction.layers[model.depth], rendering, views, views)
         return prediction, torch.stack(list(terms.values())).sum()
 
     losses = []

@@ -26,7 +26,7 @@ class Opacity(Loss):
     config: Config
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         opacities = at_least_float32(prediction.gaussians.opacities)
         return {"opacity": self.config.weight * -(opacities + self.config.eps).log().mean()}
@@ -45,7 +45,7 @@ class Mask(Loss):
     config: Config
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """One term, `mask`. Raises ValueError for views without masks."""
         if target.masks is None:

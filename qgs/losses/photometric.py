@@ -69,7 +69,7 @@ class Photometric(Loss):
     config: Config
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """Terms `mse` and `ssim`; raises ValueError for images that are too small for SSIM."""
         terms = {}

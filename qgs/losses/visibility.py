@@ -72,7 +72,7 @@ class Visibility(Loss):
             yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         per_point = view_visibility(
             prediction.gaussians.means,

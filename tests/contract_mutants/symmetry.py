@@ -9,6 +9,7 @@ from contract_mutants.slots import ChangedEncoder, OneTerm
 from torch import nn
 
 from qgs.components import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
+from qgs.contracts import Loss
 
 
 @mutant("batch_independence", "scene 0 has a gradient")
@@ -120,6 +121,14 @@ class WeighsTheFirstViewMost(OneTerm):
     def term(self, prediction, rendering, target):
         error = (rendering.rgb - target.images).square().mean((0, 2, 3, 4))
         return (error / torch.arange(1.0, len(error) + 1).to(error)).sum()
+
+
+@mutant("view_permutation", "permuted views, term")
+class ComparesWithTheFirstInput(Loss):
+    renderings = "all"
+
+    def forward(self, prediction, rendering, target, inputs):
+        return {"term": (rendering.rgb - inputs.images[:, :1]).square().mean()}
 
 
 @mutant("world_frame_makes_no_difference", "in a moved world, rgb")

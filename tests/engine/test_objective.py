@@ -36,7 +36,7 @@ def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Tiny) -> None:
     for layer, weight in ((2, 1 / 3), (4, 2 / 3)):
         rendering = model.render(prediction.layers[layer].gaussians, batch.targets.cameras)
         for loss in losses.values():
-            terms = loss(prediction.layers[layer], rendering, batch.targets)
+            terms = loss(prediction.layers[layer], rendering, batch.targets, batch.inputs)
             for name, term in terms.items():
                 expected[name] += weight * float(term.detach())
     assert {name: float(term) for name, term in outcome.terms.items()} == pytest.approx(expected)
@@ -85,7 +85,7 @@ class Flicker(Loss):
         super().__init__(ComponentConfig())
         self.gain = nn.Parameter(torch.tensor(0.7))
 
-    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == TARGETS
         brightness = rendering.rgb.mean((-3, -2, -1))
         return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
@@ -97,7 +97,7 @@ class Blind(Loss):
     name: ClassVar[str] = "blind"
     renderings = "none"
 
-    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == 0
         assert target.images.shape[1] == TARGETS
         return {"blind": prediction.state.features.square().mean()}
@@ -143,7 +143,8 @@ def written_out(
             shown = rendering
             if loss.renderings == "none":
                 shown = map_tensors(lambda tensor: tensor[:, :0], rendering)
-            total = total + weight * torch.stack(list(loss(layer, shown, targets).values())).sum()
+            terms = loss(layer, shown, targets, inputs)
+            total = total + weight * torch.stack(list(terms.values())).sum()
     return total
 
 

@@ -37,7 +37,7 @@ class AnchorVisibility(Loss):
         return config.conflicts()
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """One term, `anchor_visibility`."""
         per_anchor = view_visibility(
