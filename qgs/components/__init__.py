@@ -10,6 +10,7 @@ from qgs.components.decoder import (
 )
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
+from qgs.components.objective import OnePass
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
@@ -26,6 +27,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     GaussianHead,
     FreeCenters,
     LayerSupervision,
+    OnePass,
     OneCycleAdamW,
 )
 
@@ -46,6 +48,7 @@ __all__ = [
     "MultiViewViT",
     "NoRefinement",
     "OneCycleAdamW",
+    "OnePass",
     "SelfAttentionCore",
     "posact",
 ]

@@ -23,7 +23,7 @@ from qgs.contracts.component import (
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
 """What stands at each place; None for a component that could not be decoded."""
 
-_FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses")
+_FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses", "objective")
 """Slots that read or write fields, in the order in which a layer's prediction is made."""
 
 
@@ -157,7 +157,8 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, 
         if layer in decoded:
             for name in ("head", "centers", "renderer"):
                 yield parts["model", name], layer
-            yield from ((loss, layer) for path, loss in parts.items() if path[0] == "losses")
+            judges = ("losses", "objective")
+            yield from ((part, layer) for path, part in parts.items() if path[0] in judges)
 
 
 def _unmet(

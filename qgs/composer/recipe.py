@@ -76,6 +76,10 @@ class Recipe:
         """Losses by the names that the recipe gives; without any, training refuses to start."""
         return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
 
+    def build_objective(self) -> contracts.Objective:
+        """What a training step computes."""
+        return build(self.parts["objective",])
+
     def build_metrics(self) -> dict[str, contracts.Metric]:
         """What evaluations measure, by the names that the recipe gives."""
         return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "metrics"}
