@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
@@ -24,6 +25,7 @@ from qgs.contracts import (
     TrainingConfig,
     ViewsConfig,
 )
+from qgs.contracts.schedule import SCHEDULES, Schedule, at_step, number_kinds
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 _BOOLS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
@@ -83,13 +85,29 @@ _MAPPINGS: set[KeyPath] = {
 
 @dataclass(frozen=True)
 class Chosen:
-    """The component that stands at a place: its `type`, class, options, and where it came from."""
+    """The component that stands at a place: its `type`, class, options, and where it came from.
+
+    schedules: of options that follow the progress of training; `config` has their first numbers.
+    """
 
     place: Place
     type: str
     component: type[Component]
     config: ComponentConfig
     installed: InstalledPlugin
+    schedules: Mapping[str, Schedule] = field(default_factory=dict)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options as a recipe writes them."""
+        written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
+        return self.config.model_dump(mode="json") | written
+
+    @property
+    def later(self) -> list[ComponentConfig]:
+        """The options at the extremes of the schedules, but for the first."""
+        steps = {step for schedule in self.schedules.values() for step in schedule.corners()}
+        return [at_step(self.config, self.schedules, step) for step in sorted(steps - {0})]
 
     @property
     def path(self) -> str:
@@ -122,14 +140,60 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
         return None
     installed = registry.plugins[name.partition("/")[0]]
     try:
-        config = decode_config(component.Config, node.without("type"), place.source, problems)
+        found = _decode_options(component, name, node.without("type"), place.source, problems)
     except RecipeError:
         raise
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
         problems.add(origin, path, failure.reason, failure.fix, error)
         return None
-    return None if config is None else Chosen(place, name, component, config, installed)
+    if found is None:
+        return None
+    config, schedules = found
+    return Chosen(place, name, component, config, installed, schedules)
+
+
+def _decode_options(
+    component: type[Component], name: str, node: MapNode, path: KeyPath, problems: Problems
+) -> tuple[ComponentConfig, dict[str, Schedule]] | None:
+    """The first options and the schedules of the rest; every extreme must be within limits."""
+    schedules, fields, sound = dict[str, Schedule](), component.Config.model_fields, True
+    for option, value, origin in node.entries():
+        number = option in fields and number_kinds(fields[option].annotation)
+        if not number or not isinstance(value, MapNode):
+            continue
+        kind, schedule = value.get("schedule"), None
+        if option not in component.scheduled:
+            reason = f"`{option}` of `{name}` cannot follow a schedule: it is not read at each step"
+            can = f"options that can: {', '.join(sorted(component.scheduled)) or 'none'}"
+            problems.add(origin, ".".join((*path, option)), reason, f"give one number ({can})")
+        elif not isinstance(kind, str) or kind not in SCHEDULES:
+            reason = "a mapping in place of a number is a schedule, and names its kind"
+            near = did_you_mean(kind, SCHEDULES, "kinds") if isinstance(kind, str) else ""
+            fix = near or f"add `schedule:`, one of {', '.join(SCHEDULES)}"
+            where = value.origins.get("schedule", origin)
+            problems.add(where, ".".join((*path, option, "schedule")), reason, fix)
+        else:
+            schedule = decode_config(SCHEDULES[kind], value, (*path, option), problems)
+        sound &= schedule is not None
+        if schedule:
+            schedules[option] = schedule
+    if not sound:
+        return None
+    configs = list[ComponentConfig]()
+    for step in sorted({0, *(step for s in schedules.values() for step in s.corners())}):
+        numbers = {n: s.number(step) for n, s in schedules.items()}
+        entries = ((n, _number(numbers.get(n, value)), at) for n, value, at in node.entries())
+        config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
+        if config is None:
+            return None
+        configs.append(config)
+    return configs[0], schedules
+
+
+def _number(value: Any) -> Any:
+    """As a recipe writes it: whole numbers without a point, since whole options take no other."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[str, str]:
@@ -237,7 +301,7 @@ def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[
         inner = [models_in(field.annotation) for name, field, _ in fields if name == step]
         tagged = {m for _, field, m in fields if step in get_args(field.annotation)}
         models = set().union(*inner) or tagged or models
-    return {name for model in models for name in model.model_fields}
+    return {field.alias or name for model in models for name, field in model.model_fields.items()}
 
 
 def models_in(annotation: Any) -> set[type[BaseModel]]:

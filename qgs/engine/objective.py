@@ -10,6 +10,7 @@ from torch.utils.checkpoint import checkpoint
 from qgs.components import OnePass
 from qgs.composer import Recipe
 from qgs.contracts import Loss, Objective, Outcome
+from qgs.contracts.schedule import follow
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import (
@@ -84,6 +85,10 @@ class TrainingPass(nn.Module):
             kinds = f"losses or the objective {self.objective.name}"
             raise ValueError(f"terms of {kinds} are named {taken}, as other numbers of a step are")
         return outcome
+
+    def follow(self, step: int) -> None:
+        """Give every component the options that it has after `step` optimiser steps."""
+        follow((*self.modules(), self.objective), step)
 
     def predict(self, inputs: Views) -> Prediction:
         """See `Passes`."""

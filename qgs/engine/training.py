@@ -199,6 +199,8 @@ class Trainer:
         if saved:
             self.saver.restore(saved)
         self.resumed_at = self.step if saved else None
+        self._follow = objective.follow
+        self._follow(self.step)
         batches = training_batches(
             source,
             recipe.views,
@@ -257,6 +259,7 @@ class Trainer:
                 self.guard.passed(numbers)
                 self.saver.see(batches)
             self.step += 1
+            self._follow(self.step)
             self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
             self._tick()
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
+from qgs.contracts.schedule import END, follow
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction, Views, map_tensors, named_tensors
@@ -21,8 +22,12 @@ class Tuning:
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:
-    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults."""
-    for loss in recipe.build_losses().values():
+    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults.
+
+    Weights that follow the training are those of its end, so that a protocol means one thing.
+    """
+    follow((losses := recipe.build_losses()).values(), END)
+    for loss in losses.values():
         if isinstance(loss, Photometric) and (loss.config.mse_weight or loss.config.ssim_weight):
             return loss
     return Photometric(Photometric.Config())

@@ -15,6 +15,7 @@ class Opacity(Loss):
     """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release, weight 0 in its recipes)."""
 
     name: ClassVar[str] = "opacity"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "none"
 
     class Config(ComponentConfig):
@@ -36,6 +37,7 @@ class Mask(Loss):
     """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
 
     name: ClassVar[str] = "mask"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "each"
 
     class Config(ComponentConfig):

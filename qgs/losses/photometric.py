@@ -56,6 +56,7 @@ class Photometric(Loss):
     """mse_weight * MSE + ssim_weight * (1 - SSIM) / 2."""
 
     name: ClassVar[str] = "photometric"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"mse_weight", "ssim_weight"})
     renderings = "each"
 
     class Config(ComponentConfig):

@@ -57,6 +57,7 @@ class Visibility(Loss):
     """Mean over Gaussians of `view_visibility` of their means."""
 
     name: ClassVar[str] = "visibility"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "none"
 
     class Config(VisibilityOptions):

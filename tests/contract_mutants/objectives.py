@@ -69,3 +69,20 @@ class CountsItsJudgements(Changed):
         factor = 1 + 1 / self.calls
         terms = {name: factor * x for name, x in outcome.terms.items()}
         return replace(outcome, total=factor * outcome.total, terms=terms)
+
+
+@mutant("scheduled_options_of_objectives", "with `weight: 0.5` set after it was built")
+class ReadsItsWeightOnceForAll(OnePass):
+    scheduled = frozenset({"weight"})
+
+    class Config(OnePass.Config):
+        weight: float = 1.0
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.weight = config.weight
+
+    def forward(self, inputs, targets, passes):
+        outcome = super().forward(inputs, targets, passes)
+        terms = {name: self.weight * x for name, x in outcome.terms.items()}
+        return replace(outcome, total=self.weight * outcome.total, terms=terms)

@@ -10,7 +10,11 @@ from qgs.composer.flow import variants
 from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import ComponentConfig
 from qgs.testing.case import Case, expect
-from qgs.testing.registry import ALL_SLOTS, check
+from qgs.testing.exercise import numbers
+from qgs.testing.inputs import inputs_of
+from qgs.testing.modules import seeded
+from qgs.testing.registry import ALL_SLOTS, MODULES, check
+from qgs.testing.trees import difference
 
 
 @check(ALL_SLOTS)
@@ -47,6 +51,31 @@ def check_options_are_left_alone(case: Case) -> None:
     own = replace(case, config=case.config.model_copy(deep=True))
     own.build()
     expect(own.config == case.config, f"when it is built, {case.config!r} becomes {own.config!r}")
+
+
+@check(MODULES)
+def check_scheduled_options_are_read_anew(case: Case) -> None:
+    """An option in `scheduled` counts in the next call once it is changed, as if built with it.
+
+    What a component requires and provides does not depend on it.
+    """
+    component, inputs = case.component, inputs_of(case)
+    for option, value, config in numbers(case.config):
+        other = replace(case, config=config, state_dict=None)
+        if option not in component.scheduled or other.problems(case.size):
+            continue
+        for what in (component.requires, component.provides):
+            same = dict(what(config)) == dict(what(case.config))
+            expect(same, f"`{option}: {value}` changes what it {what.__name__}")
+        module = case.lively()
+        with seeded(0):
+            module(*inputs.values())
+        module.config = config
+        with seeded(0):
+            anew = module(*inputs.values())
+        with seeded(0):
+            found = difference(other.lively()(*inputs.values()), anew)
+        expect(not found, f"with `{option}: {value}` set after it was built, {found}")
 
 
 def _nested(config: type[BaseModel]) -> set[type[BaseModel]]:

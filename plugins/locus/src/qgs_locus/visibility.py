@@ -16,6 +16,7 @@ class AnchorVisibility(Loss):
     """Mean over queries of `qgs.losses.view_visibility` of their anchor centres (LocusGS)."""
 
     name: ClassVar[str] = "anchor_visibility"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "none"
 
     class Config(VisibilityOptions):
