@@ -106,8 +106,7 @@ class Chosen:
     @property
     def later(self) -> list[ComponentConfig]:
         """The options at the extremes of the schedules, but for the first."""
-        steps = {step for schedule in self.schedules.values() for step in schedule.corners()}
-        return [at_step(self.config, self.schedules, step) for step in sorted(steps - {0})]
+        return [at_step(self.config, self.schedules, step) for step in corners(self.schedules)[1:]]
 
     @property
     def path(self) -> str:
@@ -156,44 +155,43 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
 def _decode_options(
     component: type[Component], name: str, node: MapNode, path: KeyPath, problems: Problems
 ) -> tuple[ComponentConfig, dict[str, Schedule]] | None:
-    """The first options and the schedules of the rest; every extreme must be within limits."""
+    """The first options and the schedules of the rest, all of whose extremes are within limits."""
     schedules, fields, sound = dict[str, Schedule](), component.Config.model_fields, True
     for option, value, origin in node.entries():
         number = option in fields and number_kinds(fields[option].annotation)
         if not number or not isinstance(value, MapNode):
             continue
-        kind, schedule = value.get("schedule"), None
+        below, schedule = (*path, option), None
+        kind = str(value.get("schedule", ""))
         if option not in component.scheduled:
-            reason = f"`{option}` of `{name}` cannot follow a schedule: it is not read at each step"
+            reason = f"`{option}` of `{name}` cannot follow a schedule: it is read once for all"
             can = f"options that can: {', '.join(sorted(component.scheduled)) or 'none'}"
-            problems.add(origin, ".".join((*path, option)), reason, f"give one number ({can})")
-        elif not isinstance(kind, str) or kind not in SCHEDULES:
-            reason = "a mapping in place of a number is a schedule, and names its kind"
-            near = did_you_mean(kind, SCHEDULES, "kinds") if isinstance(kind, str) else ""
-            fix = near or f"add `schedule:`, one of {', '.join(SCHEDULES)}"
-            where = value.origins.get("schedule", origin)
-            problems.add(where, ".".join((*path, option, "schedule")), reason, fix)
+            problems.add(origin, ".".join(below), reason, f"give one number ({can})")
+        elif kind in SCHEDULES:
+            schedule = decode_config(SCHEDULES[kind], value, below, problems)
         else:
-            schedule = decode_config(SCHEDULES[kind], value, (*path, option), problems)
+            reason = "a mapping in place of a number is a schedule, and names its kind"
+            fix = did_you_mean(kind, SCHEDULES, "schedules")
+            where = value.origins.get("schedule", origin)
+            problems.add(where, ".".join((*below, "schedule")), reason, fix)
         sound &= schedule is not None
-        if schedule:
-            schedules[option] = schedule
-    if not sound:
-        return None
+        schedules |= {option: schedule} if schedule else {}
     configs = list[ComponentConfig]()
-    for step in sorted({0, *(step for s in schedules.values() for step in s.corners())}):
+    for step in corners(schedules) if sound else ():
         numbers = {n: s.number(step) for n, s in schedules.items()}
-        entries = ((n, _number(numbers.get(n, value)), at) for n, value, at in node.entries())
+        # Whole ones without a point, since whole options take no others.
+        written = {n: int(x) if x.is_integer() else x for n, x in numbers.items()}
+        entries = ((n, written.get(n, value), at) for n, value, at in node.entries())
         config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
         if config is None:
             return None
         configs.append(config)
-    return configs[0], schedules
+    return (configs[0], schedules) if configs else None
 
 
-def _number(value: Any) -> Any:
-    """As a recipe writes it: whole numbers without a point, since whole options take no other."""
-    return int(value) if isinstance(value, float) and value.is_integer() else value
+def corners(schedules: Mapping[str, Schedule]) -> list[int]:
+    """The steps at which any of them may have an extreme, with the first."""
+    return sorted({0, *(step for schedule in schedules.values() for step in schedule.corners)})
 
 
 def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[str, str]:

@@ -7,13 +7,7 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import KeyPath, MapNode, find
-from qgs.composer.registry import (
-    PluginError,
-    Registry,
-    component_error,
-    component_failure,
-    default_config,
-)
+from qgs.composer.registry import Registry, component_error, component_failure, default_config
 from qgs.composer.slots import LAYER_SLOTS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import MEMORY_FIELDS, Encoder, Queries, Refinement, Renderer, Supervision
@@ -49,8 +43,6 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
         found = list(component.problems(config, context))
         for later in chosen.later:
             found += [p for p in component.problems(later, context) if p not in found]
-            if failure := _changed_fields(chosen, later):
-                break
         odd = [type(problem).__name__ for problem in found if not isinstance(problem, Problem)]
         if odd:
             raise TypeError(f"it gives {odd[0]}, not qgs.contracts.Problem")
@@ -71,16 +63,6 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
         path = f"{chosen.path}.{problem.option}" if problem.option else chosen.path
         problems.add(origin if steps else place.origin, path, problem.reason, problem.fix)
     return True
-
-
-def _changed_fields(chosen: Chosen, later: ComponentConfig) -> PluginError | None:
-    """The error of a component whose fields are others with options of a later step."""
-    component, config = chosen.component, chosen.config
-    for what in (component.requires, component.provides):
-        if dict(what(config)) != dict(what(later)):
-            fault = f"`{chosen.type}` has other fields with options that `scheduled` names"
-            return component_error(chosen.installed, fault)
-    return None
 
 
 def _writable(component: type[Component], provided: Fields) -> Collection[str]:
@@ -164,7 +146,7 @@ def unfinished(parts: Mapping[KeyPath, Chosen], steps: int) -> Iterator[str]:
     """Schedules that a training of `steps` steps leaves before their end, one sentence each."""
     for part in {part.path: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():
-            if (last := max(schedule.corners())) > steps:
+            if (last := max(schedule.corners, default=0)) > steps:
                 yield f"{part.path}.{option} changes until step {last}, training ends at {steps}"
 
 

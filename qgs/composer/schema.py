@@ -55,7 +55,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
         slot: {"anyOf": [_type(name, c) for name, c in registry.components(slot).items()]}
         for slot in SLOTS
     }
-    kinds = [_settings(kind) for kind in SCHEDULES.values()]
+    kinds = [_settings(kind) for kind in dict.fromkeys(SCHEDULES.values())]
     definitions["schedule"] = {"anyOf": kinds, "description": summary_of(Schedule)}
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "qgs recipe"}
     return {**dialect, **_section((), beside), "$defs": definitions}
@@ -67,7 +67,9 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
     for option in component.scheduled:
         number = dict(properties[option])
-        told = {key: number.pop(key) for key in ("description", "title") if key in number}
+        told = {
+            key: number.pop(key) for key in ("description", "title", "default") if key in number
+        }
         properties[option] = {**told, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
     return schema | {"description": description, "properties": properties}
 

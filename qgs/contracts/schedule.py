@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from types import UnionType
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, Union, get_args, get_origin
 
@@ -12,9 +12,9 @@ from pydantic import ConfigDict, Field, model_validator
 from qgs.contracts.component import Component, ComponentConfig, OptionError
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
+Step: TypeAlias = Annotated[int, Field(ge=0)]
 END = 2**53
 """A step after the end of every schedule."""
-Step: TypeAlias = Annotated[int, Field(ge=0)]
 
 
 class Schedule(ComponentConfig):
@@ -27,11 +27,12 @@ class Schedule(ComponentConfig):
 
     @abstractmethod
     def number(self, step: int) -> float:
-        """The number after `step` steps"""
+        """The number after `step` steps."""
 
-    @abstractmethod
-    def corners(self) -> Sequence[int]:
-        """Steps between which the number goes one way: its extremes are at these."""
+    @property
+    def corners(self) -> tuple[int, ...]:
+        """Steps besides 0 between which the number goes one way: its extremes are at these."""
+        return ()
 
 
 class Constant(Schedule):
@@ -45,10 +46,6 @@ class Constant(Schedule):
     def number(self, step: int) -> float:
         """See `Schedule`."""
         return self.value
-
-    def corners(self) -> Sequence[int]:
-        """See `Schedule`."""
-        return (0,)
 
 
 class Steps(Schedule):
@@ -75,14 +72,17 @@ class Steps(Schedule):
         """See `Schedule`."""
         return self.values[bisect_right(self.at, step)]
 
-    def corners(self) -> Sequence[int]:
+    @property
+    def corners(self) -> tuple[int, ...]:
         """See `Schedule`."""
-        return (0, *self.at)
+        return self.at
 
 
-class Ramp(Schedule):
+class Linear(Schedule):
     """From one number to another over a range of steps; constant before and after."""
 
+    schedule: Literal["linear", "cosine"]
+    """From one number to another on a line, or on half a cosine, which is slow at both ends."""
     start: float = Field(alias="from")
     """The number until the first of the steps in `over`."""
     end: float = Field(alias="to")
@@ -103,42 +103,19 @@ class Ramp(Schedule):
         first, last = self.over
         if step <= first or step >= last:
             return self.start if step <= first else self.end
-        share = self.share((step - first) / (last - first))
+        share = (step - first) / (last - first)
+        if self.schedule == "cosine":
+            share = (1 - math.cos(math.pi * share)) / 2
         return (1 - share) * self.start + share * self.end
 
-    @abstractmethod
-    def share(self, progress: float) -> float:
-        """Share of the way from `start` to `end` after `progress`, 0 to 1, of the time."""
-
-    def corners(self) -> Sequence[int]:
+    @property
+    def corners(self) -> tuple[int, ...]:
         """See `Schedule`."""
-        return (0, *self.over)
-
-
-class Linear(Ramp):
-    """A straight line."""
-
-    schedule: Literal["linear"]
-    """A straight line from one number to another."""
-
-    def share(self, progress: float) -> float:
-        """See `Ramp`."""
-        return progress
-
-
-class Cosine(Ramp):
-    """Half a cosine: slow at both ends."""
-
-    schedule: Literal["cosine"]
-    """From one number to another by half a cosine, slow at both ends."""
-
-    def share(self, progress: float) -> float:
-        """See `Ramp`."""
-        return (1 - math.cos(math.pi * progress)) / 2
+        return self.over
 
 
 SCHEDULES: Mapping[str, type[Schedule]] = {
-    "constant": Constant, "steps": Steps, "linear": Linear, "cosine": Cosine
+    "constant": Constant, "steps": Steps, "linear": Linear, "cosine": Linear
 }  # fmt: skip
 """By the word under `schedule` in a recipe."""
 
@@ -153,18 +130,9 @@ def number_kinds(annotation: Any) -> set[type]:
 
 def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
     """`config` with the numbers after `step` steps, rounded for options that are whole numbers."""
-    fields, numbers = type(config).model_fields, dict[str, float]()
-    for name, schedule in schedules.items():
-        number = schedule.number(step)
-        whole = float not in number_kinds(fields[name].annotation)
-        numbers[name] = round(number) if whole else number
-    return config.model_copy(update=numbers)
-
-
-def steps_followed(parts: Iterable[object]) -> int | None:
-    """The step that `follow` has given `parts`; None where no option follows one."""
-    found = [x.followed for x in parts if isinstance(x, Component) and x.schedules]
-    return found[0] if found else None
+    fields, numbers = type(config).model_fields, {n: s.number(step) for n, s in schedules.items()}
+    whole = [name for name in numbers if float not in number_kinds(fields[name].annotation)]
+    return config.model_copy(update=numbers | {name: round(numbers[name]) for name in whole})
 
 
 def follow(parts: Iterable[object], step: int) -> None:
@@ -172,3 +140,9 @@ def follow(parts: Iterable[object], step: int) -> None:
     for part in parts:
         if isinstance(part, Component) and part.schedules:
             part.config, part.followed = at_step(part.config, part.schedules, step), step
+
+
+def steps_followed(parts: Iterable[object]) -> int | None:
+    """The step that `follow` has given `parts`; None where no option follows one."""
+    found = [x.followed for x in parts if isinstance(x, Component) and x.schedules]
+    return found[0] if found else None

@@ -79,7 +79,10 @@ def test_another_schedule_replaces_the_one_below_whole() -> None:
         ("optimizer.learning_rate={schedule: constant, value: 3}", "(options that can: none)"),
         ("losses.visibility.clamp={schedule: constant, value: 3}", "(options that can: weight)"),
         (f"{DILATION}={{schedule: linaer, from: 1, to: 2, over: [1, 2]}}", "mean `linear`?"),
-        (f"{DILATION}={{from: 1, to: 2, over: [1, 2]}}", "add `schedule:`, one of constant"),
+        (
+            f"{DILATION}={{from: 1, to: 2, over: [1, 2]}}",
+            "schedules: constant, cosine, linear, steps",
+        ),
         (f"{DILATION}={{schedule: linear, from: 1, over: [1, 2]}}", "`to` is missing"),
         (f"{DILATION}={{schedule: linear, from: 1, too: 2, over: [1, 2]}}", "did you mean `to`?"),
         (f"{DILATION}={{schedule: linear, from: 1, to: 2, over: [2, 2]}}", "first < last"),

@@ -71,7 +71,7 @@ class CountsItsJudgements(Changed):
         return replace(outcome, total=factor * outcome.total, terms=terms)
 
 
-@mutant("scheduled_options_of_objectives", "with `weight: 0.5` set after it was built")
+@mutant("scheduled_options_are_read_anew", "with `weight: 0.5` set after it was built")
 class ReadsItsWeightOnceForAll(OnePass):
     scheduled = frozenset({"weight"})
 

@@ -1,6 +1,5 @@
 """What objectives promise, seen by lending them passes of a model that is none."""
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,7 +8,6 @@ from torch import Tensor, nn
 from qgs.contracts import Outcome
 from qgs.renderers import TorchRenderer
 from qgs.testing.case import Case, expect
-from qgs.testing.exercise import numbers
 from qgs.testing.inputs import Maker, Sizes
 from qgs.testing.modules import seeded
 from qgs.testing.registry import check
@@ -86,23 +84,13 @@ def check_objective_gives_an_outcome(case: Case) -> None:
 def check_objective_repeats(case: Case) -> None:
     """Under one seed an objective gives the same each time: it counts and keeps nothing."""
     module = case.build()
-    first, again = (cloned(_numbers(_outcome(case, module, 3)[0])) for _ in range(2))
-    found = difference(first, again)
+    found = difference(rehearsed(case, module), rehearsed(case, module))
     expect(not found, f"the second time, {found}")
 
 
-@check({"objective"})
-def check_scheduled_options_of_objectives(case: Case) -> None:
-    """An option in `scheduled` of an objective counts in the next call once it is changed."""
-    for option, value, config in numbers(case.config):
-        other = replace(case, config=config)
-        if option in case.component.scheduled and not other.problems(case.size):
-            module = case.build()
-            _outcome(case, module, 3)
-            module.config = config
-            anew, built = (_outcome(case, m, 3)[0] for m in (module, other.build()))
-            found = difference(cloned(_numbers(built)), cloned(_numbers(anew)))
-            expect(not found, f"with `{option}: {value}` set after it was built, {found}")
+def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
+    """What an objective gives in a rehearsal."""
+    return cloned(_numbers(_outcome(case, module, 3)[0]))
 
 
 def _outcome(case: Case, module: Any, views: int) -> tuple[Outcome, Rehearsal]:
