@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from qgs.composer.errors import Problems, RecipeError, did_you_mean, nearest
-from qgs.composer.nodes import KeyPath, ListNode, MapNode, find, kind_of
+from qgs.composer.nodes import LARGEST, KeyPath, ListNode, MapNode, find, kind_of
 from qgs.composer.places import Place
 from qgs.composer.registry import InstalledPlugin, Registry, available_plugins, component_failure
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, MOVED, SECTIONS, SLOTS, type_at
@@ -180,7 +180,9 @@ def _decode_options(
     for step in corners(schedules) if sound else ():
         numbers = {n: s.number(step) for n, s in schedules.items()}
         # Whole ones without a point, since whole options take no others.
-        written = {n: int(x) if x.is_integer() else x for n, x in numbers.items()}
+        written = {
+            n: int(x) if x.is_integer() and abs(x) < LARGEST else x for n, x in numbers.items()
+        }
         entries = ((n, written.get(n, value), at) for n, value, at in node.entries())
         config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
         if config is None:

@@ -10,10 +10,12 @@ from training_runs import TWO, Tiny, first_batch, run, run_calling, same, weight
 
 import qgs
 from qgs.composer import Recipe, resolve
+from qgs.composer.registry import load_plugin
 from qgs.contracts import Objective, Outcome, Passes
 from qgs.engine.distributed import StopRequest
 from qgs.engine.objective import TrainingPass
 from qgs.engine.training import Trainer
+from qgs.testing import Case, checks_for, run_check
 from qgs.types import Cameras, Views
 
 TERMS = {"alpha_consistency", "depth_consistency"}
@@ -32,6 +34,23 @@ def test_terms_of_both_passes_are_recorded(tiny: Tiny, tmp_path: Path, two: None
         assert sum(record[n] for n in named - {"gradient"}) == pytest.approx(record["loss"])
         assert in_parts["loss"] == pytest.approx(record["loss"], rel=1e-4)
     assert qgs.load(result.folder.checkpoint).recipe["objective"]["type"] == "two/two_passes"
+
+
+def test_what_is_watched_tells_the_judgements_apart(tiny: Tiny, two: None) -> None:
+    recipe = tiny("tokengs", *TWO)
+    step, batch, seen = (
+        TrainingPass.of(recipe, recipe.build_model().train()),
+        first_batch(recipe),
+        [],
+    )
+    step.hook = lambda name, _: seen.append(name)
+    for _ in range(2):
+        seen.clear()
+        step(batch.inputs, batch.targets)
+        told = [name for name in seen if name.startswith("gradient")]
+        assert told == [
+            f"gradient of layer {n}{j}" for j in ("", " in judgement 2") for n in (2, 4)
+        ]
 
 
 def test_it_resumes_and_another_is_refused(tiny: Tiny, tmp_path: Path, two: None) -> None:
@@ -107,3 +126,11 @@ def test_a_recipe_names_its_objective(tiny: Tiny) -> None:
     assert recipe.tree["objective"] == {"type": "qgs/one_pass"}
     again: Recipe = resolve(recipe.tree)
     assert again.tree == recipe.tree
+
+
+def test_the_objective_of_two_passes_keeps_the_contract(two: None) -> None:
+    (component,) = load_plugin("two").plugin.components
+    case = Case(component.Config())
+    results = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert len(results) >= 6
+    assert [result.message for result in results if not result.ok] == []

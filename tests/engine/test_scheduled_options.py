@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from training_runs import Tiny, losses, read_jsonl, run, run_calling, same, weights
+from training_runs import TWO, Tiny, losses, read_jsonl, run, run_calling, same, weights
 
 import qgs
 from qgs.engine.distributed import StopRequest
@@ -39,6 +39,12 @@ def test_each_step_has_its_own_numbers(tiny: Tiny, tmp_path: Path) -> None:
     assert terms == sorted(terms, reverse=True)
     assert terms[3] == pytest.approx(terms[0] / 4, rel=0.2), "0.1 of it is left in step 4"
     assert "dilation:" in (tmp_path / "run" / "recipe.yaml").read_text()
+
+
+def test_an_objective_follows_too(tiny: Tiny, tmp_path: Path, two: None) -> None:
+    grows = "objective.alpha_weight={schedule: steps, values: [0, 1], at: [2]}"
+    history = run(tiny("tokengs", *TWO, grows), tmp_path / "run").folder.history()
+    assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(tiny: Tiny, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ class TwoPasses(Objective):
     """
 
     name: ClassVar[str] = "two_passes"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"alpha_weight", "depth_weight"})
 
     class Config(ComponentConfig):
         alpha_weight: float = Field(default=1e-3, ge=0)
