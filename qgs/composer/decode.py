@@ -164,7 +164,7 @@ def _decode_options(
         below, schedule = (*path, option), None
         kind = str(value.get("schedule", ""))
         if option not in component.scheduled:
-            reason = f"`{option}` of `{name}` cannot follow a schedule: it is read once for all"
+            reason = f"`{option}` of `{name}` takes no schedule: it stays for a whole training"
             can = f"options that can: {', '.join(sorted(component.scheduled)) or 'none'}"
             problems.add(origin, ".".join(below), reason, f"give one number ({can})")
         elif kind in SCHEDULES:

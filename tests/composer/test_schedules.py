@@ -75,7 +75,10 @@ def test_another_schedule_replaces_the_one_below_whole() -> None:
 @pytest.mark.parametrize(
     ("override", "seen"),
     [
-        ("model.queries.count={schedule: constant, value: 3}", "`count` of `qgs/latent` cannot"),
+        (
+            "model.queries.count={schedule: constant, value: 3}",
+            "`count` of `qgs/latent` takes no schedule",
+        ),
         ("optimizer.learning_rate={schedule: constant, value: 3}", "(options that can: none)"),
         ("losses.visibility.clamp={schedule: constant, value: 3}", "(options that can: weight)"),
         (f"{DILATION}={{schedule: linaer, from: 1, to: 2, over: [1, 2]}}", "mean `linear`?"),
