@@ -196,6 +196,14 @@ class Views(TensorContainer):
         """The views at `index` of every scene (a slice or a list of ints)."""
         return map_tensors(lambda x: x[:, index], self)
 
+    def joined(self, other: Self) -> Self:
+        """These views, then `other` ones of the same scenes, of one size, with the same parts."""
+        own, theirs = dict(named_tensors(self)), dict(named_tensors(other))
+        if own.keys() != theirs.keys() or self.cameras.size != other.cameras.size:
+            raise ValueError(f"views cannot be joined with others of another kind: {self}, {other}")
+        added = iter(theirs.values())
+        return map_tensors(lambda x: torch.cat([x, next(added)], 1), self)
+
 
 @dataclass(frozen=True)
 class ImageMemory(TensorContainer):

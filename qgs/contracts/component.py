@@ -3,6 +3,7 @@
 from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias
 
 import torch
@@ -120,6 +121,14 @@ class Component(metaclass=ABCMeta):
 
     slot: ClassVar[str]
     name: ClassVar[str]
+    scheduled: ClassVar[frozenset[str]] = frozenset()
+    """Options, numbers, that are read from `self.config` in every call and nowhere else: training
+    may change them from step to step, as a schedule in the recipe says."""
+
+    schedules: Mapping[str, Any] = MappingProxyType({})
+    """Option to its `qgs.contracts.schedule.Schedule`; `config` has the numbers after `followed`
+    steps."""
+    followed: int = 0
 
     class Config(ComponentConfig):
         """No options."""

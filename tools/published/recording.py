@@ -45,7 +45,8 @@ def model_tensors(
     for number, layer in prediction.layers.items():
         found[f"gaussians_layer.{number}"] = _packed(layer.gaussians)
     if tuned_latents is not None:
-        state, memory = model.queries(len(tuned_latents)), model.encoder(views)
+        memory = model.encoder(views)
+        state = model.queries(memory, views)
         tuned = model.predict(model.encoder.project(tuned_latents, memory), state)
         found["gaussians_of_tuned_latents"] = _packed(tuned.gaussians)
     return found
