@@ -202,6 +202,14 @@ class Views(TensorContainer):
         chosen = map_tensors(lambda x: x[:, index], of_views)
         return replace(chosen, target_time=self.target_time)
 
+    def joined(self, other: Self) -> Self:
+        """These views, then `other` ones of the same scenes, of one size, with the same parts."""
+        own, theirs = dict(named_tensors(self)), dict(named_tensors(other))
+        if own.keys() != theirs.keys() or self.cameras.size != other.cameras.size:
+            raise ValueError(f"views cannot be joined with others of another kind: {self}, {other}")
+        added = iter(theirs.values())
+        return map_tensors(lambda x: torch.cat([x, next(added)], 1), self)
+
 
 @dataclass(frozen=True)
 class ImageMemory(TensorContainer):

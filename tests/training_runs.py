@@ -13,7 +13,7 @@ from rich.console import Console
 
 from qgs.composer import Recipe
 from qgs.data.sampling import Batch
-from qgs.data.stream import SampleStream
+from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder
 from qgs.engine.tracking import TrainingProgress
@@ -22,6 +22,8 @@ from qgs.engine.training import Trainer, TrainingResult, train
 QUIET = Console(quiet=True)
 Tiny: TypeAlias = Callable[..., Recipe]
 """The fixture `tiny`."""
+TWO = ("plugins=[rooms, locus, two]", "objective={type: two/two_passes}", "views.inputs=5")
+"""With the fixture `two`: train on two passes of the model."""
 
 
 def run(recipe: Recipe, folder: Path, resume: bool = False, device: str = "cpu") -> TrainingResult:
@@ -57,6 +59,10 @@ def same(first: Mapping[str, torch.Tensor], second: Mapping[str, torch.Tensor]) 
     return first.keys() == second.keys() and all(
         torch.equal(t, second[n]) for n, t in first.items()
     )
+
+
+def first_batch(recipe: Recipe) -> Batch:
+    return next(training_batches(recipe.build_data(), recipe.views, 2, seed=0))
 
 
 def losses(run: Path) -> list[float]:

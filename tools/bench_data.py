@@ -40,7 +40,7 @@ from qgs.contracts import Scene
 from qgs.data.scenes import EncodedFrame, EncodedScene
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.objective import Objective
+from qgs.engine.objective import TrainingPass
 from qgs.engine.parameters import make_optimizer
 from qgs.engine.training import compute_gradients
 
@@ -160,7 +160,7 @@ def loaded_over_consumed(recipe: Recipe, workers: int) -> float:
 
 def _training_step(recipe: Recipe) -> Callable[[], None]:
     torch.set_num_threads(2)
-    objective = Objective(recipe.build_model().train(), recipe.build_losses(), 0)
+    objective = TrainingPass.of(recipe, recipe.build_model().train())
     optimizer = make_optimizer(objective, recipe.build_optimizer(), recipe.rate_factors(objective))
     accelerator = make_accelerator("cpu")
     with closing(training_batches(recipe.build_data(), recipe.views, 2, 0)) as stream:

@@ -47,6 +47,8 @@ def option_table(config: type[ComponentConfig]) -> str:
     rows = ["| option | values | default | meaning |", "|---|---|---|---|"]
     for name, option in schema["properties"].items():
         values = values_of(_resolved(option, schema.get("$defs", {})))
+        if config.__component__ and name in config.__component__.scheduled:
+            values += ", or a [schedule](#schedules)"
         default = f"`{_yaml(option['default'])}`" if "default" in option else "must be given"
         meaning = " ".join((config.model_fields[name].description or "").split())
         cells = (cell.replace("|", "\\|") for cell in (f"`{name}`", values, default, meaning))

@@ -20,7 +20,7 @@ from process_memory import megabytes
 
 from qgs.composer import resolve
 from qgs.data.stream import training_batches
-from qgs.engine.objective import Objective
+from qgs.engine.objective import TrainingPass
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
 SIDE = 256
@@ -42,7 +42,7 @@ def step_memory(views: int, render_views: int, device: str) -> dict[str, float]:
     )
     torch.manual_seed(0)
     model = recipe.build_model(device).train()
-    objective = Objective(model, recipe.build_losses(), render_views).to(device)
+    objective = TrainingPass(model, recipe.build_losses(), render_views).to(device)
     stream = training_batches(recipe.build_data(), recipe.views, 1, recipe.seed)
     batch = next(stream)
     stream.close()

@@ -128,6 +128,8 @@ def _rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[s
 
 def _type(option: Schema) -> str:
     """Which values a JSON Schema allows."""
+    if "$ref" in option:
+        return option["$ref"].rpartition("/")[2]
     variants = option.get("anyOf", option.get("oneOf"))
     if variants:
         return " or ".join(dict.fromkeys(map(_type, variants)))

@@ -14,6 +14,7 @@ from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
 from qgs.components.latents import LatentBottleneck
 from qgs.components.multiscale import MultiscaleViT
+from qgs.components.objective import OnePass
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
@@ -35,6 +36,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     GaussianHead,
     FreeCenters,
     LayerSupervision,
+    OnePass,
     OneCycleAdamW,
 )
 
@@ -60,6 +62,7 @@ __all__ = [
     "MultiscaleViT",
     "NoRefinement",
     "OneCycleAdamW",
+    "OnePass",
     "SelfAttentionCore",
     "posact",
 ]

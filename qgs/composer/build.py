@@ -48,7 +48,7 @@ def build_model(
     def at(*path: str) -> Any:
         chosen = parts["model", *path]
         for known, built in shared:
-            if known.component is chosen.component and known.config == chosen.config:
+            if known.component is chosen.component and known.options == chosen.options:
                 return built
         built = build(chosen, *(dims,) if issubclass(chosen.component, ModelComponent) else ())
         if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
@@ -148,6 +148,8 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
         raise RecipeError([problem]) from error
+    if chosen.schedules:
+        built.schedules = chosen.schedules
     if issubclass(component, Queries | Refinement | DecoderLayer):
 
         def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:

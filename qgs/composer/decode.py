@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from qgs.composer.errors import Problems, RecipeError, did_you_mean, nearest
-from qgs.composer.nodes import KeyPath, ListNode, MapNode, find, kind_of
+from qgs.composer.nodes import LARGEST, KeyPath, ListNode, MapNode, find, kind_of
 from qgs.composer.places import Place
 from qgs.composer.registry import InstalledPlugin, Registry, available_plugins, component_failure
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, MOVED, SECTIONS, SLOTS, type_at
@@ -24,6 +25,7 @@ from qgs.contracts import (
     TrainingConfig,
     ViewsConfig,
 )
+from qgs.contracts.schedule import SCHEDULES, Schedule, at_step, number_kinds
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 _BOOLS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
@@ -83,13 +85,28 @@ _MAPPINGS: set[KeyPath] = {
 
 @dataclass(frozen=True)
 class Chosen:
-    """The component that stands at a place: its `type`, class, options, and where it came from."""
+    """The component that stands at a place: its `type`, class, options, and where it came from.
+
+    schedules: of options that follow the progress of training; `config` has their first numbers.
+    """
 
     place: Place
     type: str
     component: type[Component]
     config: ComponentConfig
     installed: InstalledPlugin
+    schedules: Mapping[str, Schedule] = field(default_factory=dict)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options as a recipe writes them."""
+        written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
+        return self.config.model_dump(mode="json") | written
+
+    @property
+    def later(self) -> list[ComponentConfig]:
+        """The options at the extremes of the schedules, but for the first."""
+        return [at_step(self.config, self.schedules, step) for step in corners(self.schedules)[1:]]
 
     @property
     def path(self) -> str:
@@ -122,14 +139,61 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
         return None
     installed = registry.plugins[name.partition("/")[0]]
     try:
-        config = decode_config(component.Config, node.without("type"), place.source, problems)
+        found = _decode_options(component, name, node.without("type"), place.source, problems)
     except RecipeError:
         raise
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
         problems.add(origin, path, failure.reason, failure.fix, error)
         return None
-    return None if config is None else Chosen(place, name, component, config, installed)
+    if found is None:
+        return None
+    config, schedules = found
+    return Chosen(place, name, component, config, installed, schedules)
+
+
+def _decode_options(
+    component: type[Component], name: str, node: MapNode, path: KeyPath, problems: Problems
+) -> tuple[ComponentConfig, dict[str, Schedule]] | None:
+    """The first options and the schedules of the rest, all of whose extremes are within limits."""
+    schedules, fields, sound = dict[str, Schedule](), component.Config.model_fields, True
+    for option, value, origin in node.entries():
+        number = option in fields and number_kinds(fields[option].annotation)
+        if not number or not isinstance(value, MapNode):
+            continue
+        below, schedule = (*path, option), None
+        kind = str(value.get("schedule", ""))
+        if option not in component.scheduled:
+            reason = f"`{option}` of `{name}` takes no schedule: it stays for a whole training"
+            can = f"options that can: {', '.join(sorted(component.scheduled)) or 'none'}"
+            problems.add(origin, ".".join(below), reason, f"give one number ({can})")
+        elif kind in SCHEDULES:
+            schedule = decode_config(SCHEDULES[kind], value, below, problems)
+        else:
+            reason = "a mapping in place of a number is a schedule, and names its kind"
+            fix = did_you_mean(kind, SCHEDULES, "schedules")
+            where = value.origins.get("schedule", origin)
+            problems.add(where, ".".join((*below, "schedule")), reason, fix)
+        sound &= schedule is not None
+        schedules |= {option: schedule} if schedule else {}
+    configs = list[ComponentConfig]()
+    for step in corners(schedules) if sound else ():
+        numbers = {n: s.number(step) for n, s in schedules.items()}
+        # Whole ones without a point, since whole options take no others.
+        written = {
+            n: int(x) if x.is_integer() and abs(x) < LARGEST else x for n, x in numbers.items()
+        }
+        entries = ((n, written.get(n, value), at) for n, value, at in node.entries())
+        config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
+        if config is None:
+            return None
+        configs.append(config)
+    return (configs[0], schedules) if configs else None
+
+
+def corners(schedules: Mapping[str, Schedule]) -> list[int]:
+    """The steps at which any of them may have an extreme, with the first."""
+    return sorted({0, *(step for schedule in schedules.values() for step in schedule.corners)})
 
 
 def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[str, str]:
@@ -237,7 +301,7 @@ def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[
         inner = [models_in(field.annotation) for name, field, _ in fields if name == step]
         tagged = {m for _, field, m in fields if step in get_args(field.annotation)}
         models = set().union(*inner) or tagged or models
-    return {name for model in models for name in model.model_fields}
+    return {field.alias or name for model in models for name, field in model.model_fields.items()}
 
 
 def models_in(annotation: Any) -> set[type[BaseModel]]:

@@ -48,13 +48,15 @@ def refuse_beyond_reading(resolved: Mapping[str, Any], origin: Origin, problems:
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     """`over` laid over `base`, both at `path`.
 
-    A component of another `type`, or a mapping of another `kind`, keeps nothing of the old one.
+    A component of another `type`, or a mapping of another `kind` or `schedule`, keeps nothing of
+    the old one.
     `plugins` are united, other lists replaced. `null` replaces what it lies over: in place of an
     option it is a value, in place of a component or a section it leaves the default, in place of
     a swap it drops the swap.
     """
     other_type = "type" in over and type_at(base, path) not in (None, type_at(over, path))
-    other_kind = "kind" in over and base.get("kind") not in (None, over["kind"])
+    told = [key for key in ("kind", "schedule") if key in over]
+    other_kind = any(base.get(key) not in (None, over[key]) for key in told)
     if other_type or other_kind or (path[:1] == ("swap",) and len(path) == 2):
         return over
     merged = MapNode(over.origin, base.entries())

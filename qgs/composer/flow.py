@@ -31,7 +31,7 @@ from qgs.contracts.component import (
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
 """What stands at each place; None for a component that could not be decoded."""
 
-_FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses")
+_FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses", "objective")
 """Slots that read or write fields, in the order in which a layer's prediction is made."""
 
 
@@ -49,6 +49,8 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
             dict(component(config).weights())
         asked = "problems"
         found = list(component.problems(config, context))
+        for later in chosen.later:
+            found += [p for p in component.problems(later, context) if p not in found]
         odd = [type(problem).__name__ for problem in found if not isinstance(problem, Problem)]
         if odd:
             raise TypeError(f"it gives {odd[0]}, not qgs.contracts.Problem")
@@ -180,6 +182,14 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
         )
 
 
+def unfinished(parts: Mapping[KeyPath, Chosen], steps: int) -> Iterator[str]:
+    """Schedules that a training of `steps` steps leaves before their end, one sentence each."""
+    for part in {part.path: part for part in parts.values()}.values():
+        for option, schedule in part.schedules.items():
+            if (last := max(schedule.corners, default=0)) > steps:
+                yield f"{part.path}.{option} changes until step {last}, training ends at {steps}"
+
+
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, int | None]]:
     """Every component's turn in a training step, and the layer that is decoded, else None.
 
@@ -199,7 +209,8 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, 
         if layer in decoded:
             for name in ("head", "centers", "renderer"):
                 yield parts["model", name], layer
-            yield from ((loss, layer) for path, loss in parts.items() if path[0] == "losses")
+            judges = ("losses", "objective")
+            yield from ((part, layer) for path, part in parts.items() if path[0] in judges)
 
 
 def _unmet(

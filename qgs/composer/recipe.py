@@ -13,13 +13,20 @@ from qgs.composer.build import build, build_model
 from qgs.composer.decode import Chosen, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
 from qgs.composer.files import MAX_BYTES, apply_overrides, merge, read_recipe, refuse_beyond_reading
-from qgs.composer.flow import check_flow, check_options, idle_fields, without_idle_sublayers
+from qgs.composer.flow import (
+    check_flow,
+    check_options,
+    idle_fields,
+    unfinished,
+    without_idle_sublayers,
+)
 from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
 from qgs.composer.rates import rate_factors
 from qgs.composer.registry import Registry, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import inline
+from qgs.contracts.schedule import Schedule
 from qgs.memory import refuse_beyond_memory
 from qgs.model import QueryGaussianModel
 
@@ -58,7 +65,12 @@ class Recipe:
     @property
     def warnings(self) -> list[str]:
         """What works and is probably not what was meant, a sentence each."""
-        return list(idle_fields(self.parts))
+        return [*idle_fields(self.parts), *unfinished(self.parts, self.training.steps)]
+
+    @property
+    def schedules(self) -> dict[KeyPath, Mapping[str, Schedule]]:
+        """Of each place with options that follow the progress of training, these options."""
+        return {path: part.schedules for path, part in self.parts.items() if part.schedules}
 
     def build_model(self, device: torch.device | str | None = None) -> QueryGaussianModel:
         """The model with its initial parameters; on "meta" it takes no memory.
@@ -75,6 +87,10 @@ class Recipe:
     def build_losses(self) -> dict[str, contracts.Loss]:
         """Losses by the names that the recipe gives; without any, training refuses to start."""
         return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
+
+    def build_objective(self) -> contracts.Objective:
+        """What a training step computes."""
+        return build(self.parts["objective",])
 
     def build_metrics(self) -> dict[str, contracts.Metric]:
         """What evaluations measure, by the names that the recipe gives."""
@@ -231,13 +247,13 @@ def _put_decoder(tree: "_Tree", parts: Mapping[KeyPath, Chosen]) -> None:
     for name in LAYER_SLOTS:
         if (*decoder, name) not in parts:
             continue
-        alike = [(part.type, part.config) for path, part in layers.items() if path[-1] == name]
+        alike = [(part.type, part.options) for path, part in layers.items() if path[-1] == name]
         same = alike.count(alike[0]) == len(alike)
         template = parts[(*decoder, "layers", "0", name) if same else (*decoder, name)]
         tree.put_component((*decoder, name), template)
-        templates[name] = (template.type, template.config)
+        templates[name] = (template.type, template.options)
     for path, part in layers.items():
-        if (part.type, part.config) != templates[path[-1]]:
+        if (part.type, part.options) != templates[path[-1]]:
             tree.put_component(path, part)
 
 
@@ -270,8 +286,7 @@ class _Tree:
     def put_component(self, path: KeyPath, chosen: Chosen) -> None:
         self.used.add(chosen.installed.plugin.name)
         self.put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
-        options = chosen.config.model_dump(mode="json")
-        self.put(path, options, chosen.place.node, f"default of {chosen.type}")
+        self.put(path, chosen.options, chosen.place.node, f"default of {chosen.type}")
 
 
 def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:

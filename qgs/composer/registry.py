@@ -13,6 +13,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from torch.nn import Module
+
 import qgs
 import qgs.components
 import qgs.data
@@ -22,8 +24,17 @@ import qgs.renderers
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
 from qgs.composer.slots import SLOTS
-from qgs.contracts import Component, ComponentConfig, Metric, OptionError, Renderer, WeightLayout
+from qgs.contracts import (
+    Component,
+    ComponentConfig,
+    Metric,
+    Objective,
+    OptionError,
+    Renderer,
+    WeightLayout,
+)
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
+from qgs.contracts.schedule import number_kinds
 
 BUILTIN = Plugin(
     name="qgs",
@@ -282,6 +293,13 @@ def component_fault(component: object) -> str:
         return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
     if "type" in config.model_fields:
         return "whose Config has an option `type`, which names the component itself"
+    fields: Mapping[str, Any] = config.model_fields
+    scheduled: object = component.scheduled
+    known = {n for n, option in fields.items() if number_kinds(option.annotation)}
+    if not (isinstance(scheduled, frozenset) and scheduled <= known):
+        return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
+    if scheduled and not issubclass(component, Module | Objective):
+        return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
     return _schema_fault(config)
 
 

@@ -8,6 +8,7 @@ from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import Registry
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS
 from qgs.contracts import Component, ComponentConfig
+from qgs.contracts.schedule import SCHEDULES, Schedule
 
 _NAMES = {"type": "array", "items": {"type": "string"}}
 _NULL = {"type": "null"}
@@ -50,10 +51,12 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
             component = {"type": "object", "additionalProperties": component}
         beside[name] = {"description": description, **component}
     beside |= {path[0]: _section(path) for path in SETTINGS if path and path[0] not in beside}
-    definitions = {
+    definitions: dict[str, dict[str, Any]] = {
         slot: {"anyOf": [_type(name, c) for name, c in registry.components(slot).items()]}
         for slot in SLOTS
     }
+    kinds = [_settings(kind) for kind in dict.fromkeys(SCHEDULES.values())]
+    definitions["schedule"] = {"anyOf": kinds, "description": summary_of(Schedule)}
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "qgs recipe"}
     return {**dialect, **_section((), beside), "$defs": definitions}
 
@@ -62,6 +65,12 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
     """The options of `component`, and the `type` that chooses it."""
     description, schema = summary_of(component), _settings(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
+    for option in component.scheduled:
+        number = dict(properties[option])
+        told = {
+            key: number.pop(key) for key in ("description", "title", "default") if key in number
+        }
+        properties[option] = {**told, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
     return schema | {"description": description, "properties": properties}
 
 

@@ -47,6 +47,7 @@ SLOTS = {
         Slot(contracts.Supervision, "qgs/layers"),
         Slot(contracts.Renderer, "qgs/auto"),
         Slot(contracts.Loss, named=True, defaults=DEFAULT_LOSSES),
+        Slot(contracts.Objective, "qgs/one_pass"),
         Slot(contracts.Metric, named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
         Slot(contracts.Optimizer, "qgs/adamw"),
         Slot(contracts.SceneSource),
@@ -55,7 +56,7 @@ SLOTS = {
 MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
-SECTIONS = {name: SLOTS[name] for name in ("losses", "data", "metrics", "optimizer")}
+SECTIONS = {name: SLOTS[name] for name in ("losses", "objective", "data", "metrics", "optimizer")}
 """Slots that are top-level sections of a recipe."""
 _RATE = ("learning_rate", "warmup", "initial_divisor", "final_divisor")
 _OF_OPTIMIZER = (*_RATE, "betas", "weight_decay")

@@ -27,6 +27,7 @@ from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
 from qgs.contracts.head import Centers, Head
 from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
+from qgs.contracts.objective import Objective, Outcome, Passes
 from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
 from qgs.contracts.plugin import CONTRACT_VERSION, Expected, ExpectedError, Plugin
 from qgs.contracts.queries import LearnedQueries, Queries
@@ -60,10 +61,13 @@ __all__ = [
     "MissingExtraError",
     "ModelComponent",
     "ModelDims",
+    "Objective",
     "Optimizer",
     "OptimizerConfig",
     "OptionError",
+    "Outcome",
     "ParameterGroup",
+    "Passes",
     "Plugin",
     "Problem",
     "Queries",

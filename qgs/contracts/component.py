@@ -1,8 +1,9 @@
 """What all components share: a name, a Config, the fields they read and write, problems."""
 
-from abc import ABC
+from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias
 
 import torch
@@ -107,7 +108,7 @@ def without_effect(
             yield Problem(option, f"`{option}` has no effect: {because}", fix)
 
 
-class Component(ABC):
+class Component(metaclass=ABCMeta):
     """Base of everything that a recipe selects with `type: PLUGIN/NAME`.
 
     A slot's contract sets `slot`; a component sets `name` and nests its `Config`. Classmethods are
@@ -120,6 +121,14 @@ class Component(ABC):
 
     slot: ClassVar[str]
     name: ClassVar[str]
+    scheduled: ClassVar[frozenset[str]] = frozenset()
+    """Options, numbers, that are read from `self.config` in every call and nowhere else: training
+    may change them from step to step, as a schedule in the recipe says."""
+
+    schedules: Mapping[str, Any] = MappingProxyType({})
+    """Option to its `qgs.contracts.schedule.Schedule`; `config` has the numbers after `followed`
+    steps."""
+    followed: int = 0
 
     class Config(ComponentConfig):
         """No options."""

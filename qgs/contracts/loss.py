@@ -12,11 +12,12 @@ from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Loss(Component, torch.nn.Module):
-    """(LayerPrediction, Rendering, target Views) -> named 0-d tensors, already weighted.
+    """(LayerPrediction, Rendering, target Views, input Views) -> named 0-d tensors, weighted.
 
-    Called for each supervised layer with a rendering from the target's cameras; the objective is
-    the sum of all terms, weighted by layer. Term names are unique within a recipe. Every term has a
-    gradient in the prediction or in the rendering.
+    Called for each supervised layer with a rendering from the target's cameras, and with all views
+    that the prediction was made from; what is minimised is the sum of all terms, weighted by layer.
+    Term names are unique within a recipe. Every term has a gradient in the prediction or in the
+    rendering.
 
     renderings: which views a call needs, since training may render few at a time
         (`training.render_views`). "each": a term is a mean over views, so the loss is called with
@@ -29,7 +30,7 @@ class Loss(Component, torch.nn.Module):
 
     @abstractmethod
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """The terms of this loss, each multiplied by its weight and averaged over scenes."""
 

@@ -57,6 +57,7 @@ class Renderer(Component, torch.nn.Module):
     """
 
     slot: ClassVar[str] = "renderer"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"near", "far", "dilation"})
     devices: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 

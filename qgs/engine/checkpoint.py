@@ -18,6 +18,7 @@ from torch import Tensor, nn
 import qgs
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import flat
+from qgs.contracts.schedule import follow, steps_followed
 from qgs.data.domain import KEY, SAMPLES, Domain
 from qgs.data.sampling import Batch
 from qgs.engine.distributed import placed_like, sharded, whole
@@ -168,6 +169,7 @@ class Saver:
         assert self.model.recipe is not None
         copy = resolve(self.model.recipe).build_model()
         load_weights(copy, self.parts["weights"].state(), "the model in shards")
+        follow(copy.modules(), steps_followed(self.model.modules()) or 0)
         return copy.to(self._accelerator.device)
 
     def restore(self, saved: SavedState) -> None:

@@ -53,7 +53,8 @@ def refuse_unfit(recipe: Recipe, accelerator: Accelerator) -> None:
     if data := recipe.data_config:
         size = height, width = data.image_size
         images, batches = config.batch_size * (views.inputs + views.targets), config.accumulate + 1
-        rendered = config.batch_size * min(views.targets, config.render_views or views.targets)
+        judged = views.targets + config.judge_inputs * views.inputs
+        rendered = config.batch_size * min(judged, config.render_views or judged)
         on_device["renderings and their gradients"] = 2 * 4 * _RENDERED * rendered * height * width
         counted = f"batch_size {config.batch_size} x ({views.inputs} + {views.targets}) images"
         in_host[f"{counted} of {height} x {width}, {batches} times"] = batches * image_bytes(

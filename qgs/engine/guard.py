@@ -20,7 +20,7 @@ from qgs.data.sampling import Batch
 from qgs.engine.causes import blamed
 from qgs.engine.checkpoint import Saver, Weights
 from qgs.engine.distributed import whole
-from qgs.engine.objective import Objective
+from qgs.engine.objective import TrainingPass
 from qgs.io.checkpoint import save, unique_tensors, write_tensors
 from qgs.io.differences import nonfinite
 from qgs.io.files import replacing_entries
@@ -95,7 +95,7 @@ class Guard:
     def __init__(
         self,
         accelerator: Accelerator,
-        objective: Objective,
+        objective: TrainingPass,
         saver: Saver,
         recipe: Recipe,
         repeat: Callable[[Sequence[Batch]], Any],
@@ -412,7 +412,7 @@ class Watch:
                 self.first = BadTensor(path, bad, max(self._batch, 0))
 
     @contextmanager
-    def on(self, objective: Objective) -> Iterator[None]:
+    def on(self, objective: TrainingPass) -> Iterator[None]:
         """Watch the steps that `objective` makes inside the `with` block."""
         for name, tensor in unique_tensors(objective).items():
             self.see(f"weight {name}", whole(tensor))

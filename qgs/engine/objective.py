@@ -1,20 +1,23 @@
-"""What a training step minimises: every supervised layer rendered and compared with photos."""
+"""What a training step runs: its objective, and what that calls, the model and the losses."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from qgs.contracts import Loss
+from qgs.components import OnePass
+from qgs.composer import Recipe
+from qgs.contracts import Loss, Objective, Outcome
+from qgs.contracts.schedule import follow
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import (
     Cameras,
     Gaussians,
     LayerPrediction,
+    Prediction,
     Rendering,
     Views,
     concatenated,
@@ -22,34 +25,34 @@ from qgs.types import (
     named_tensors,
 )
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """total: 0-d. terms: 0-d, weighted by layer, detached.
-
-    signs: of the last supervised layer, 0-d: "psnr", and "alpha" and "deviation" of `measure`.
-    """
-
-    total: Tensor
-    terms: Mapping[str, Tensor]
-    signs: Mapping[str, Tensor]
+RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
+"""Names of a record of history.jsonl that no term may have."""
 
 
-class Objective(nn.Module):
-    """The model with its losses, one module so that distributed wrappers see one forward.
+class TrainingPass(nn.Module):
+    """The model, its losses and its objective: the `Passes` that the objective is given.
 
-    The forward pass takes the losses' gradients with respect to the Gaussians too, one layer and
+    One module, so that distributed wrappers see one forward however often the model runs in it.
+
+    `judge` takes the losses' gradients with respect to the Gaussians too, one layer and
     `render_views` target views at a time (0: all views), and frees each part's graph before it
     makes the next; the backward pass starts from their sums. Memory thus grows neither
     with layers nor with views. Where a loss needs all renderings at once, only the renderer's
     graphs are made in parts.
+
+    objective: None for `qgs/one_pass`. judge_inputs: the input views are targets too, the last.
 
     owners: the names of terms that were computed so far, to those of their losses.
     hook: called with the name and the value (tensors, or a nest of them) of what is computed.
     """
 
     def __init__(
-        self, model: QueryGaussianModel, losses: Mapping[str, Loss], render_views: int = 0
+        self,
+        model: QueryGaussianModel,
+        losses: Mapping[str, Loss],
+        render_views: int = 0,
+        objective: Objective | None = None,
+        judge_inputs: bool = False,
     ) -> None:
         super().__init__()
         if not losses:
@@ -58,36 +61,69 @@ class Objective(nn.Module):
         self.losses = nn.ModuleDict(losses)
         self._of_gaussians = [n for n, loss in losses.items() if loss.renderings == "none"]
         self._of_images = [name for name in losses if name not in self._of_gaussians]
-        self.render_views = render_views
+        self.render_views, self.judge_inputs = render_views, judge_inputs
+        self.objective = objective or OnePass(OnePass.Config())
+        self._judged = 0
         self.hook: Callable[[str, Any], None] = lambda name, value: None
         self.owners: dict[str, str] = {}
 
+    @classmethod
+    def of(cls, recipe: Recipe, model: QueryGaussianModel) -> "TrainingPass":
+        """As `recipe` says, with `model`, which was built from it."""
+        config, objective = recipe.training, recipe.build_objective()
+        shown = config.render_views, objective, config.judge_inputs
+        return cls(model, recipe.build_losses(), *shown)
+
     def forward(self, inputs: Views, targets: Views) -> Outcome:
-        """Reconstruct `inputs` and compare with `targets`, layers weighted by the supervision.
+        """What the objective makes of a batch.
+
+        Raises ValueError when two terms have one name, or one that a step's record has already.
+        """
+        self._judged = 0
+        targets = targets.joined(inputs) if self.judge_inputs else targets
+        outcome = self.objective.forward(inputs, targets, self)
+        if taken := sorted(outcome.terms.keys() & RECORDED):
+            kinds = f"losses or the objective {self.objective.name}"
+            raise ValueError(f"terms of {kinds} are named {taken}, as other numbers of a step are")
+        return outcome
+
+    def follow(self, step: int) -> None:
+        """Give every component the options that it has after `step` optimiser steps."""
+        follow((*self.modules(), self.objective), step)
+
+    def predict(self, inputs: Views) -> Prediction:
+        """See `Passes`."""
+        return self.model(inputs)
+
+    def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
+        """See `Passes`: layers are weighted by the supervision, the signs are of the last one.
 
         Raises ValueError when two losses name a term alike.
         """
-        prediction = self.model(inputs)
+        self._judged += 1
+        judgement = f" in judgement {self._judged}" if self._judged > 1 else ""
         parameters = dict(self.losses.named_parameters(prefix="losses"))
         total, count = targets.images.new_zeros(()), targets.images.shape[1]
         terms: dict[str, Tensor] = {}
         signs: list[tuple[float, dict[str, Tensor]]] = []
         for number, weight in self.model.supervision.weights().items():
-            self.hook(f"prediction of layer {number}", prediction.layers[number])
+            self.hook(f"prediction of layer {number}{judgement}", prediction.layers[number])
             layer = DetachedLayer(prediction.layers[number], parameters)
             signs = []
             for part in self._parts(targets):
                 views = part.images.shape[1]
-                rendering = self._render(layer.prediction.gaussians, part.cameras)
-                self.hook(f"rendering of layer {number}", rendering)
+                rendering = self.render(layer.prediction.gaussians, part.cameras)
+                self.hook(f"rendering of layer {number}{judgement}", rendering)
                 signs.append((views / count, self._signs(rendering, part)))
-                found = self._terms(self._of_images, layer.prediction, rendering, part, number)
+                seen = rendering, part, inputs
+                found = self._terms(self._of_images, layer.prediction, *seen, number)
                 layer.add(found, weight * views / count)
             if self._of_gaussians:
                 no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
-                found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, number)
+                seen = no_views, targets, inputs
+                found = self._terms(self._of_gaussians, layer.prediction, *seen, number)
                 layer.add(found, weight)
-            self.hook(f"gradient of layer {number}", layer.gradients)
+            self.hook(f"gradient of layer {number}{judgement}", layer.gradients)
             total = total + layer.total()
             _add(layer.terms, terms)
         mean = {
@@ -103,8 +139,8 @@ class Objective(nn.Module):
             return [targets]
         return [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
 
-    def _render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """The rendering for all `cameras`; the graphs of at most `render_views` exist at a time."""
+    def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """See `Passes`: the graphs of at most `render_views` views exist at a time."""
         if cameras.shape[1] <= (self.render_views or cameras.shape[1]):
             return self.model.render(gaussians, cameras)
         parts = [
@@ -119,12 +155,13 @@ class Objective(nn.Module):
         layer: LayerPrediction,
         rendering: Rendering,
         target: Views,
+        inputs: Views,
         number: int,
     ) -> dict[str, Tensor]:
         """The terms of the losses `names`."""
         terms: dict[str, Tensor] = {}
         for name in names:
-            new = self.losses[name](layer, rendering, target)
+            new = self.losses[name](layer, rendering, target, inputs)
             repeated = sorted(term for term in new if self.owners.setdefault(term, name) != name)
             if repeated:
                 raise ValueError(

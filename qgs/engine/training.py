@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from qgs.composer import Recipe
 from qgs.composer.recipe import annotated
-from qgs.contracts import TrainingConfig
+from qgs.contracts import Outcome, TrainingConfig
 from qgs.data.sampling import Batch
 from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
 from qgs.engine.checkpoint import (
@@ -46,7 +46,7 @@ from qgs.engine.fit import explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.engine.guard import Guard, not_finite
 from qgs.engine.initial import initialise
-from qgs.engine.objective import Objective, Outcome
+from qgs.engine.objective import TrainingPass
 from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
@@ -167,8 +167,7 @@ class Trainer:
         self.model = recipe.build_model(device=self.accelerator.device).train()
         warnings = [f"warning: {text}" for text in recipe.warnings]
         self.notes = warnings + ([] if saved else initialise(self.model, recipe))
-        objective = Objective(self.model, recipe.build_losses(), config.render_views)
-        objective.to(self.accelerator.device)
+        objective = TrainingPass.of(recipe, self.model).to(self.accelerator.device)
         if wants_shards(self.accelerator):  # before the optimiser, whose moments lie in shards too
             shard(self.model)
         factors = recipe.rate_factors(objective)
@@ -200,6 +199,8 @@ class Trainer:
         if saved:
             self.saver.restore(saved)
         self.resumed_at = self.step if saved else None
+        self._follow = objective.follow
+        self._follow(self.step)
         batches = training_batches(
             source,
             recipe.views,
@@ -258,6 +259,7 @@ class Trainer:
                 self.guard.passed(numbers)
                 self.saver.see(batches)
             self.step += 1
+            self._follow(self.step)
             self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
             self._tick()
 
@@ -362,7 +364,8 @@ class Trainer:
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)
             self.trackers.log(finite, self.step)
-        images = self.samples * self.recipe.views.targets
+        judged = self.recipe.training.judge_inputs * self.recipe.views.inputs
+        images = self.samples * (self.recipe.views.targets + judged)
         shown = record["loss"], record["psnr"], images, self.seconds, self.used
         if progress.update(self.step, *shown):
             self.folder.flush()

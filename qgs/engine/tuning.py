@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
+from qgs.contracts.schedule import END, follow
 from qgs.contracts.settings import Tuned
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
@@ -22,8 +23,12 @@ class Tuning:
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:
-    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults."""
-    for loss in recipe.build_losses().values():
+    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults.
+
+    Weights that follow the training are those of its end, so that a protocol means one thing.
+    """
+    follow((losses := recipe.build_losses()).values(), END)
+    for loss in losses.values():
         if isinstance(loss, Photometric) and any(loss.weights()):
             return loss
     return Photometric(Photometric.Config())
@@ -68,7 +73,7 @@ def tune(
         else:
             prediction = model.predict(model.encoder.project(tuned, memory), start, ())
         rendering = model.render(prediction.gaussians, views.cameras)
-        terms = loss(prediction.layers[model.depth], rendering, views)
+        terms = loss(prediction.layers[model.depth], rendering, views, views)
         return prediction, torch.stack(list(terms.values())).sum()
 
     losses = []

@@ -17,6 +17,7 @@ import qgs
 from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts import CONTRACT_VERSION
+from qgs.contracts.schedule import END, follow, steps_followed
 from qgs.data.domain import KEY, Domain
 from qgs.io.differences import (
     CONTENTS,
@@ -114,7 +115,9 @@ def save(
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, tensor in (weights or unique_tensors(model)).items()
     }
-    write_checkpoint(path, tensors, model.recipe, extra or {})
+    step = steps_followed(model.modules())
+    followed = {} if step is None else {"step": str(step)}
+    write_checkpoint(path, tensors, model.recipe, followed | dict(extra or {}))
 
 
 def write_checkpoint(
@@ -163,6 +166,8 @@ def load(
         ) from error
     load_weights(model, tensors, str(path))
     refuse_damaged(tensors, path)
+    step = load_step(path)
+    follow(model.modules(), END if step is None else step)
     model.trained_on = load_domain(path)
     model.loaded_from = str(path.resolve()) if Path(name).expanduser().exists() else name
     return (model if device is None else model.to(device)).eval()

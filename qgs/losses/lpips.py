@@ -14,6 +14,7 @@ class LpipsLoss(Loss):
     """Mean LPIPS of the views, of VGG-16 (TokenGS 2026.6); nothing is downloaded."""
 
     name: ClassVar[str] = "lpips"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "each"
 
     class Config(ComponentConfig):
@@ -30,7 +31,7 @@ class LpipsLoss(Loss):
         self.network = PerceptualDistance(config.weights)
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """One term, `lpips`.
 

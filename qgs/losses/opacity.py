@@ -15,6 +15,7 @@ class Opacity(Loss):
     """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release, weight 0 in its recipes)."""
 
     name: ClassVar[str] = "opacity"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "none"
 
     class Config(ComponentConfig):
@@ -26,7 +27,7 @@ class Opacity(Loss):
     config: Config
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         opacities = at_least_float32(prediction.gaussians.opacities)
         return {"opacity": self.config.weight * -(opacities + self.config.eps).log().mean()}
@@ -36,6 +37,7 @@ class Mask(Loss):
     """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
 
     name: ClassVar[str] = "mask"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "each"
 
     class Config(ComponentConfig):
@@ -45,7 +47,7 @@ class Mask(Loss):
     config: Config
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """One term, `mask`. Raises ValueError for views without masks."""
         if target.masks is None:

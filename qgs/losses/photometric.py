@@ -56,6 +56,7 @@ class Photometric(Loss):
     """mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2."""
 
     name: ClassVar[str] = "photometric"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"mse_weight", "l1_weight", "ssim_weight"})
     renderings = "each"
 
     class Config(ComponentConfig):
@@ -75,7 +76,7 @@ class Photometric(Loss):
         return self.config.mse_weight, self.config.l1_weight, self.config.ssim_weight
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """Terms `mse`, `l1`, `ssim`; raises ValueError for images that are too small for SSIM."""
         terms = {}

@@ -57,6 +57,7 @@ class Visibility(Loss):
     """Mean over Gaussians of `view_visibility` of their means."""
 
     name: ClassVar[str] = "visibility"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "none"
 
     class Config(VisibilityOptions):
@@ -72,7 +73,7 @@ class Visibility(Loss):
             yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         per_point = view_visibility(
             prediction.gaussians.means,

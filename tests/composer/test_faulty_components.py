@@ -53,7 +53,7 @@ class ExplodingLoss(Loss):
     name = "exploding"
     def __init__(self, config):
         look_up("x")
-    def forward(self, prediction, rendering, target):
+    def forward(self, prediction, rendering, target, inputs):
         raise NotImplementedError
 
 class Closed(SceneSource):

@@ -61,8 +61,21 @@ def test_recipes_validate(path, schema):
         {"model": {"queries": {"cuont": 1}}},
         {"model": {"decoder": {"layers": {"x": {}}}}},
         {"training": {"precision": "fp8"}},
+        {"model": {"renderer": {"dilation": {"schedule": "linaer", "from": 1, "to": 0}}}},
+        {"model": {"renderer": {"dilation": {"schedule": "linear", "value": 1}}}},
+        {"model": {"queries": {"count": {"schedule": "constant", "value": 1}}}},
     ],
 )
 def test_mistakes_do_not_validate(recipe, schema):
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(recipe, schema)
+
+
+def test_schedules_validate_where_options_may_follow(schema):
+    ramp = {"schedule": "cosine", "from": 1, "to": 0.1, "over": [0, 100]}
+    jumps = {"schedule": "steps", "values": [10, 1], "at": [100]}
+    recipe = {
+        "model": {"renderer": {"dilation": jumps, "far": ramp}},
+        "losses": {"photometric": {"mse_weight": {"schedule": "constant", "value": 2}}},
+    }
+    jsonschema.validate(recipe, schema)

@@ -1,5 +1,6 @@
-"""Recipes that train in a blink."""
+"""Recipes that train in a blink, and a plugin with an objective of two passes."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,3 +32,10 @@ def tiny() -> Callable[..., Recipe]:
         return resolve(RECIPES / f"{name}.yaml", [*SMALL, *overrides])
 
     return make
+
+
+@pytest.fixture
+def two(install: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plugin of two_passes.py, installed for this process and for those that it starts."""
+    install("qgs-two", "two", Path(__file__).with_name("two_passes.py").read_text())
+    monkeypatch.setenv("PYTHONPATH", sys.path[0])

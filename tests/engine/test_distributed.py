@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from safetensors.torch import load_file
-from training_runs import Tiny, losses, read_jsonl, run, run_calling
+from training_runs import TWO, Tiny, losses, read_jsonl, run, run_calling
 
 import qgs
 from qgs.composer import Recipe
@@ -91,6 +91,19 @@ def test_shards_continue_what_one_process_began(
         for key, tensor in ours[name].items():
             torch.testing.assert_close(tensor, theirs[name][key], rtol=1e-3, atol=1e-4)
     qgs.load(tmp_path / "shards" / "checkpoint.safetensors")
+
+
+@pytest.mark.parametrize(
+    "environment", [{}, pytest.param(FSDP, marks=pytest.mark.slow)], ids=["copies", "shards"]
+)
+def test_two_processes_make_two_passes_as_one_does(
+    tiny: Tiny, tmp_path: Path, two: None, environment: dict[str, str]
+) -> None:
+    alone = tiny("locus", *TWO, "training.batch_size=2")
+    run(alone, tmp_path / "alone")
+    pair = tiny("locus", *TWO, "training.batch_size=1", "training.render_views=1")
+    train_in_two_processes(pair, tmp_path / "two", **environment)
+    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
 
 
 def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path: Path) -> None:

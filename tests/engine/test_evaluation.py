@@ -28,6 +28,7 @@ from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.metrics.dispersion import token_dispersion
 from qgs.metrics.images import Psnr, psnr, ssim
 from qgs.metrics.lpips import Lpips
+from qgs.perceptual import PerceptualDistance
 
 FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
 
@@ -295,7 +296,9 @@ def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny, tmp_p
 def test_lpips_fills_its_column_where_it_can(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = tiny("tokengs", "metrics.lpips={type: qgs/lpips, weights: mine.pth}")
     asked = []
-    monkeypatch.setattr(Lpips, "_load", lambda self, weights: asked.append(weights) or "")
+    monkeypatch.setattr(
+        PerceptualDistance, "_load", lambda self, weights: asked.append(weights) or ""
+    )
     monkeypatch.setattr(
         Lpips, "distance", lambda self, images, truth: (images - truth).abs().mean((-3, -2, -1))
     )

@@ -20,7 +20,7 @@ from qgs.engine.checkpoint import Saver
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.folder import RunFolder
 from qgs.engine.guard import MAX_SAVED, BadTensor, Guard, Watch
-from qgs.engine.objective import Objective
+from qgs.engine.objective import TrainingPass
 from qgs.engine.training import compute_gradients
 from qgs.types import named_tensors
 
@@ -35,7 +35,7 @@ class Step:
         self.recipe, self.accelerator = recipe, make_accelerator("cpu")
         self.model = recipe.build_model().train()
         losses = recipe.build_losses()
-        self.objective = Objective(self.model, losses, recipe.training.render_views)
+        self.objective = TrainingPass(self.model, losses, recipe.training.render_views)
         self.gradients = partial(
             compute_gradients, self.accelerator, self.objective, recipe.training
         )

@@ -11,33 +11,27 @@ from typing import ClassVar, TypeAlias
 import pytest
 import torch
 from torch import Tensor, nn
-from training_runs import Tiny
+from training_runs import TWO, Tiny, first_batch
 from varying_head import VaryingHead
 
 from qgs.composer import Recipe
-from qgs.contracts import ComponentConfig, Loss
-from qgs.data.sampling import Batch
-from qgs.data.stream import training_batches
-from qgs.engine.objective import Objective, Outcome, measure
+from qgs.contracts import ComponentConfig, Loss, Outcome
+from qgs.engine.objective import TrainingPass, measure
 from qgs.losses import Mask, Opacity
 from qgs.metrics.images import psnr
 from qgs.types import Views, map_tensors
 
 
-def first_batch(recipe: Recipe) -> Batch:
-    return next(training_batches(recipe.build_data(), recipe.views, 2, seed=0))
-
-
 def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Tiny) -> None:
     recipe = tiny("tokengs")
     model, losses, batch = recipe.build_model().train(), recipe.build_losses(), first_batch(recipe)
-    outcome = Objective(model, losses)(batch.inputs, batch.targets)
+    outcome = TrainingPass(model, losses)(batch.inputs, batch.targets)
     prediction = model(batch.inputs)
     expected = {"mse": 0.0, "ssim": 0.0, "visibility": 0.0}
     for layer, weight in ((2, 1 / 3), (4, 2 / 3)):
         rendering = model.render(prediction.layers[layer].gaussians, batch.targets.cameras)
         for loss in losses.values():
-            terms = loss(prediction.layers[layer], rendering, batch.targets)
+            terms = loss(prediction.layers[layer], rendering, batch.targets, batch.inputs)
             for name, term in terms.items():
                 expected[name] += weight * float(term.detach())
     assert {name: float(term) for name, term in outcome.terms.items()} == pytest.approx(expected)
@@ -50,7 +44,7 @@ def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Tiny) -> None:
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
 def test_every_parameter_gets_a_finite_gradient(tiny: Tiny, name: str) -> None:
     recipe = tiny(name)
-    objective = Objective(recipe.build_model().train(), recipe.build_losses())
+    objective = TrainingPass(recipe.build_model().train(), recipe.build_losses())
     batch = first_batch(recipe)
     objective(batch.inputs, batch.targets).total.backward()
     for parameter_name, parameter in objective.named_parameters():
@@ -61,14 +55,14 @@ def test_every_parameter_gets_a_finite_gradient(tiny: Tiny, name: str) -> None:
 def test_two_losses_with_one_term_are_refused(tiny: Tiny) -> None:
     recipe = tiny("tokengs", "losses.again={type: qgs/visibility}")
     batch = first_batch(recipe)
-    objective = Objective(recipe.build_model().train(), recipe.build_losses())
+    objective = TrainingPass(recipe.build_model().train(), recipe.build_losses())
     with pytest.raises(ValueError, match=r"losses\.again .*\['visibility'\]"):
         objective(batch.inputs, batch.targets)
 
 
 def test_no_loss_at_all_is_refused(tiny: Tiny) -> None:
     with pytest.raises(ValueError, match="at least one loss"):
-        Objective(tiny("tokengs").build_model("meta"), {})
+        TrainingPass(tiny("tokengs").build_model("meta"), {})
 
 
 TOOL = Path(__file__).parents[2] / "tools" / "measure_render_memory.py"
@@ -86,7 +80,7 @@ class Flicker(Loss):
         super().__init__(ComponentConfig())
         self.gain = nn.Parameter(torch.tensor(0.7))
 
-    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == TARGETS
         brightness = rendering.rgb.mean((-3, -2, -1))
         return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
@@ -98,7 +92,7 @@ class Blind(Loss):
     name: ClassVar[str] = "blind"
     renderings = "none"
 
-    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == 0
         assert target.images.shape[1] == TARGETS
         return {"blind": prediction.state.features.square().mean()}
@@ -144,7 +138,8 @@ def written_out(
             shown = rendering
             if loss.renderings == "none":
                 shown = map_tensors(lambda tensor: tensor[:, :0], rendering)
-            total = total + weight * torch.stack(list(loss(layer, shown, targets).values())).sum()
+            terms = loss(layer, shown, targets, inputs)
+            total = total + weight * torch.stack(list(terms.values())).sum()
     return total
 
 
@@ -161,7 +156,7 @@ def furthest(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> float
     return max(float((found[n] - g).abs().max()) for n, g in wanted.items()) / largest
 
 
-def error(objective: Objective, *batch: Views) -> float:
+def error(objective: TrainingPass, *batch: Views) -> float:
     """How far its gradients are from those of the definition."""
     wanted = gradients(objective, written_out(objective.model, objective.losses, *batch))
     return furthest(gradients(objective, objective(*batch).total), wanted)
@@ -176,7 +171,7 @@ def test_gradients_do_not_depend_on_it(
     model, losses, *batch = setting(renderer)
     if all_at_once:
         losses["flicker"] = Flicker()
-    objective = Objective(model, losses, render_views)
+    objective = TrainingPass(model, losses, render_views)
     assert error(objective, *batch) < 1e-6
     outcome = objective(*batch)
     assert float(outcome.total.detach()) == pytest.approx(float(sum(outcome.terms.values())))
@@ -188,7 +183,7 @@ class Marked(Loss):
     name: ClassVar[str] = "marked"
     renderings = "each"
 
-    def forward(self, prediction, rendering, target) -> dict[str, Tensor]:
+    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
 
 
@@ -202,10 +197,32 @@ def test_harmonics_and_features_get_theirs(
     losses |= {"marked": Marked(ComponentConfig())} | (
         {"flicker": Flicker()} if all_at_once else {}
     )
-    objective = Objective(model, losses, render_views=2)
+    objective = TrainingPass(model, losses, render_views=2)
     assert error(objective, *batch) < 1e-6
     found = gradients(objective, objective(*batch).total)["model.head.linear.weight"]
     assert found.unflatten(0, (-1, 28)).abs().amax((0, 2)).gt(0).all(), "all channels"
+
+
+@pytest.mark.parametrize("render_views", [0, 1])
+def test_gradients_of_two_passes_are_those_of_the_definition(
+    tiny: Tiny, two: None, render_views: int
+) -> None:
+    """As one graph, in which the two passes and both comparisons stand written out."""
+    factors = "alpha_weight: 0.1, depth_weight: 0.2"
+    recipe = tiny("locus", *TWO, f"objective={{type: two/two_passes, {factors}}}")
+    model, batch = recipe.build_model().train(), first_batch(recipe)
+    step = TrainingPass(model, recipe.build_losses(), render_views, recipe.build_objective())
+    total, seen = torch.zeros(()), []
+    for views in ([0, 1, 3, 4], [0, 2, 4]):
+        some = batch.inputs.select(views)
+        total = total + written_out(model, step.losses, some, batch.targets) / 2
+        seen.append(model.render(model(some).gaussians, batch.targets.cameras))
+    for name, factor in (("alpha", 0.1), ("depth", 0.2)):
+        one, other = (getattr(rendering, name) for rendering in seen)
+        # half of the gradient that |one - other| has with nothing fixed, its value in full
+        total = total + factor * (one - other).abs().mean() / 2
+    wanted = gradients(step, total)
+    assert furthest(gradients(step, step(batch.inputs, batch.targets).total), wanted) < 1e-5
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
@@ -213,21 +230,21 @@ def test_harmonics_and_features_get_theirs(
 def test_gradients_through_gsplat_do_not_depend_on_it(setting: Setting, render_views: int) -> None:
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     model, losses, *batch = setting("qgs/gsplat")
-    objective = Objective(model, losses, render_views).cuda()
+    objective = TrainingPass(model, losses, render_views).cuda()
     found = error(objective, *(views.to("cuda") for views in batch))
     assert found < 1e-5, "its kernels add in no fixed order"
 
 
 def test_in_float64_they_are_the_same_numbers(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/torch", dtype=torch.float64)
-    assert error(Objective(model, losses, 2), *batch) < 1e-13
+    assert error(TrainingPass(model, losses, 2), *batch) < 1e-13
 
 
 def test_under_autocast_the_gaussians_get_the_same_gradients(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/cpu")
     found: dict[int, dict[str, Tensor]] = {}
     for render_views in (0, 2):
-        objective = Objective(model, losses, render_views)
+        objective = TrainingPass(model, losses, render_views)
         seen = found[render_views] = {}
 
         def note(name: str, value: Mapping[str, Tensor], seen: dict = seen) -> None:
@@ -244,7 +261,7 @@ def test_under_autocast_the_gaussians_get_the_same_gradients(setting: Setting) -
 
 def test_a_scaled_total_scales_every_gradient(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/cpu")
-    objective = Objective(model, losses, 2)
+    objective = TrainingPass(model, losses, 2)
     whole = gradients(objective, objective(*batch).total)
     quarter = gradients(objective, objective(*batch).total / 4)
     assert furthest({n: 4 * g for n, g in quarter.items()}, whole) < 1e-6
@@ -255,7 +272,7 @@ def test_signs_are_those_of_all_views_of_the_last_layer(
     setting: Setting, render_views: int
 ) -> None:
     model, losses, inputs, targets = setting("qgs/cpu")
-    outcome: Outcome = Objective(model, losses, render_views)(inputs, targets)
+    outcome: Outcome = TrainingPass(model, losses, render_views)(inputs, targets)
     with torch.no_grad():
         rendering = model.render(model(inputs).gaussians, targets.cameras)
     background = torch.tensor(model.renderer.config.background)
@@ -269,7 +286,7 @@ def test_signs_are_those_of_all_views_of_the_last_layer(
 def test_without_gradients_it_only_measures(setting: Setting) -> None:
     model, losses, *batch = setting("qgs/cpu")
     with torch.no_grad():
-        outcome = Objective(model, losses, 2)(*batch)
+        outcome = TrainingPass(model, losses, 2)(*batch)
     assert not outcome.total.requires_grad
     assert float(outcome.total) == pytest.approx(float(sum(outcome.terms.values())))
 
@@ -286,6 +303,7 @@ def test_every_shipped_loss_says_which_renderings_it_needs() -> None:
         "visibility": "none",
         "anchor_visibility": "none",
         "opacity": "none",
+        "lpips": "each",
     }
 
 

@@ -23,7 +23,7 @@ def term_of(loss: Loss, golden: dict[str, Tensor], target: Views) -> dict[str, T
     quats = torch.ones(*means.shape[:2], 4)
     gaussians = Gaussians(means, means.abs(), quats, golden["opacity"][..., 0], means.sigmoid())
     rendering = Rendering(golden["images_pred"], alpha, alpha)
-    return loss(LayerPrediction(gaussians, QueryState(means)), rendering, target)
+    return loss(LayerPrediction(gaussians, QueryState(means)), rendering, target, target)
 
 
 def test_mask_is_the_released_one(golden: dict[str, Tensor]) -> None:

@@ -19,7 +19,8 @@ def terms_of(rgb: Tensor, truth: Tensor, **options: object) -> dict[str, Tensor]
     gaussians = Gaussians(nothing, nothing, quats, torch.zeros(batch, 0), nothing)
     loss = Photometric(Photometric.Config(**options))
     prediction = LayerPrediction(gaussians, QueryState(nothing))
-    return loss(prediction, Rendering(rgb, alpha, alpha), Views(truth, cameras))
+    views = Views(truth, cameras)
+    return loss(prediction, Rendering(rgb, alpha, alpha), views, views)
 
 
 def test_valid_ssim_is_the_metric(golden: dict[str, Tensor]) -> None:

@@ -58,7 +58,7 @@ def test_component_weighs_the_mean_over_gaussians(
     images = golden["images_gt"]
     target = Views(images, cameras)
     rendering = Rendering(images, golden["alphas_pred"], golden["alphas_pred"])
-    terms = loss(LayerPrediction(gaussians, QueryState(means)), rendering, target)
+    terms = loss(LayerPrediction(gaussians, QueryState(means)), rendering, target, target)
     near = 0.025 if behind == "invisible" else None
     torch.testing.assert_close(
         terms, {"visibility": 0.1 * view_visibility(means, cameras, behind=near).mean()}

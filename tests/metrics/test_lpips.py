@@ -159,8 +159,8 @@ def loss_and_inputs(weights: object) -> tuple[LpipsLoss, dict[str, Any]]:
 @pytest.mark.usefixtures("package")
 def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg: Path) -> None:
     loss, given = loss_and_inputs(vgg)
-    prediction, rendering, target = given.values()
-    value = loss(prediction, rendering, target)["lpips"]
+    prediction, rendering, target, inputs = given.values()
+    value = loss(prediction, rendering, target, inputs)["lpips"]
     expected = lpips_of(vgg).distance(rendering.rgb, target.images).mean() / 2
     torch.testing.assert_close(value, expected)
     rgb = rendering.rgb.clone().requires_grad_()

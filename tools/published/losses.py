@@ -49,7 +49,7 @@ class LossInputs(TensorContainer):
 
     def value(self, loss: Loss) -> Tensor:
         """The only term of `loss`."""
-        (term,) = loss(self.prediction, self.rendering, self.target).values()
+        (term,) = loss(self.prediction, self.rendering, self.target, self.target).values()
         return term
 
 

@@ -51,8 +51,8 @@ def model_tensors(
         found[f"gaussians_layer.{number}"] = _packed(layer.gaussians)
     if tuned_latents is not None:
         memory = model.encoder(views)
-        other = model.encoder.project(tuned_latents, memory)
-        tuned = model.predict(other, model.queries(memory, views))
+        state = model.queries(memory, views)
+        tuned = model.predict(model.encoder.project(tuned_latents, memory), state)
         found["gaussians_of_tuned_latents"] = _packed(tuned.gaussians)
     return found
 

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from qgs.composer import Recipe
-from qgs.engine.objective import Objective
+from qgs.engine.objective import TrainingPass
 from qgs.engine.parameters import make_optimizer
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
@@ -85,8 +85,7 @@ def make_task(
         for seed, count in enumerate((workload.views, workload.targets))
     )
     if operation == "step":
-        losses, render_views = recipe.build_losses(), recipe.training.render_views
-        objective = Objective(model.train(), losses, render_views).to(workload.device)
+        objective = TrainingPass.of(recipe, model.train()).to(workload.device)
         factors = recipe.rate_factors(objective)
         optimizer = make_optimizer(objective, recipe.build_optimizer(), factors)
 

@@ -16,6 +16,7 @@ class AnchorVisibility(Loss):
     """Mean over queries of `qgs.losses.view_visibility` of their anchor centres (LocusGS)."""
 
     name: ClassVar[str] = "anchor_visibility"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     renderings = "none"
 
     class Config(VisibilityOptions):
@@ -37,7 +38,7 @@ class AnchorVisibility(Loss):
         return config.conflicts()
 
     def forward(
-        self, prediction: LayerPrediction, rendering: Rendering, target: Views
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """One term, `anchor_visibility`."""
         per_anchor = view_visibility(

@@ -30,7 +30,7 @@ def idle_options(cases: Iterable[Case]) -> dict[str, list[str]]:
         before = [*_results(case, inputs)]
         for option in type(case.config).model_fields:
             idle.setdefault(option, [])
-        for option, value, config in (*variants(case.config), *_numbers(case.config)):
+        for option, value, config in (*variants(case.config), *numbers(case.config)):
             other = replace(case, config=config, state_dict=None)
             if option in exercised:
                 continue
@@ -48,7 +48,7 @@ def idle_options(cases: Iterable[Case]) -> dict[str, list[str]]:
     return {option: tried for option, tried in idle.items() if option not in exercised}
 
 
-def _numbers(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
+def numbers(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
     """Whole numbers near each one, half and twice every other, 1/2 and 1 for 0.0, where allowed."""
     chosen = {option: getattr(config, option) for option in config.model_fields_set}
     for option, value in dict(config).items():

@@ -41,7 +41,7 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "head": ("state",),
     "centers": ("offsets", "state"),
     "renderer": ("gaussians", "cameras"),
-    "losses": ("prediction", "rendering", "target"),
+    "losses": ("prediction", "rendering", "target", "inputs"),
 }
 """Arguments of the forward pass of each slot's components, in their order: methods of `Maker`."""
 
@@ -213,6 +213,10 @@ class Maker:
         views = self.views()
         masks = self.uniform(0, 1, *views.images.shape[:2], 1, *self.image).round()
         return replace(views, masks=masks)
+
+    def inputs(self) -> Views:
+        """What a prediction was made from: other pictures than the target's."""
+        return self.target()
 
 
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:

@@ -90,7 +90,7 @@ class SearchesTheFields(NoRefinement):
 class ReadsAnUndeclaredRendering(Loss):
     renderings = "none"
 
-    def forward(self, prediction, rendering, target):
+    def forward(self, prediction, rendering, target, inputs):
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
 
 
@@ -98,7 +98,7 @@ class ReadsAnUndeclaredRendering(Loss):
 class ReadsAFieldOfThePrediction(Loss):
     renderings = "none"
 
-    def forward(self, prediction, rendering, target):
+    def forward(self, prediction, rendering, target, inputs):
         radius = prediction.state.fields.get("anchor.raw_radius")
         small = prediction.gaussians.scales.mean()
         return {"small": small if radius is None else small + radius.mean()}

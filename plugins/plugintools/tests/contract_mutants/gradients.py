@@ -47,9 +47,18 @@ class DetachedLoss(OneTerm):
 class HasATermOfTheTargetAlone(Loss):
     renderings = "each"
 
-    def forward(self, prediction, rendering, target):
+    def forward(self, prediction, rendering, target, inputs):
         error = (rendering.rgb - target.images).square().mean()
         return {"error": error, "contrast": target.images.square().mean()}
+
+
+@mutant("terms_have_gradients", "from the term brightness")
+class HasATermOfTheInputsAlone(Loss):
+    renderings = "each"
+
+    def forward(self, prediction, rendering, target, inputs):
+        error = (rendering.rgb - target.images).square().mean()
+        return {"error": error, "brightness": inputs.images.mean()}
 
 
 @mutant("gradients_match_differences", "in evaluation: Jacobian")

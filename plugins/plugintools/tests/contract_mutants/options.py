@@ -4,7 +4,8 @@ from contract_mutants.mutant import mutant
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 
 from qgs.components import FreeCenters, MlpFeedForward
-from qgs.contracts import ComponentConfig
+from qgs.contracts import ComponentConfig, FieldSpec
+from qgs.losses import Opacity
 
 
 @mutant("config_round_trip", "is read again as", options={"z_offset": 0.3})
@@ -49,3 +50,36 @@ class AppendsToAnOption(MlpFeedForward):
     def __init__(self, config, dims):
         super().__init__(config, dims)
         config.sizes.append(2)
+
+
+@mutant("scheduled_options_are_read_anew", "with `weight: 0.05` set after it was built")
+class ReadsItsWeightOnce(Opacity):
+    def __init__(self, config):
+        super().__init__(config)
+        self.weight = config.weight
+
+    def forward(self, prediction, rendering, target, inputs):
+        opacities = prediction.gaussians.opacities
+        return {"opacity": self.weight * -(opacities + self.config.eps).log().mean()}
+
+
+@mutant(
+    "scheduled_options_are_read_anew",
+    "with `eps: 5.0e-07` set after it was built",
+    also="forward_keeps_no_state",
+)
+class KeepsWhatItMadeOfAnOption(Opacity):
+    scheduled = frozenset({"weight", "eps"})
+    made = None
+
+    def forward(self, prediction, rendering, target, inputs):
+        self.made = self.config.eps if self.made is None else self.made
+        opacities = prediction.gaussians.opacities
+        return {"opacity": self.config.weight * -(opacities + 1e4 * self.made).log().mean()}
+
+
+@mutant("scheduled_options_are_read_anew", "changes what it requires", options={"weight": 0.0})
+class RequiresWhatItsWeightSays(Opacity):
+    @classmethod
+    def requires(cls, config):
+        return {"a.field": FieldSpec((3,))} if config.weight else {}

@@ -36,7 +36,7 @@ class OneTerm(Loss):
     def term(self, prediction: LayerPrediction, rendering: Rendering, target: Views) -> Tensor:
         raise NotImplementedError
 
-    def forward(self, prediction, rendering, target):
+    def forward(self, prediction, rendering, target, inputs):
         return {"term": self.term(prediction, rendering, target)}
 
 

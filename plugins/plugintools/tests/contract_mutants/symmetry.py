@@ -9,6 +9,7 @@ from contract_mutants.slots import ChangedEncoder, OneTerm
 from torch import nn
 
 from qgs.components import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
+from qgs.contracts import Loss
 
 PAINT = "colours_depend_on_the_direction features_are_blended_as_colours"
 """Checks that fail too where colours are not what they are given as."""
@@ -123,6 +124,14 @@ class WeighsTheFirstViewMost(OneTerm):
     def term(self, prediction, rendering, target):
         error = (rendering.rgb - target.images).square().mean((0, 2, 3, 4))
         return (error / torch.arange(1.0, len(error) + 1).to(error)).sum()
+
+
+@mutant("view_permutation", "permuted views, term")
+class ComparesWithTheFirstInput(Loss):
+    renderings = "all"
+
+    def forward(self, prediction, rendering, target, inputs):
+        return {"term": (rendering.rgb - inputs.images[:, :1]).square().mean()}
 
 
 @mutant("world_frame_makes_no_difference", "in a moved world, rgb", also=PAINT)

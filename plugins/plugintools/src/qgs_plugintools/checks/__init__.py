@@ -4,6 +4,7 @@ from qgs_plugintools.checks import (  # noqa: F401
     basics,
     fields,
     gradients,
+    objective,
     options,
     parameters,
     precision,

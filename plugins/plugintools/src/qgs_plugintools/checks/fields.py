@@ -277,7 +277,7 @@ def run_training_step(recipe: Recipe, case: Case, sizes: Sizes | None = None) ->
         for loss in losses.values():
             none = loss.renderings == "none"
             seen = map_tensors(lambda x: x[:, :0], rendering) if none else rendering
-            terms = loss(prediction, seen, target)
+            terms = loss(prediction, seen, target, views)
             _expect_finite("losses", terms)
             total = total + scalar(terms)
     found = gradients(total, dict(model.named_parameters()))

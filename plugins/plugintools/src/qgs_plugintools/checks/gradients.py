@@ -93,7 +93,9 @@ def check_terms_have_gradients(case: Case) -> None:
     for inputs in _draws(case):
         terms = module(*inputs.values())
         zeros = zeros and _are_zero(terms)
-        learned = {name: value for name, value in inputs.items() if name != "target"}
+        learned = {
+            name: value for name, value in inputs.items() if name not in ("target", "inputs")
+        }
         flat = {n for n, x in terms.items() if _are_zero(gradients(x, learned))}
         idle = flat if idle is None else idle & flat
     expect(zeros or not idle, f"no gradient comes from the term {', '.join(sorted(idle or ()))}")

@@ -1,6 +1,7 @@
 """Options: what a user writes is what the component gets."""
 
 from dataclasses import replace
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -10,7 +11,12 @@ from qgs.composer.flow import variants
 from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import ComponentConfig
 from qgs_plugintools.case import Case, expect
-from qgs_plugintools.registry import ALL_SLOTS, check
+from qgs_plugintools.checks.objective import rehearsed
+from qgs_plugintools.exercise import numbers
+from qgs_plugintools.inputs import inputs_of
+from qgs_plugintools.modules import seeded
+from qgs_plugintools.registry import ALL_SLOTS, MODULES, check
+from qgs_plugintools.trees import difference
 
 
 @check(ALL_SLOTS)
@@ -47,6 +53,37 @@ def check_options_are_left_alone(case: Case) -> None:
     own = replace(case, config=case.config.model_copy(deep=True))
     own.build()
     expect(own.config == case.config, f"when it is built, {case.config!r} becomes {own.config!r}")
+
+
+@check(MODULES | {"objective"})
+def check_scheduled_options_are_read_anew(case: Case) -> None:
+    """An option in `scheduled` counts in the next call once it is changed, as if built with it.
+
+    What a component requires and provides does not depend on it.
+    """
+    for option, value, config in numbers(case.config):
+        other = replace(case, config=config, state_dict=None)
+        if option not in case.component.scheduled or other.problems(case.size):
+            continue
+        for what in (case.component.requires, case.component.provides):
+            same = dict(what(config)) == dict(what(case.config))
+            expect(same, f"`{option}: {value}` changes what it {what.__name__}")
+        module = _ready(case)
+        _called(case, module)
+        module.config = config
+        found = difference(_called(case, _ready(other)), _called(case, module))
+        expect(not found, f"with `{option}: {value}` set after it was built, {found}")
+
+
+def _ready(case: Case) -> Any:
+    return case.build() if case.slot == "objective" else case.lively()
+
+
+def _called(case: Case, module: Any) -> Any:
+    if case.slot == "objective":
+        return rehearsed(case, module)
+    with seeded(0):
+        return module(*inputs_of(case).values())
 
 
 def _nested(config: type[BaseModel]) -> set[type[BaseModel]]:

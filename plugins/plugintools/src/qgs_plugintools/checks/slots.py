@@ -176,7 +176,7 @@ def check_renderings_as_declared(case: Case) -> None:
         for view in range(2):
             seen = map_tensors(lambda x, v=view: x[:, v : v + 1], inputs["rendering"])
             target = inputs["target"].select([view])
-            alone.append(module(inputs["prediction"], seen, target))
+            alone.append(module(inputs["prediction"], seen, target, inputs["inputs"]))
         found = difference(_mean(*alone), terms, 1e-4, 1e-6)
         expect(not found, f"`each` is declared; against the mean over views, {found}")
 

@@ -25,7 +25,7 @@ from qgs_plugintools.trees import difference, floating, gradients, leaves, mappe
 
 RTOL, ATOL = 1e-4, 1e-5
 
-VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "target")
+VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "target", "inputs")
 """Arguments that hold something of every view."""
 
 TURN = (0.8, 0.4, -0.2, 0.4)

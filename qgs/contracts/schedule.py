@@ -1,0 +1,148 @@
+"""Options that follow the progress of training: what a recipe writes in place of a number."""
+
+import math
+from abc import abstractmethod
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping
+from types import UnionType
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, Union, get_args, get_origin
+
+from pydantic import ConfigDict, Field, model_validator
+
+from qgs.contracts.component import Component, ComponentConfig, OptionError
+
+ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
+Step: TypeAlias = Annotated[int, Field(ge=0)]
+END = 2**53
+"""A step after the end of every schedule."""
+
+
+class Schedule(ComponentConfig):
+    """A number as a function of the optimiser steps that were made: 0 in the first step."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    schedule: str
+    """What kind of schedule it is."""
+
+    @abstractmethod
+    def number(self, step: int) -> float:
+        """The number after `step` steps."""
+
+    @property
+    def corners(self) -> tuple[int, ...]:
+        """Steps besides 0 between which the number goes one way: its extremes are at these."""
+        return ()
+
+
+class Constant(Schedule):
+    """One number, as if it were written alone."""
+
+    schedule: Literal["constant"]
+    """One number, as if it were written alone."""
+    value: float
+    """The number."""
+
+    def number(self, step: int) -> float:
+        """See `Schedule`."""
+        return self.value
+
+
+class Steps(Schedule):
+    """`values[0]` first, and each further value from its step on."""
+
+    schedule: Literal["steps"]
+    """A number for each of several ranges of steps."""
+    values: tuple[float, ...]
+    """The numbers, one more than there are steps in `at`."""
+    at: tuple[Step, ...] = Field(min_length=1)
+    """Steps after which the next value holds, ascending."""
+
+    @model_validator(mode="after")
+    def _one_value_more(self) -> Self:
+        steps, count = list(self.at), len(self.values)
+        if steps != sorted(set(steps)):
+            raise OptionError(f"`at` must ascend, got {steps}", f"write {sorted(set(steps))}")
+        if count != len(steps) + 1:
+            reason = f"{len(steps)} steps in `at` part {len(steps) + 1} values, got {count}"
+            raise OptionError(reason, "give one value more than steps; the first holds from 0")
+        return self
+
+    def number(self, step: int) -> float:
+        """See `Schedule`."""
+        return self.values[bisect_right(self.at, step)]
+
+    @property
+    def corners(self) -> tuple[int, ...]:
+        """See `Schedule`."""
+        return self.at
+
+
+class Linear(Schedule):
+    """From one number to another over a range of steps; constant before and after."""
+
+    schedule: Literal["linear", "cosine"]
+    """From one number to another on a line, or on half a cosine, which is slow at both ends."""
+    start: float = Field(alias="from")
+    """The number until the first of the steps in `over`."""
+    end: float = Field(alias="to")
+    """The number from the last of the steps in `over` on."""
+    over: tuple[Step, Step]
+    """[first, last] step of the change."""
+
+    @model_validator(mode="after")
+    def _takes_time(self) -> Self:
+        first, last = self.over
+        if first >= last:
+            reason = f"`over` must be [first, last] with first < last, got [{first}, {last}]"
+            raise OptionError(reason, "for a jump, write `schedule: steps`")
+        return self
+
+    def number(self, step: int) -> float:
+        """See `Schedule`."""
+        first, last = self.over
+        if step <= first or step >= last:
+            return self.start if step <= first else self.end
+        share = (step - first) / (last - first)
+        if self.schedule == "cosine":
+            share = (1 - math.cos(math.pi * share)) / 2
+        return (1 - share) * self.start + share * self.end
+
+    @property
+    def corners(self) -> tuple[int, ...]:
+        """See `Schedule`."""
+        return self.over
+
+
+SCHEDULES: Mapping[str, type[Schedule]] = {
+    "constant": Constant, "steps": Steps, "linear": Linear, "cosine": Linear
+}  # fmt: skip
+"""By the word under `schedule` in a recipe."""
+
+
+def number_kinds(annotation: Any) -> set[type]:
+    """Which of int and float an option of this type can hold; none where it is no number."""
+    if annotation in (int, float):
+        return {annotation}
+    parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
+    return {kind for part in parts for kind in number_kinds(part)}
+
+
+def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
+    """`config` with the numbers after `step` steps, rounded for options that are whole numbers."""
+    fields, numbers = type(config).model_fields, {n: s.number(step) for n, s in schedules.items()}
+    whole = [name for name in numbers if float not in number_kinds(fields[name].annotation)]
+    return config.model_copy(update=numbers | {name: round(numbers[name]) for name in whole})
+
+
+def follow(parts: Iterable[object], step: int) -> None:
+    """Give those of `parts` that are components the options that they have after `step` steps."""
+    for part in parts:
+        if isinstance(part, Component) and part.schedules:
+            part.config, part.followed = at_step(part.config, part.schedules, step), step
+
+
+def steps_followed(parts: Iterable[object]) -> int | None:
+    """The step that `follow` has given `parts`; None where no option follows one."""
+    found = [x.followed for x in parts if isinstance(x, Component) and x.schedules]
+    return found[0] if found else None
