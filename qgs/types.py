@@ -204,11 +204,14 @@ class Views(TensorContainer):
 
     def joined(self, other: Self) -> Self:
         """These views, then `other` ones of the same scenes, of one size, with the same parts."""
-        own, theirs = dict(named_tensors(self)), dict(named_tensors(other))
+        of_views = replace(self, target_time=None)
+        own = dict(named_tensors(of_views))
+        theirs = dict(named_tensors(replace(other, target_time=None)))
         if own.keys() != theirs.keys() or self.cameras.size != other.cameras.size:
             raise ValueError(f"views cannot be joined with others of another kind: {self}, {other}")
         added = iter(theirs.values())
-        return map_tensors(lambda x: torch.cat([x, next(added)], 1), self)
+        both = map_tensors(lambda x: torch.cat([x, next(added)], 1), of_views)
+        return replace(both, target_time=self.target_time)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from qgs.components.decoder import (
     MlpFeedForward,
     NoRefinement,
 )
-from qgs.components.dynamic import BlockCausalSelfAttention, DynamicQueries
+from qgs.components.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
 from qgs.components.latents import LatentBottleneck
@@ -29,6 +29,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     DynamicQueries,
     CrossSelfMlp,
     BlockCausalSelfAttention,
+    DynamicObjective,
     ContentCrossAttention,
     ContentSelfAttention,
     MlpFeedForward,
@@ -49,6 +50,7 @@ __all__ = [
     "ContentSelfAttention",
     "CrossAttentionCore",
     "CrossSelfMlp",
+    "DynamicObjective",
     "DynamicQueries",
     "FreeCenters",
     "GaussianHead",

@@ -15,12 +15,22 @@ from qgs.contracts import (
     Fields,
     FieldSpec,
     ModelDims,
+    Objective,
+    Outcome,
+    Passes,
     Problem,
     Queries,
     RecipeContext,
     SelfAttention,
 )
-from qgs.types import ImageMemory, QueryState, Views
+from qgs.types import (
+    ImageMemory,
+    LayerPrediction,
+    Prediction,
+    QueryState,
+    Views,
+    map_tensors,
+)
 
 MOVES = "dynamic.moves"
 """Whether a query is of the moment that is asked for: True for the dynamic ones."""
@@ -113,6 +123,47 @@ class BlockCausalSelfAttention(SelfAttention):
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
         return self.attention.explain(self.norm(state.features), queries, _readable(state))
+
+
+class DynamicObjective(Objective):
+    """One pass, judged as a whole and again by the Gaussians of its dynamic queries alone."""
+
+    name: ClassVar[str] = "dynamic"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+
+    class Config(ComponentConfig):
+        weight: float = Field(default=0.3, ge=0)
+        """Factor of the second judgement (TokenGS: 0.3 for 5,000 steps, to 0 over 10,000)."""
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return _FIELDS
+
+    def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
+        """The term `dynamic`, besides those of the whole."""
+        prediction = passes.predict(inputs)
+        whole = passes.judge(prediction, targets, inputs)
+        added = torch.zeros_like(whole.total)
+        if self.config.weight:
+            layers = {number: _alone(layer) for number, layer in prediction.layers.items()}
+            last = layers[max(layers)]
+            alone = Prediction(last.gaussians, last.state, layers)
+            added = self.config.weight * passes.judge(alone, targets, inputs).total
+        terms = {**whole.terms, "dynamic": added.detach()}
+        return Outcome(whole.total + added, terms, whole.signs)
+
+
+def _alone(layer: LayerPrediction) -> LayerPrediction:
+    """The dynamic queries of a layer, the same in all scenes, and their Gaussians."""
+    moves_N = layer.state[MOVES][0]
+    each = layer.gaussians.count // len(moves_N)
+    of_gaussians = moves_N.repeat_interleave(each)
+    return LayerPrediction(
+        map_tensors(lambda x: x[:, of_gaussians], layer.gaussians),
+        map_tensors(lambda x: x[:, moves_N], layer.state),
+    )
 
 
 def _readable(state: QueryState) -> Tensor:

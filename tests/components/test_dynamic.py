@@ -1,6 +1,8 @@
 """Scenes that move: the embedding of times, which queries carry them, who reads whom."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,10 +13,14 @@ from qgs import Cameras, Views
 from qgs.components import BlockCausalSelfAttention, DynamicQueries, LatentQueries, MultiViewViT
 from qgs.components.dynamic import MOVES
 from qgs.components.times import TimeEmbedding, time_features
-from qgs.composer import resolve
+from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
+from qgs.contracts.schedule import follow
+from qgs.engine.objective import TrainingPass
 from qgs.model import QueryGaussianModel
-from qgs.types import ImageMemory
+from qgs.types import ImageMemory, LayerPrediction
+
+TOKENGS = Path(__file__).parents[2] / "recipes/tokengs"
 
 DIMS = ModelDims(width=16, heads=2, depth=1)
 MEMORY = ImageMemory(torch.zeros(2, 3, 16))
@@ -138,3 +144,34 @@ def test_what_time_adds_to_the_parameters() -> None:
         "time_embedding.proj.weight",
         "time_embedding.proj.bias",
     }
+
+
+@pytest.mark.parametrize("weight", [0.3, 0.0])
+def test_the_objective_judges_dynamic_gaussians_again(weight: float) -> None:
+    recipe = resolve({**RECIPE, "objective": {"type": "qgs/dynamic", "weight": weight}})
+    reconstruct = model()
+    inputs = views(torch.zeros(2, 2), torch.zeros(2, 1))
+    targets = replace(inputs.select([0]), target_time=None)
+    outcome = TrainingPass.of(recipe, reconstruct)(inputs, targets)
+    gaussians = reconstruct(inputs).gaussians[:, 4 * 2 :]
+    rendering = reconstruct.render(gaussians, targets.cameras)
+    layer = LayerPrediction(gaussians, reconstruct.queries(MEMORY, inputs))
+    terms = [loss(layer, rendering, targets, inputs) for loss in recipe.build_losses().values()]
+    expected = weight * sum(sum(found.values()) for found in terms)
+    torch.testing.assert_close(outcome.terms["dynamic"], torch.as_tensor(expected))
+    torch.testing.assert_close(outcome.total.detach(), sum(outcome.terms.values()))
+
+
+def test_the_published_weight_of_dynamic_gaussians() -> None:
+    objective = resolve(TOKENGS / "dynamic.yaml").build_objective()
+    weights = []
+    for step in (0, 5000, 10_000, 15_000, 20_000):
+        follow([objective], step)
+        weights.append(objective.config.weight)
+    assert weights == pytest.approx([0.3, 0.3, 0.15, 0, 0])
+
+
+def test_static_queries_have_nothing_for_the_objective() -> None:
+    tree = {"recipe": 1, "objective": {"type": "qgs/dynamic"}}
+    with pytest.raises(RecipeError, match=r"`qgs/dynamic` needs dynamic.moves"):
+        resolve(tree)

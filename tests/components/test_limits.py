@@ -164,7 +164,8 @@ def loss_value(kind: str, options: dict[str, Any]) -> Tensor:
     images = torch.zeros(1, 1, 3, 16, 16)
     cameras = Cameras(torch.eye(4)[None, None], torch.tensor([[[16.0, 16, 8, 8]]]), (16, 16))
     rendering = Rendering(images, images[:, :, :1], images[:, :, :1])
-    (term,) = loss(LayerPrediction(gaussians, state), rendering, Views(images, cameras)).values()
+    views = Views(images, cameras)
+    (term,) = loss(LayerPrediction(gaussians, state), rendering, views, views).values()
     return term.detach()
 
 
