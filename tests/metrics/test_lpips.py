@@ -165,10 +165,10 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg: Pat
     torch.testing.assert_close(value, expected)
     rgb = rendering.rgb.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(
-        loss(prediction, replace(rendering, rgb=rgb), target)["lpips"], rgb
+        loss(prediction, replace(rendering, rgb=rgb), target, inputs)["lpips"], rgb
     )
     step = rendering.rgb - 0.01 * gradient / gradient.abs().max()
-    assert loss(prediction, replace(rendering, rgb=step), target)["lpips"] < value
+    assert loss(prediction, replace(rendering, rgb=step), target, inputs)["lpips"] < value
     assert not any(parameter.requires_grad for parameter in loss.parameters())
 
 
