@@ -171,16 +171,20 @@ class Views(TensorContainer):
     """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V).
 
     masks: (B, V, 1, H, W) in [0, 1], 1 where the photo shows what is to be modelled; None for
-    photos without masks.
+    photos without masks. times: (B, V), when each photo was taken; None where nothing moves.
+    target_time: (B, 1), of the scene that is to be reconstructed from them.
     """
 
     images: Tensor
     cameras: Cameras
     masks: Tensor | None = None
+    times: Tensor | None = None
+    target_time: Tensor | None = None
 
     def __post_init__(self) -> None:
         size = dict(zip("HW", self.cameras.size, strict=True))
-        _check_shapes(self, size, images="B V 3 H W", masks="B V 1 H W")
+        shapes = {"images": "B V 3 H W", "masks": "B V 1 H W"}
+        _check_shapes(self, size, **shapes, times="B V", target_time="B 1")
         if not self.images.is_floating_point():
             raise ValueError(
                 f"Views.images must be floating-point numbers in [0, 1], got {self.images.dtype}; "
@@ -193,16 +197,21 @@ class Views(TensorContainer):
             )
 
     def select(self, index: Any) -> Self:
-        """The views at `index` of every scene (a slice or a list of ints)."""
-        return map_tensors(lambda x: x[:, index], self)
+        """The views at `index` of every scene (a slice or a list of ints), of the same time."""
+        of_views = replace(self, target_time=None)
+        chosen = map_tensors(lambda x: x[:, index], of_views)
+        return replace(chosen, target_time=self.target_time)
 
     def joined(self, other: Self) -> Self:
         """These views, then `other` ones of the same scenes, of one size, with the same parts."""
-        own, theirs = dict(named_tensors(self)), dict(named_tensors(other))
+        of_views = replace(self, target_time=None)
+        own = dict(named_tensors(of_views))
+        theirs = dict(named_tensors(replace(other, target_time=None)))
         if own.keys() != theirs.keys() or self.cameras.size != other.cameras.size:
             raise ValueError(f"views cannot be joined with others of another kind: {self}, {other}")
         added = iter(theirs.values())
-        return map_tensors(lambda x: torch.cat([x, next(added)], 1), self)
+        both = map_tensors(lambda x: torch.cat([x, next(added)], 1), of_views)
+        return replace(both, target_time=self.target_time)
 
 
 @dataclass(frozen=True)

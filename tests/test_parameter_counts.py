@@ -37,6 +37,8 @@ OF_LATENTS = LATENTS * D + LAYERS * DECODER_BLOCK + (D * 2 * D + 2 * D) + HEAD_N
 HEAD = D * 64 * 14 + 64 * 14
 
 TOKENGS_2026_6 = 362_695_680
+TIME_EMBEDDING = D * 2 * 8 * 8 + D
+DYNAMIC = TOKENGS_2026_6 + (1024 + 256 - N) * D + 2 * TIME_EMBEDDING
 
 
 def parameters(recipe: str) -> int:
@@ -58,6 +60,11 @@ def test_tokengs_2026_6(views: int, loss: str) -> None:
     encoder = EMBEDDINGS + 12 * ENCODER_BLOCK + READOUT + OF_LATENTS
     assert encoder + N * D + DECODER_BLOCK + HEAD == TOKENGS_2026_6
     assert parameters(f"tokengs/latent_{views}views_{loss}.yaml") == TOKENGS_2026_6
+
+
+def test_dynamic_tokengs() -> None:
+    model = qgs.compose(RECIPES / "tokengs/dynamic.yaml", device="meta")
+    assert sum(parameter.numel() for parameter in model.parameters()) == DYNAMIC == 360_076_288
 
 
 def test_what_locusgs_adds_to_tokengs() -> None:

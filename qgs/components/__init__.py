@@ -9,6 +9,7 @@ from qgs.components.decoder import (
     MlpFeedForward,
     NoRefinement,
 )
+from qgs.components.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
 from qgs.components.latents import LatentBottleneck
@@ -25,7 +26,10 @@ COMPONENTS: tuple[type[Component], ...] = (
     MultiscaleViT,
     LatentBottleneck,
     LatentQueries,
+    DynamicQueries,
     CrossSelfMlp,
+    BlockCausalSelfAttention,
+    DynamicObjective,
     ContentCrossAttention,
     ContentSelfAttention,
     MlpFeedForward,
@@ -41,10 +45,13 @@ __all__ = [
     "COMPONENTS",
     "NORM_EPS",
     "TOKENGS",
+    "BlockCausalSelfAttention",
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",
     "CrossSelfMlp",
+    "DynamicObjective",
+    "DynamicQueries",
     "FreeCenters",
     "GaussianHead",
     "LatentBottleneck",

@@ -73,22 +73,22 @@ class SelfAttentionCore(nn.Module):
         )
         return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
-    def forward(self, x_BTD: Tensor, mask_BT: Tensor | None = None) -> Tensor:
-        """(B, T, D). mask: False for tokens that nobody reads."""
+    def forward(self, x_BTD: Tensor, mask: Tensor | None = None) -> Tensor:
+        """(B, T, D). mask: (B, T), False for tokens that nobody reads; or (B, T, T), for each."""
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
-        mask = None if mask_BT is None else mask_BT[:, None, None]
+        mask = None if mask is None else _by_head(mask if mask.ndim == 3 else mask[:, None])
         read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask)
         return self.proj(merge_heads(read_BhTd))
 
     def explain(
-        self, x_BTD: Tensor, queries: Tensor, mask_BT: Tensor | None = None
+        self, x_BTD: Tensor, queries: Tensor, mask: Tensor | None = None
     ) -> AttentionWeights:
         """Attention of the tokens with indices `queries` (Q,), with the mask as in `forward`."""
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
         bias_B1QT = None
-        if mask_BT is not None:
-            hidden_BT = torch.where(mask_BT, 0.0, -torch.inf)
-            bias_B1QT = hidden_BT[:, None, None].expand(-1, -1, len(queries), -1)
+        if mask is not None:
+            each = mask[:, None].expand(-1, x_BTD.shape[1], -1) if mask.ndim == 2 else mask
+            bias_B1QT = torch.where(each[:, None, queries], 0.0, -torch.inf)
         return attention_weights(q_BhTd[:, :, queries], k_BhTd, bias_B1QT)
 
 

@@ -9,6 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
+from qgs.components.times import TimeEmbedding
 from qgs.contracts import ComponentConfig, Encoder, ModelDims, Problem, RecipeContext
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
@@ -66,14 +67,21 @@ class PatchViT(Encoder):
         """Hidden width of the MLPs (rounded down) over the model's width."""
         layer_scale: float = Field(default=0.01, gt=0)
         """Initial value of every LayerScale factor of the encoder."""
+        time_channels: int = Field(default=0, ge=0, multiple_of=2)
+        """Numbers that the time of a photo is embedded as; 0 for photos without times."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Added to the variance by every LayerNorm."""
+
+    config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.patch_size, eps = config.patch_size, config.norm_eps
         self.rgb_embedding = PatchEmbedding(3, dims.width, config.patch_size, eps)
         self.ray_embedding = PatchEmbedding(6, dims.width, config.patch_size, eps)
+        if config.time_channels:
+            channels, patch = config.time_channels, config.patch_size
+            self.time_embedding = TimeEmbedding(channels, dims.width, patch)
         self.blocks = nn.ModuleList(
             EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale, eps)
             for _ in range(config.depth)
@@ -111,11 +119,21 @@ class PatchViT(Encoder):
             )
         return view_count, height // self.patch_size, width // self.patch_size
 
-    def embed(self, images: Tensor, plucker: Tensor) -> Tensor:
-        """Images (B, V, 3, H, W) in [0, 1] and Plücker maps (B, V, 6, H, W) -> (B, M, D)."""
-        x_XPD = self.rgb_embedding(imagenet_normalised(images).flatten(0, 1))
+    def embed(self, views: Views, plucker: Tensor) -> Tensor:
+        """Views (B, V) and their Plücker maps (B, V, 6, H, W) -> (B, M, D).
+
+        Raises ValueError for views without times where these are to be embedded.
+        """
+        x_XPD = self.rgb_embedding(imagenet_normalised(views.images).flatten(0, 1))
         x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
-        return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=images.shape[0])
+        if self.config.time_channels:
+            if views.times is None:
+                raise ValueError(
+                    "this encoder reads the times of photos and these have none: give the views "
+                    "times (B, V), or set model.encoder.time_channels to 0"
+                )
+            x_XPD = x_XPD + self.time_embedding(views.times).flatten(0, 1)[:, None]
+        return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=len(views.images))
 
 
 class MultiViewViT(PatchViT):
@@ -132,7 +150,7 @@ class MultiViewViT(PatchViT):
     def forward(self, views: Views) -> ImageMemory:
         """The memory of all views; raises ValueError when the patch does not divide the images."""
         grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
-        x_BMD = self.embed(views.images, plucker_BV6HW)
+        x_BMD = self.embed(views, plucker_BV6HW)
         for block in self.blocks:
             x_BMD = block(x_BMD)
         x_BMD = self.norm(x_BMD)

@@ -87,7 +87,7 @@ class LatentBottleneck(MultiscaleReadout):
         Raises ValueError when the patch does not divide the images.
         """
         self.grid(views)
-        x_BMC = self.features(views.images, plucker_rays(views.cameras))
+        x_BMC = self.features(views, plucker_rays(views.cameras))
         k_BhMd, v_BhMd = keys_and_values(x_BMC, self.feature_kv_proj, self.feature_k_norm)
         x_BLD = self.latents.expand(len(x_BMC), -1, -1)
         for block in self.latent_blocks:

@@ -57,9 +57,9 @@ class MultiscaleReadout(PatchViT):
                 f"set depth to {last}, or let blocks end with {config.depth}",
             )
 
-    def features(self, images: Tensor, plucker: Tensor) -> Tensor:
-        """Images and Plücker maps as in `embed` -> (B, M, S D), the first chosen block first."""
-        x_BMD, outputs = self.embed(images, plucker), []
+    def features(self, views: Views, plucker: Tensor) -> Tensor:
+        """Views and Plücker maps as in `embed` -> (B, M, S D), the first chosen block first."""
+        x_BMD, outputs = self.embed(views, plucker), []
         for number, block in enumerate(self.blocks, start=1):
             x_BMD = block(x_BMD)
             if number in self.read:
@@ -87,7 +87,7 @@ class MultiscaleViT(MultiscaleReadout):
     def forward(self, views: Views) -> ImageMemory:
         """Features (B, M, S D); raises ValueError when the patch does not divide the images."""
         grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
-        x_BMC = self.features(views.images, plucker_BV6HW)
+        x_BMC = self.features(views, plucker_BV6HW)
         keys, values = keys_and_values(x_BMC, self.kv_proj, self.k_norm)
         rays = patch_rays(plucker_BV6HW, self.patch_size)
         return ImageMemory(x_BMC, keys, values, rays, grid)

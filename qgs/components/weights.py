@@ -17,6 +17,7 @@ from qgs.contracts.weights import (
 ENCODER = "enc_dec_backbone.encoder."
 DECODER = "enc_dec_backbone.decoder_blocks."
 READOUT = "enc_dec_backbone.multiscale_norms."
+DYNAMIC, TIME, TARGET_TIME = "gs_tokens_dynamic", "patch_time_embed", "patch_time_embed_tgt"
 LATENTS = "enc_dec_backbone.latents"
 LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
@@ -48,6 +49,9 @@ BACKBONE_RENAMES = (
 """Names that TokenGS and the models built on it share."""
 
 LATENT_RENAMES = (
+    Rename("encoder.time_embedding.", "patch_time_embed."),
+    Rename("queries.time_embedding.", "patch_time_embed_tgt."),
+    Rename("queries.dynamic", DYNAMIC),
     Rename("encoder.norms.{}.", READOUT + "{}."),
     Rename("encoder.latents", LATENTS),
     Rename("encoder.feature_kv_proj.", "enc_dec_backbone.latent_feature_kv_proj."),
@@ -68,7 +72,7 @@ LATENT_RENAMES = (
         )
     ),
 )
-"""Names of the encoders of TokenGS 2026.6: the readout of several blocks, the latent bottleneck."""
+"""Names in TokenGS 2026.6: times, dynamic queries, the readout of several blocks, latents."""
 
 READ_OPTIONS = (
     "model.width",
@@ -77,11 +81,14 @@ READ_OPTIONS = (
     "model.encoder.patch_size",
     "model.encoder.depth",
     "model.encoder.mlp_ratio",
+    "model.encoder.time_channels",
     "model.encoder.blocks",
     "model.encoder.latents",
     "model.encoder.latent_depth",
     "model.queries.type",
     "model.queries.count",
+    "model.queries.dynamic",
+    "model.queries.time_channels",
     "model.decoder.depth",
     "model.decoder.cross_attention.type",
     "model.decoder.self_attention.type",
@@ -135,6 +142,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "self_attention": {"type": "qgs/content"},
         "refinement": {"type": "qgs/none"},
     }
+    _read_times(shapes, model)
     model["head"] |= {"scale_input_limit": None, "quat_eps": 1e-12}
     unlimited = {"input_limit": None, "output_limit": None}
     model["centers"] = {"type": "qgs/free", "z_offset": 0.0 if later else 1.0, **unlimited}
@@ -142,6 +150,24 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     tree: dict[str, Any] = {"recipe": 1, "model": model}
     tree |= {"views": {"frame": "mean_cam"}} if later else {}
     return tree | ({"evaluation": {"tuning": "latents"}} if LATENTS in shapes else {})
+
+
+def _read_times(shapes: Shapes, model: dict[str, Any]) -> None:
+    """Change `model` to what reads the times of photos, and to queries of the moment asked for."""
+
+    def channels(module: str) -> int:
+        name = f"{module}.proj.weight"
+        return size_at(shapes, name, 1) if name in shapes else 0
+
+    model["encoder"] |= {"time_channels": channels(TIME)}
+    dynamic = size_at(shapes, DYNAMIC, 0) if DYNAMIC in shapes else 0
+    if dynamic:
+        model["decoder"]["self_attention"] = {"type": "qgs/block_causal"}
+    if dynamic or channels(TARGET_TIME):
+        count, patch = model["queries"]["count"] + dynamic, model["encoder"]["patch_size"]
+        sizes = {"count": count, "dynamic": dynamic, "patch_size": patch}
+        times = {"time_channels": channels(TARGET_TIME)}
+        model["queries"] = {"type": "qgs/dynamic", **sizes, **times}
 
 
 def _encoder_of_2026_6(shapes: Shapes, depth: int) -> dict[str, Any]:
@@ -165,9 +191,9 @@ TOKENGS = WeightLayout(
     source="nv-tlabs/TokenGS",
     components={
         "encoder": ("qgs/multiview_vit", "qgs/multiscale_vit", "qgs/latent_bottleneck"),
-        "queries": ("qgs/latent",),
+        "queries": ("qgs/latent", "qgs/dynamic"),
         "cross_attention": ("qgs/content",),
-        "self_attention": ("qgs/content",),
+        "self_attention": ("qgs/content", "qgs/block_causal"),
         "feed_forward": ("qgs/mlp",),
         "refinement": ("qgs/none",),
         "head": ("qgs/gaussian_head",),
@@ -189,4 +215,4 @@ TOKENGS = WeightLayout(
         "scale of the world, losses, renderer, training: the framework's defaults",
     ),
 )
-"""The released TokenGS for posed photos, without its dynamic tokens."""
+"""The released TokenGS, up to 2026.6."""

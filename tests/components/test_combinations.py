@@ -80,7 +80,8 @@ def _recipe(chosen: dict[str, Choice]) -> dict[str, Any]:
     def written(slot: str) -> dict[str, Any]:
         kind, _, config = chosen[slot]
         options = config.model_dump(mode="json")
-        return {"type": kind, **options, **({"count": 6} if slot == "queries" else {})}
+        fewer = {name: count for name, count in (("count", 6), ("dynamic", 2)) if name in options}
+        return {"type": kind, **options, **(fewer if slot == "queries" else {})}
 
     return {
         "recipe": 1,
@@ -155,3 +156,29 @@ def test_every_two_options_run_together_or_are_refused(parts: tuple[Choice, ...]
 @pytest.mark.parametrize("parts", list(product(*CHOICES.values())), ids=_names)
 def test_a_combination_of_options_runs_or_is_refused(parts: tuple[Choice, ...]) -> None:
     test_a_combination_runs_or_is_refused(parts)
+
+
+ENCODERS = {
+    "qgs/multiview_vit": {"depth": 1},
+    "qgs/multiscale_vit": {"depth": 2, "blocks": [1, 2]},
+    "qgs/latent_bottleneck": {"depth": 1, "blocks": [1], "latents": 4, "latent_depth": 1},
+}
+
+
+MET = [p for p in product(*PLAIN.values()) if not _unmet(dict(zip(SLOTS, p, strict=True)))]
+
+
+@pytest.mark.parametrize("parts", MET, ids=_names)
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_an_encoder_runs_with_all_that_need_no_rays(
+    encoder: str, parts: tuple[Choice, ...]
+) -> None:
+    chosen = dict(zip(SLOTS, parts, strict=True))
+    recipe = _recipe(chosen)
+    recipe["model"]["encoder"] = {"type": encoder, **ENCODERS[encoder]}
+    needed = chosen["cross_attention"][1].requires(chosen["cross_attention"][2])
+    if encoder == "qgs/latent_bottleneck" and "memory.patch_rays" in needed:
+        with pytest.raises(RecipeError, match=r"needs memory.patch_rays .*qgs/latent_bottleneck"):
+            resolve(recipe)
+    else:
+        run_training_step(resolve(recipe), Case(chosen["queries"][2]))

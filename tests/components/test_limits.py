@@ -51,6 +51,12 @@ READ = "depth: 1, blocks: [1], layer_scale: 0.5"
 MULTISCALE = f"model.encoder={{type: qgs/multiscale_vit, {READ}}}"
 LATENTS = f"model.encoder={{type: qgs/latent_bottleneck, latents: 5, latent_depth: 1, {READ}}}"
 
+DYNAMIC = (
+    *CONTENT,
+    "model.queries={type: qgs/dynamic, count: 8, dynamic: 3, std: 1.0, time_channels: 0}",
+    f"{OWN}={{type: qgs/block_causal}}", f"{REFINE}={{type: qgs/none}}", FREE,
+)  # fmt: skip
+
 LIMITS: list[tuple[str, tuple[str, ...], float, float, tuple[str, ...]]] = [
     ("multiview_vit", ("model.encoder.norm_eps",), 1e-5, 0.1, ()),
     ("multiscale_vit", ("model.encoder.norm_eps",), 1e-5, 0.1, (MULTISCALE,)),
@@ -67,6 +73,7 @@ LIMITS: list[tuple[str, tuple[str, ...], float, float, tuple[str, ...]]] = [
     ("anchor_aware", (f"{OWN}.norm_eps",), 1e-5, 0.1, ()),
     ("content", (f"{CROSS}.norm_eps",), 1e-5, 0.1, tuple(CONTENT)),
     ("content", (f"{OWN}.norm_eps",), 1e-5, 0.1, tuple(CONTENT)),
+    ("block_causal", (f"{OWN}.norm_eps",), 1e-5, 0.1, DYNAMIC),
     ("mlp", (f"{FEED}.norm_eps",), 1e-5, 0.1, ()),
     ("refine", (f"{REFINE}.input_limit",), 100.0, 0.01, ()),
     ("refine", (f"{REFINE}.output_limit",), 1000.0, 0.01, ()),
@@ -157,7 +164,8 @@ def loss_value(kind: str, options: dict[str, Any]) -> Tensor:
     images = torch.zeros(1, 1, 3, 16, 16)
     cameras = Cameras(torch.eye(4)[None, None], torch.tensor([[[16.0, 16, 8, 8]]]), (16, 16))
     rendering = Rendering(images, images[:, :, :1], images[:, :, :1])
-    (term,) = loss(LayerPrediction(gaussians, state), rendering, Views(images, cameras)).values()
+    views = Views(images, cameras)
+    (term,) = loss(LayerPrediction(gaussians, state), rendering, views, views).values()
     return term.detach()
 
 

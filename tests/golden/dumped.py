@@ -1,7 +1,7 @@
 """Files like the golden ones, of other sizes and options, computed by our models in float64."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ OF_KIND = {
     "tokengs": "tokengs_a",
     "latent": "tokengs_latent_a",
     "multiscale": "tokengs_multiscale_a",
+    "dynamic": "tokengs_dynamic_a",
     "locusgs": "locus_full_a",
 }
 
@@ -57,6 +58,9 @@ def write(path: Path, config: dict[str, Any], sizes: Sizes) -> Path:
         torch.manual_seed(0)
         model = perturbed(recipe.build_model().eval(), sizes.saturation)
         views = random_views(sizes, config["options"]["img_size"])
+        if config["options"].get("time_embedding"):
+            times = torch.rand(sizes.batch, sizes.views + 1)
+            views = replace(views, times=times[:, 1:], target_time=times[:, :1])
         tuned = torch.randn_like(model.encoder(views).features) if model.encoder.tunable else None
     weights = {name: tensor.clone() for name, tensor in unique_tensors(model).items()}
     published = exact_names_of(recipe).to_published(weights)
@@ -68,7 +72,8 @@ def write(path: Path, config: dict[str, Any], sizes: Sizes) -> Path:
     tensors |= {name: tensor.float() for name, tensor in computed.items()}
     tensors |= {"rgb": views.images, "c2w": views.cameras.c2w}
     tensors["intrinsics"] = views.cameras.intrinsics
-    tensors |= {} if tuned is None else {"tuned_latents": tuned}
+    optional = {"tuned_latents": tuned, "times": views.times, "target_time": views.target_time}
+    tensors |= {name: tensor for name, tensor in optional.items() if tensor is not None}
     outputs = sorted(set(computed) - {"images", "rays_o", "rays_d", "plucker"})
     save(path, tensors, config | {"outputs": outputs})
     return path

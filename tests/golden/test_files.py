@@ -12,6 +12,7 @@ VARIANTS = (
     "anchor_offset", "center_only_bias", "content_cross_attn", "content_self_attn",
     "free_center", "full", "no_radius_state", "static_radius",
 )  # fmt: skip
+OPTIONAL_INPUTS = {"tuned_latents", "times", "target_time"}
 INPUTS = {"c2w", "intrinsics", "rgb"}
 LOSS_INPUTS = {
     "alphas_pred", "c2w", "has_mask", "images_gt", "images_pred", "intrinsics", "masks_gt",
@@ -21,7 +22,7 @@ LOSS_INPUTS = {
 
 def test_the_published_files_are_all_here() -> None:
     names = [*(f"locus_{variant}_a" for variant in VARIANTS), "loss_a", "tokengs_a"]
-    names += [f"tokengs_{kind}_a" for kind in ("latent", "multiscale")]
+    names += [f"tokengs_{kind}_a" for kind in ("dynamic", "latent", "multiscale")]
     assert [path.stem for path in FILES] == sorted(names)
 
 
@@ -29,7 +30,7 @@ def test_the_published_files_are_all_here() -> None:
 def test_every_tensor_of_a_golden_file(path: Path) -> None:
     rows = parity.rows_of(path)
     assert [row for row in rows if row.problem] == []
-    inputs = LOSS_INPUTS if path.stem == "loss_a" else {*INPUTS, "tuned_latents"}
+    inputs = LOSS_INPUTS if path.stem == "loss_a" else {*INPUTS, *OPTIONAL_INPUTS}
     with safe_open(path, "pt") as file:
         compared = {name for name in file.keys() if not name.startswith("weights.")} - inputs  # noqa: SIM118
     assert {row.name for row in rows} == compared

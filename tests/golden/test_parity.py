@@ -56,16 +56,22 @@ LATENT = {"num_latents": 9, "latent_cross_attn_depth": 3}
         ("multiscale", {"enc_depth": 5, "multiscale_encoder_layers": [4, 0, 3]}),
         ("latent", {"enc_depth": 4, "multiscale_encoder_layers": [0, 1, 3], **LATENT}),
         ("latent", {"enc_depth": 2, "use_multiscale_encoder": False, **LATENT}),
+        ("dynamic", {"num_dynamic_gs_tokens": 2, "time_embedding_dim": 4, **LATENT}),
+        ("dynamic", {"num_dynamic_gs_tokens": 0, "use_latent_bottleneck": False}),
+        ("dynamic", {"time_embedding": False, "use_latent_bottleneck": False}),
     ],
 )
 @pytest.mark.parametrize("sizes", [(1, 1), (2, 3)], ids=str)
 def test_tokengs_of_2026_6_of_another_size(
     tmp_path: Path, kind: str, changes: dict[str, Any], sizes: tuple[int, int]
 ) -> None:
-    config = metadata(kind, **{**BIGGER, "dec_depth": 1, **changes}, dec_patch_size=3)
+    sized = {**BIGGER, "enc_depth": 3, "dec_depth": 1, **changes}
+    config = metadata(kind, **sized, dec_patch_size=3)
     path = write(tmp_path / "file", config, Sizes(*sizes))
     names = {row.name for row in parity.rows_of(path)}
-    assert ("gaussians_of_tuned_latents" in names) == (kind == "latent")
+    bottleneck = config["options"]["use_latent_bottleneck"]
+    assert ("gaussians_of_tuned_latents" in names) == bottleneck
+    assert ("time_embedding_target" in names) == config["options"]["time_embedding"]
     assert problems(path) == {}
 
 

@@ -66,8 +66,18 @@ LATENT = [
     ({"use_multiscale_encoder": False}, {"encoder.blocks": [4]}),
     ({"use_latent_bottleneck": False}, {"encoder.type": "qgs/multiscale_vit"}),
 ]
+DYNAMIC = [
+    (
+        {"num_dynamic_gs_tokens": 3},
+        {"queries.count": 15, "queries.dynamic": 3, "queries.type": "qgs/dynamic"},
+    ),
+    ({"num_dynamic_gs_tokens": 0}, {"decoder.self_attention.type": "qgs/content"}),
+    ({"time_embedding_dim": 6}, {"encoder.time_channels": 6, "queries.time_channels": 6}),
+    ({"time_embedding": False}, {"encoder.time_channels": 0, "queries.time_channels": 0}),
+]
 CASES = [("tokengs", *case) for case in TOKENGS] + [("locusgs", *case) for case in LOCUSGS]
 CASES += [("multiscale", *case) for case in MULTISCALE] + [("latent", *case) for case in LATENT]
+CASES += [("dynamic", *case) for case in DYNAMIC]
 
 
 @pytest.mark.parametrize(("kind", "options", "says"), CASES, ids=str)

@@ -25,14 +25,15 @@ Rays and frames (both papers): Plücker ray of a pixel | ray of a patch | as use
     world frame | scale of the world | scale of the world, automatic | mirroring
 Encoder (TokenGS): images | tokens | block | keys and values |
     several blocks | latents
-Decoder layer (TokenGS): queries | cross-attention | self-attention | MLP | residual
+Decoder layer (TokenGS): queries | cross-attention | self-attention | MLP | residual |
+    a time | self-attention, dynamic
 Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-attention |
     self-attention | PE | refinement | means | means, ablation
 Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in features |
     refinement | means | Gaussians in the anchor's frame
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation
     | colour along a direction d | rendering
-Objective (both papers): photometric | L1, LPIPS | visibility | visibility of anchors |
+Objective (both papers): photometric | L1, LPIPS | dynamic | visibility | visibility of anchors |
     over layers | weight decay | schedule | token tuning | refinement |
     depth of a pixel | splitting a Gaussian | growing queries
 Evaluation: PSNR | SSIM | LPIPS | token dispersion

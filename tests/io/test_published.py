@@ -34,9 +34,9 @@ def small(tree: dict[str, Any], *overrides: str) -> Recipe:
     return resolve(tree, [*SMALL, "model.supervision.layers=[2]", *overrides])
 
 
-@pytest.mark.parametrize("file", ["tokengs_a", "tokengs_latent_a", "tokengs_multiscale_a"])
+@pytest.mark.parametrize("file", ["a", "latent_a", "multiscale_a", "dynamic_a"])
 def test_names_survive_both_ways(file: str) -> None:
-    weights = published(file)
+    weights = published(f"tokengs_{file}")
     recipe = resolve(TOKENGS.read(shapes_of(weights)))
     ours = names_of(recipe).from_published(weights)
     back = exact_names_of(recipe).to_published(ours)
@@ -44,10 +44,10 @@ def test_names_survive_both_ways(file: str) -> None:
     assert all(back[name] is weights[name] for name in weights)
 
 
-LATENT_PRESETS = [f"{views}views_{loss}" for views in (2, 4, 6) for loss in ("ssim", "lpips")]
+LATENT_PRESETS = [f"latent_{n}views_{loss}" for n in (2, 4, 6) for loss in ("ssim", "lpips")]
 
 
-@pytest.mark.parametrize("preset", LATENT_PRESETS)
+@pytest.mark.parametrize("preset", [*LATENT_PRESETS, "dynamic"])
 @pytest.mark.parametrize(
     "sizes",
     [
@@ -60,8 +60,10 @@ LATENT_PRESETS = [f"{views}views_{loss}" for views in (2, 4, 6) for loss in ("ss
 def test_a_latent_checkpoint_gives_the_recipe_of_its_preset(
     preset: str, sizes: dict[str, Any]
 ) -> None:
+    if sizes and preset == "dynamic":
+        sizes = {**sizes, "queries.dynamic": 2, "queries.patch_size": 4}
     overrides = [f"model.{option}={value}" for option, value in sizes.items()]
-    recipe = resolve(RECIPES / f"tokengs/latent_{preset}.yaml", overrides)
+    recipe = resolve(RECIPES / f"tokengs/{preset}.yaml", overrides)
     names = exact_names_of(recipe)
     theirs = names.published_shapes()
     assert theirs["enc_dec_backbone.latents"] == (

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from published.options import ReleasedOptions
-from published.tokengs import OF_2026_6, backbone, query_options
+from published.tokengs import OF_2026_6, OF_MOTION, backbone, query_options
 
 UNSUPPORTED_BUT = {
     "geo_sparse_sampling_k": 0,
@@ -30,7 +30,7 @@ def locusgs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     Raises ReleasedOptionError for options that are missing or not understood.
     """
     released = ReleasedOptions(options)
-    released.only({**UNSUPPORTED_BUT, **OF_2026_6})
+    released.only({**UNSUPPORTED_BUT, **OF_2026_6, **OF_MOTION})
     model = backbone(released)
     model["head"]["gaussians_per_query"] = released.count("num_gaussians_per_token")
     model["queries"] = _queries(released)

@@ -19,6 +19,7 @@ RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "locusgs": locusgs_recipe,
 }
 
+TIMES = ("times", "target_time")
 TUNED = "tuned_latents"
 LAST_NORM, READ_NORM = "enc_dec_backbone.encoder_norm.", "enc_dec_backbone.multiscale_norms.0."
 DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
@@ -37,8 +38,10 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
         weights = {name.replace(LAST_NORM, READ_NORM): x for name, x in weights.items()}
     model.load_state_dict(names_of(recipe).from_published(weights), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
+    times = (golden.input(name) if name in golden.tensors else None for name in TIMES)
+    views = Views(golden.input("rgb"), cameras, None, *times)
     tuned = golden.input(TUNED) if TUNED in golden.tensors else None
-    return model_tensors(model, Views(golden.input("rgb"), cameras), tuned)
+    return model_tensors(model, views, tuned)
 
 
 def recipe_of(golden: GoldenFile) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from qgs.components import CrossSelfMlp, LatentBottleneck
 from qgs.components.encoder import PatchViT, imagenet_normalised
+from qgs.components.times import time_features
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, Views
@@ -37,6 +38,10 @@ def model_tensors(
         "rays_d": directions.movedim(-1, -3),
         "plucker": plucker_rays(views.cameras),
     }
+    for name, times in (("input", views.times), ("target", views.target_time)):
+        channels = getattr(model.encoder.config, "time_channels", 0)
+        if times is not None and channels:
+            found[f"time_embedding_{name}"] = time_features(times, channels)
     with ExitStack() as stack:
         for handle in _Recorder(model, found).handles():
             stack.callback(handle.remove)

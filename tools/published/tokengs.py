@@ -5,13 +5,11 @@ from typing import Any
 
 from published.options import ReleasedOptions
 
-UNSUPPORTED_BUT = {"num_dynamic_gs_tokens": 0, "time_embedding": False}
-"""Parts of the release that no recipe can express."""
-
 FRAMES = ("first_cam", "mean_cam")
 
 OF_2026_6 = {"use_multiscale_encoder": False, "use_latent_bottleneck": False}
-"""Encoders that LocusGS's release does not have."""
+OF_MOTION = {"num_dynamic_gs_tokens": 0, "time_embedding": False}
+"""Parts of the release that LocusGS's does not have."""
 
 
 def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -29,6 +27,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
         "quat_eps": 1e-12,
     }
     model["queries"] = {"type": "qgs/latent", **query_options(released)}
+    model |= motion_options(released, model)
     model["centers"] = {
         "type": "qgs/free",
         "z_offset": released.number("gaussian_z_offset"),
@@ -43,7 +42,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
 def backbone(options: ReleasedOptions) -> dict[str, Any]:
     """What TokenGS and LocusGS share: sizes, encoder, decoder depth, scale cap."""
     width = options.count("enc_embed_dim")
-    options.only({**UNSUPPORTED_BUT, "token_dim": width})
+    options.only({"token_dim": width})
     return {
         "width": width,
         "heads": options.count("enc_num_heads"),
@@ -54,6 +53,24 @@ def backbone(options: ReleasedOptions) -> dict[str, Any]:
         },
         "decoder": {"depth": options.count("dec_depth")},
         "head": {"scale_cap": options.number("gaussian_scale_cap")},
+    }
+
+
+def motion_options(options: ReleasedOptions, model: dict[str, Any]) -> dict[str, Any]:
+    """The parts of `model` that times and dynamic tokens change."""
+    dynamic, timed = (name in options and options[name] for name in OF_MOTION)
+    if not (dynamic or timed):
+        return {}
+    count = options.count("num_dynamic_gs_tokens")
+    channels = options.count("time_embedding_dim") if options.flag("time_embedding") else 0
+    queries = {**model["queries"], "type": "qgs/dynamic", "dynamic": count}
+    queries |= {"count": queries["count"] + count, "time_channels": channels}
+    queries |= {"patch_size": model["encoder"]["patch_size"]}
+    own = {"self_attention": {"type": "qgs/block_causal"}} if count else {}
+    return {
+        "encoder": {**model["encoder"], "time_channels": channels},
+        "queries": queries,
+        "decoder": {**model["decoder"], **own},
     }
 
 

@@ -155,9 +155,12 @@ class Maker:
         return Cameras(c2w, lens.clone(), (height, width)).to(self.case.device)
 
     def views(self) -> Views:
-        """Noise pictures."""
-        cameras = self.cameras()
-        return Views(self.uniform(0, 1, *cameras.shape, 3, *cameras.size), cameras)
+        """Noise pictures; they have times where the component embeds these."""
+        cameras, times = self.cameras(), None
+        images = self.uniform(0, 1, *cameras.shape, 3, *cameras.size)
+        if getattr(self.case.config, "time_channels", 0):
+            times = self.uniform(0, 1, *cameras.shape)
+        return Views(images, cameras, None, times, None if times is None else times[:, :1])
 
     def memory(self) -> ImageMemory:
         """An image memory with the rays of the cameras, in patches of PATCH pixels."""
@@ -215,7 +218,7 @@ class Maker:
         """Noise pictures with masks."""
         views = self.views()
         masks = self.uniform(0, 1, *views.images.shape[:2], 1, *self.image).round()
-        return Views(views.images, views.cameras, masks)
+        return replace(views, masks=masks)
 
     def inputs(self) -> Views:
         """What a prediction was made from: other pictures than the target's."""

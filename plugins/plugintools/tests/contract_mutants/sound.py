@@ -177,9 +177,9 @@ class SeesFar(MultiViewViT):
             *(nn.Sequential(nn.Conv2d(i, o, 7, padding=3), nn.Tanh()) for i, o in layers)
         )
 
-    def embed(self, images, plucker):
-        seen = self.stem(images.flatten(0, 1)).unflatten(0, images.shape[:2])
-        return super().embed(seen, plucker)
+    def embed(self, views, plucker):
+        seen = self.stem(views.images.flatten(0, 1)).unflatten(0, views.images.shape[:2])
+        return super().embed(replace(views, images=seen), plucker)
 
 
 @named

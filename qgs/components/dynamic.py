@@ -1,0 +1,173 @@
+"""Queries of scenes that move: static ones, and others of the moment asked for (TokenGS 2026.6)."""
+
+from collections.abc import Iterable
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components.blocks import NORM_EPS, SelfAttentionCore
+from qgs.components.times import TimeEmbedding
+from qgs.contracts import (
+    AttentionWeights,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    ModelDims,
+    Objective,
+    Outcome,
+    Passes,
+    Problem,
+    Queries,
+    RecipeContext,
+    SelfAttention,
+)
+from qgs.types import (
+    ImageMemory,
+    LayerPrediction,
+    Prediction,
+    QueryState,
+    Views,
+    map_tensors,
+)
+
+MOVES = "dynamic.moves"
+"""Whether a query is of the moment that is asked for: True for the dynamic ones."""
+_FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
+
+
+class DynamicQueries(Queries):
+    """N learned vectors, of which the last ones also know the time that is asked for."""
+
+    name: ClassVar[str] = "dynamic"
+
+    class Config(ComponentConfig):
+        count: int = Field(default=1280, ge=1)
+        """N, the number of queries, static and dynamic (TokenGS: 1024 and 256)."""
+        dynamic: int = Field(default=256, ge=0)
+        """Dynamic ones among them, the last; 0 gives all of them the time."""
+        std: float = Field(default=0.02, ge=0)
+        """Standard deviation of the normal distribution that the features start from."""
+        time_channels: int = Field(default=2, ge=0, multiple_of=2)
+        """Numbers that a time is embedded as; 0 for queries that know no time."""
+        patch_size: int = Field(default=8, ge=1)
+        """Side of the patches that embed the time, as published those of the encoder."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        fixed, moving = config.count - config.dynamic, config.dynamic
+        self.features = nn.Parameter(torch.randn(fixed, dims.width) * config.std)
+        if moving:
+            self.dynamic = nn.Parameter(torch.randn(moving, dims.width) * config.std)
+        if config.time_channels:
+            self.time_embedding = TimeEmbedding(config.time_channels, dims.width, config.patch_size)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if config.dynamic >= config.count:
+            yield Problem(
+                "dynamic",
+                f"{config.dynamic} dynamic queries leave none of {config.count} to be static",
+                f"set dynamic to {config.count - 1} or less, or raise count",
+            )
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        return _FIELDS
+
+    @property
+    def count(self) -> int:
+        """N, static and dynamic."""
+        return self.config.count
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """The field `dynamic.moves` (B, N). Raises ValueError for views without a target time."""
+        config, batch = self.config, len(memory.features)
+        parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
+        x_BND = torch.cat(parts).expand(batch, -1, -1)
+        first = len(self.features) if config.dynamic else 0
+        moves_N = torch.arange(config.count, device=x_BND.device) >= first
+        if config.time_channels:
+            if views.target_time is None:
+                raise ValueError(
+                    "qgs/dynamic queries need the time that is asked for: give the input views a "
+                    "target_time (B, 1), or set model.queries.time_channels to 0"
+                )
+            x_BND = x_BND + moves_N[:, None] * self.time_embedding(views.target_time)
+        return QueryState(x_BND, {MOVES: moves_N.expand(batch, -1)})
+
+
+class BlockCausalSelfAttention(SelfAttention):
+    """Dynamic queries read all queries, static ones the static ones alone."""
+
+    name: ClassVar[str] = "block_causal"
+
+    class Config(ComponentConfig):
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return _FIELDS
+
+    def forward(self, state: QueryState) -> Tensor:
+        return self.attention(self.norm(state.features), _readable(state))
+
+    def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
+        return self.attention.explain(self.norm(state.features), queries, _readable(state))
+
+
+class DynamicObjective(Objective):
+    """One pass, judged as a whole and again by the Gaussians of its dynamic queries alone."""
+
+    name: ClassVar[str] = "dynamic"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+
+    class Config(ComponentConfig):
+        weight: float = Field(default=0.3, ge=0)
+        """Factor of the second judgement (TokenGS: 0.3 for 5,000 steps, to 0 over 10,000)."""
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return _FIELDS
+
+    def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
+        """The term `dynamic`, besides those of the whole."""
+        prediction = passes.predict(inputs)
+        whole = passes.judge(prediction, targets, inputs)
+        added = torch.zeros_like(whole.total)
+        if self.config.weight:
+            layers = {number: _alone(layer) for number, layer in prediction.layers.items()}
+            last = layers[max(layers)]
+            alone = Prediction(last.gaussians, last.state, layers)
+            added = self.config.weight * passes.judge(alone, targets, inputs).total
+        terms = {**whole.terms, "dynamic": added.detach()}
+        return Outcome(whole.total + added, terms, whole.signs)
+
+
+def _alone(layer: LayerPrediction) -> LayerPrediction:
+    """The dynamic queries of a layer, the same in all scenes, and their Gaussians."""
+    moves_N = layer.state[MOVES][0]
+    each = layer.gaussians.count // len(moves_N)
+    of_gaussians = moves_N.repeat_interleave(each)
+    return LayerPrediction(
+        map_tensors(lambda x: x[:, of_gaussians], layer.gaussians),
+        map_tensors(lambda x: x[:, moves_N], layer.state),
+    )
+
+
+def _readable(state: QueryState) -> Tensor:
+    """(B, N, N): which queries (rows) may read which."""
+    moves_BN = state[MOVES]
+    readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
+    return readable_BNN if state.mask is None else readable_BNN & state.mask[:, None]

@@ -1,0 +1,36 @@
+"""Times: numbers that a network reads of them (TokenGS 2026.6). Axes: T numbers of a time."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from qgs.geometry.precision import full_precision
+
+
+@full_precision
+def time_features(times: Tensor, channels: int) -> Tensor:
+    """Times (...) -> (..., T): cos, then sin, of t exp(-ln(10000) i / (T/2)), i = 0 … T/2 - 1."""
+    half = channels // 2
+    rates = torch.exp(-math.log(10_000) / half * torch.arange(half).to(times))
+    angles = times[..., None] * rates
+    return torch.cat([angles.cos(), angles.sin()], -1)
+
+
+class TimeEmbedding(nn.Module):
+    """Times (B, V) -> (B, V, D), zeros at first.
+
+    As published a patch embedding, of P x P pixels that all hold the numbers of one time.
+    """
+
+    def __init__(self, channels: int, width: int, patch_size: int) -> None:
+        """channels: T, even."""
+        super().__init__()
+        self.proj = nn.Conv2d(channels, width, kernel_size=patch_size, stride=patch_size)
+        for parameter in self.proj.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, times: Tensor) -> Tensor:
+        numbers = time_features(times, self.proj.in_channels).flatten(0, 1)
+        patches = numbers[..., None, None].expand(-1, -1, *self.proj.kernel_size)
+        return self.proj(patches)[..., 0, 0].unflatten(0, times.shape)
