@@ -11,9 +11,11 @@ from qgs.composer.registry import Registry, component_error, component_failure, 
 from qgs.composer.slots import LAYER_SLOTS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import (
+    GAUSSIAN_FIELDS,
     MEMORY_FIELDS,
     DecoderLayer,
     Encoder,
+    Head,
     Queries,
     Refinement,
     Renderer,
@@ -77,8 +79,8 @@ def _writable(component: type[Component], provided: Fields) -> Collection[str]:
     """Names of the fields among `provided` that a component of this slot can write."""
     if issubclass(component, Queries | DecoderLayer | Refinement):
         return provided
-    if issubclass(component, Encoder):
-        return MEMORY_FIELDS
+    if issubclass(component, Encoder | Head):
+        return MEMORY_FIELDS if issubclass(component, Encoder) else GAUSSIAN_FIELDS
     return Renderer.provides(Renderer.Config()) if issubclass(component, Renderer) else ()
 
 

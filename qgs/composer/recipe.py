@@ -141,7 +141,7 @@ def resolve(
         data = parts.get(("data",))
         source = data.config if data else None
         size = source.image_size if isinstance(source, contracts.SceneSourceConfig) else None
-        context = contracts.RecipeContext(dims, size)
+        context = contracts.RecipeContext(dims, size, settings["views",].inputs if data else None)
         sound = {
             p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
         }

@@ -24,7 +24,7 @@ from qgs.contracts.decoder import (
     SelfAttention,
 )
 from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
-from qgs.contracts.head import Centers, Head
+from qgs.contracts.head import GAUSSIAN_FIELDS, Centers, Head
 from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
 from qgs.contracts.objective import Objective, Outcome, Passes
@@ -37,6 +37,7 @@ from qgs.contracts.weights import LayoutError, Rename, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",
+    "GAUSSIAN_FIELDS",
     "MEMORY_FIELDS",
     "AttentionWeights",
     "Centers",

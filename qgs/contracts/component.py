@@ -74,11 +74,13 @@ class ModelDims:
 class RecipeContext:
     """The rest of a recipe, as far as `Component.problems` sees it.
 
-    image_size: (H, W) of the data's images; None for a recipe without data.
+    image_size: (H, W) of the data's images; None for a recipe without data. inputs: how many input
+    views a training sample has; None likewise.
     """
 
     dims: ModelDims
     image_size: tuple[int, int] | None = None
+    inputs: int | None = None
 
 
 @dataclass(frozen=True)

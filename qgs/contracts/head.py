@@ -6,14 +6,21 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from qgs.contracts.component import ModelComponent
+from qgs.contracts.component import Fields, FieldSpec, ModelComponent
 from qgs.types import GaussianAttributes, QueryState
+
+GAUSSIAN_FIELDS: Fields = {
+    "gaussians.sh": FieldSpec(("C", 3)),
+    "gaussians.features": FieldSpec(("F",)),
+}
+"""What a head may give besides the attributes that every Gaussian has."""
 
 
 class Head(ModelComponent):
     """QueryState -> GaussianAttributes of K Gaussians per query, in the ranges given there.
 
-    They hold with initial parameters too, for features other than zero.
+    They hold with initial parameters too, for features other than zero. A head that gives `sh` or
+    `features` provides those of GAUSSIAN_FIELDS, so that losses which read them can require them.
     """
 
     slot: ClassVar[str] = "head"

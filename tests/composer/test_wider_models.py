@@ -5,23 +5,35 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
+from qgs_plugintools import Case, checks_for, run_check
 from torch import Tensor, nn
 
-from qgs.components import MultiViewViT
+from qgs.components import GaussianHead, MultiViewViT
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import PluginError
 from qgs.contracts import (
     CONTRACT_VERSION,
+    GAUSSIAN_FIELDS,
     MEMORY_FIELDS,
+    Component,
     ComponentConfig,
     DecoderLayer,
     Fields,
     FieldSpec,
+    Loss,
     ModelDims,
     Plugin,
     Queries,
 )
-from qgs.types import Cameras, ImageMemory, QueryState, Views
+from qgs.types import (
+    Cameras,
+    GaussianAttributes,
+    ImageMemory,
+    LayerPrediction,
+    QueryState,
+    Rendering,
+    Views,
+)
 
 FEATURES = {"memory.features": MEMORY_FIELDS["memory.features"]}
 
@@ -104,7 +116,39 @@ class WideQueries(TokenQueries):
         return QueryState(self.norm(memory.features[..., :16]))
 
 
-COMPONENTS = (TokenQueries, BrightQueries, JointLayer, BlindEncoder, WideQueries)
+class FeatureLoss(Loss):
+    """The rendered features, which a head must give."""
+
+    name: ClassVar[str] = "features"
+    renderings = "each"
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return {"gaussians.features": GAUSSIAN_FIELDS["gaussians.features"]}
+
+    def forward(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
+    ) -> dict[str, Tensor]:
+        assert rendering.features is not None
+        return {"features": rendering.features.square().mean()}
+
+
+class FeatureHead(GaussianHead):
+    """Gaussians that carry the first two features of their query."""
+
+    name: ClassVar[str] = "carrying"
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        return {"gaussians.features": GAUSSIAN_FIELDS["gaussians.features"]}
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        x_BNK2 = state.features[:, :, None, :2].repeat(1, 1, self.gaussians_per_query, 1)
+        return replace(super().forward(state), features=x_BNK2)
+
+
+OF_PHOTOS = (TokenQueries, BrightQueries, JointLayer, BlindEncoder, WideQueries)
+COMPONENTS = (*OF_PHOTOS, FeatureLoss, FeatureHead)
 PLUGIN = Plugin("other", CONTRACT_VERSION, COMPONENTS)
 NO_LAYERS = {"depth": 0}
 
@@ -268,3 +312,18 @@ def test_a_layer_that_forgets_the_memory_is_reported() -> None:
     model = resolve(wanted, plugins=[plugin]).build_model()
     with pytest.raises(PluginError, match="returns QueryState, not a QueryState and an ImageM"):
         model(views())
+
+
+@pytest.mark.parametrize("component", [FeatureLoss, FeatureHead])
+def test_features_of_gaussians_keep_the_contract(component: type[Component]) -> None:
+    case = Case(component.Config())
+    results = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert not [result.message for result in results if not result.ok]
+
+
+def test_a_loss_on_features_needs_a_head_that_gives_them() -> None:
+    wanted = {**recipe(), "losses": {"mine": {"type": "other/features"}}}
+    with pytest.raises(RecipeError, match=r"(?s)needs gaussians.features .*slot `head`"):
+        resolve(wanted, plugins=[PLUGIN])
+    wanted["model"]["head"]["type"] = "other/carrying"
+    assert resolve(wanted, plugins=[PLUGIN])

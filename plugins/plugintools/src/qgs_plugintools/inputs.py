@@ -85,7 +85,7 @@ def tracked_inputs(case: Case, inputs: Inputs) -> Inputs:
 def required_fields(case: Case) -> dict[str, FieldSpec]:
     """The fields of the state of the queries that the case requires."""
     required = case.component.requires(case.config)
-    elsewhere = ("memory.", "rendering.")
+    elsewhere = ("memory.", "rendering.", "gaussians.")
     return {n: spec for n, spec in required.items() if not n.startswith(elsewhere)}
 
 
@@ -189,10 +189,14 @@ class Maker:
             opacities=self.uniform(0.2, 0.9, *shape),
             colors=self.uniform(0, 1, *shape, 3),
         )
-        if self.case.slot != "renderer":
-            return plain
-        sh = 0.1 * self.normal(*shape, SH_COUNTS[1], 3)
-        return replace(plain, sh=sh, features=self.uniform(0, 1, *shape, 4))
+        sh = 0.1 * self.normal(*shape, SH_COUNTS[1], 3) if self.gives("sh") else None
+        features = self.uniform(0, 1, *shape, 4) if self.gives("features") else None
+        return replace(plain, sh=sh, features=features)
+
+    def gives(self, name: str) -> bool:
+        """Whether Gaussians have `sh` or `features`: for a renderer, and what requires them."""
+        required = self.case.component.requires(self.case.config)
+        return self.case.slot == "renderer" or f"gaussians.{name}" in required
 
     def prediction(self) -> LayerPrediction:
         """Gaussians, and the state they are said to come from."""
@@ -206,7 +210,9 @@ class Maker:
             views = 0 if loss.renderings == "none" else self.sizes.views
         shape = (self.sizes.batch, views)
         rgb, alpha = (self.uniform(0, 1, *shape, c, *self.image) for c in (3, 1))
-        return Rendering(rgb, alpha, self.uniform(1, 2, *shape, 1, *self.image))
+        depth = self.uniform(1, 2, *shape, 1, *self.image)
+        features = self.uniform(0, 1, *shape, 4, *self.image) if self.gives("features") else None
+        return Rendering(rgb, alpha, depth, features)
 
     def target(self) -> Views:
         """Noise pictures with masks."""

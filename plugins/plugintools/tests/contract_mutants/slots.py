@@ -330,3 +330,9 @@ class ExplainsToFewTokens(ContentCrossAttention):
 class IgnoresTheMask(ContentSelfAttention):
     def forward(self, state):
         return self.attention(self.norm(state.features))
+
+
+@mutant("head_gives_gaussians", "gives {'features'}, and provides None")
+class GivesFeaturesUntold(GaussianHead):
+    def activate(self, raw):
+        return replace(super().activate(raw), features=1 * raw[..., :2])

@@ -6,12 +6,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from qgs.components import LatentQueries, MultiViewViT
+from qgs.components import GaussianHead, LatentQueries, MultiViewViT
 from qgs.composer import RecipeError
 from qgs.composer.recipe import Recipe, resolve
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.contracts import (
     CONTRACT_VERSION,
+    GAUSSIAN_FIELDS,
     MEMORY_FIELDS,
     Component,
     ComponentConfig,
@@ -21,7 +22,14 @@ from qgs.contracts import (
     Loss,
     Plugin,
 )
-from qgs.types import ImageMemory, LayerPrediction, QueryState, Views, map_tensors
+from qgs.types import (
+    GaussianAttributes,
+    ImageMemory,
+    LayerPrediction,
+    QueryState,
+    Views,
+    map_tensors,
+)
 from qgs_plugintools.case import Case, expect
 from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
 from qgs_plugintools.modules import each_mode, seeded
@@ -108,14 +116,18 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
 
 @check(READERS)
 def check_requires_are_read(case: Case) -> None:
-    """Every field in `requires` is read: else recipes that lack it are refused for nothing."""
+    """Every field in `requires` is read: else recipes that lack it are refused for nothing.
+
+    Features of Gaussians may be read off their rendering.
+    """
     module, inputs = case.lively(), inputs_of(case)
     outputs = module(*inputs.values())
     for field in case.component.requires(case.config):
-        full = next(name for name in leaves(inputs) if name.endswith(field))
-        others = [leaves(inputs_of(case, seed=seed))[full] for seed in (1, 2, 3)]
-        others.append(leaves(inputs)[full].roll(1, 1))  # rays are the same for every seed
-        changed = [mapped(inputs, lambda n, x, o=o, f=full: o if n == f else x) for o in others]
+        rendered = f"rendering.{field.removeprefix('gaussians.')}"
+        full = {name for name in leaves(inputs) if name.endswith((field, rendered))}
+        others = [leaves(inputs_of(case, seed=seed)) for seed in (1, 2, 3)]
+        others.append(leaves(map_tensors(lambda x: x.roll(1, 1), inputs)))  # rays have no seed
+        changed = [mapped(inputs, lambda n, x, o=o, f=full: o[n] if n in f else x) for o in others]
         read = any(difference(outputs, module(*given.values())) for given in changed)
         expect(read, f"it requires {field}, which changes nothing")
 
@@ -190,7 +202,30 @@ def _resolved(case: Case, given: Fields) -> Recipe:
     if features and features != MEMORY_FIELDS["memory.features"]:
         components.append(_encoder_with(case, features))
         recipe["model"]["encoder"]["type"] = f"{PLUGIN}/{GIVEN}"
+    look = {n: s for n, s in case.component.requires(case.config).items() if n in GAUSSIAN_FIELDS}
+    if look:
+        components.append(_head_with(look))
+        recipe["model"]["head"]["type"] = f"{PLUGIN}/{GIVEN}"
     return resolve(recipe, plugins=(Plugin(PLUGIN, CONTRACT_VERSION, components),))
+
+
+def _head_with(look: Fields) -> type[Component]:
+    """A head whose Gaussians have harmonics or features, read off those of the queries."""
+
+    class GivenHead(GaussianHead):
+        name: ClassVar[str] = GIVEN
+
+        @classmethod
+        def provides(cls, config: ComponentConfig) -> Fields:
+            return look
+
+        def forward(self, state: QueryState) -> GaussianAttributes:
+            x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
+            parts = {"sh": x_BNKD[..., :9].unflatten(-1, (3, 3)), "features": x_BNKD[..., :4]}
+            chosen = {name: x for name, x in parts.items() if f"gaussians.{name}" in look}
+            return replace(super().forward(state), **chosen)
+
+    return GivenHead
 
 
 def _encoder_with(case: Case, spec: FieldSpec) -> type[Component]:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError, gradcheck
 from torch.func import functional_call
 
+from qgs.contracts import GAUSSIAN_FIELDS
 from qgs_plugintools.case import Case, expect
 from qgs_plugintools.inputs import (
     QUERY_INPUTS,
@@ -69,7 +70,7 @@ def _read(case: Case) -> Iterable[str]:
     state = "prediction.state" if case.slot == "losses" else "state"
     fields = required_fields(case)
     for name, spec in case.component.requires(case.config).items():
-        if spec.dtype.is_floating_point:
+        if spec.dtype.is_floating_point and name not in GAUSSIAN_FIELDS:  # may be read rendered
             yield f"{state}.fields.{name}" if name in fields else name
 
 

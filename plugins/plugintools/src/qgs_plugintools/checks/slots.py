@@ -44,8 +44,10 @@ Patch = tuple[int, int, int]  # view, row and column
 def check_head_gives_gaussians(case: Case) -> None:
     """Quaternions are unit, scales positive, opacities inside (0, 1), colours inside [0, 1].
 
-    With initial parameters too, for ordinary features.
+    With initial parameters too, for ordinary features. `sh` and `features` are there if the head
+    provides them.
     """
+    told = {name.removeprefix("gaussians.") for name in case.component.provides(case.config)}
     modules = [(case.build(), 1.0, "with initial parameters,")]
     modules += [(case.lively(), f, f"for features times {f:g}") for f in (0.0, 1.0, 100.0)]
     state = inputs_of(case)["state"]
@@ -53,6 +55,10 @@ def check_head_gives_gaussians(case: Case) -> None:
         for mode in each_mode(module):
             with seeded(0), torch.no_grad():
                 out = module(state.replace(factor * state.features))
+            given = {name for name in ("sh", "features") if getattr(out, name) is not None}
+            expect(
+                given == told, f"in {mode} it gives {given or None}, and provides {told or None}"
+            )
             _expect_valid(out, factor > 1, f"in {mode}, {where}")
 
 
