@@ -46,10 +46,10 @@ def tuning_settings(tune: str | None) -> list[str]:
     """
     if tune is None:
         return []
-    match = re.fullmatch(r"(queries|latents)?:?(\d+)?", tune)
-    if match is None or not tune.strip(":") or tune.endswith(":"):
+    match = re.fullmatch(r"(?:(queries|latents):)?(\d+)|(queries|latents)", tune)
+    if match is None:
         raise ValueError(f"--tune must be STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
-    what, steps = match.groups()
+    what, steps = match[1] or match[3], match[2]
     settings = [f"evaluation.tuning_steps={steps or 50}"]
     return [*settings, *([f"evaluation.tuning={what}"] if what else [])]
 

@@ -12,6 +12,7 @@ from rich.console import Console
 
 import qgs
 from qgs.cli.evaluate import evaluation_folder
+from qgs.cli.options import tuning_settings
 from qgs.composer import resolve
 from qgs.engine.training import train
 
@@ -175,3 +176,26 @@ def test_averaged_weights_of_a_run_are_told(runs: Path, tmp_path: Path) -> None:
     assert hint in evaluated(run, *few).output
     assert hint not in evaluated(run / "checkpoint_ema.safetensors", *few).output
     assert hint not in evaluated(runs / "locus", *few, "--out", tmp_path / "out").output
+
+
+@pytest.mark.parametrize(
+    ("tune", "steps", "what"),
+    [
+        ("7", 7, []),
+        ("0", 0, []),
+        ("latents", 50, ["evaluation.tuning=latents"]),
+        ("queries:20", 20, ["evaluation.tuning=queries"]),
+    ],
+)
+def test_tune_says_what_and_how_often(tune: str, steps: int, what: list[str]) -> None:
+    assert tuning_settings(tune) == [f"evaluation.tuning_steps={steps}", *what]
+
+
+@pytest.mark.parametrize("tune", ["", ":", ":5", "latents:", "tokens:5", "-3", "5:latents"])
+def test_what_tune_cannot_be(tune: str) -> None:
+    with pytest.raises(ValueError, match=r"--tune must be STEPS, queries\[:STEPS\] or"):
+        tuning_settings(tune)
+
+
+def test_no_tune_sets_nothing() -> None:
+    assert tuning_settings(None) == []
