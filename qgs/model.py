@@ -3,7 +3,7 @@
 import os
 from collections.abc import Collection, Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,7 @@ from qgs.types import (
     Gaussians,
     ImageMemory,
     LayerPrediction,
+    Photos,
     Prediction,
     QueryState,
     Rendering,
@@ -87,7 +88,7 @@ class QueryGaussianModel(nn.Module):
 
     def forward(
         self,
-        views: Views,
+        views: Views | Photos,
         layers: Collection[int] | None = None,
         state: QueryState | None = None,
     ) -> Prediction:
@@ -95,13 +96,26 @@ class QueryGaussianModel(nn.Module):
 
         layers: see `predict`. state: the initial state; None for that of the queries.
         In evaluation, a warning tells once what of `views` is not as it was in training.
+        Raises ValueError for photos without cameras where the encoder or the queries read them.
         """
-        if not (self.training or self._warned or torch.compiler.is_compiling()):
+        if isinstance(views, Photos):
+            views = self._without_cameras(views)
+        elif not (self.training or self._warned or torch.compiler.is_compiling()):
             settings = (self.recipe or {}).get("views")
             self._warned = warn_of_unlike(views, settings, self.trained_on)
         memory = self.encoder(views)
         initial = self.queries(memory, views) if state is None else state
         return self.predict(memory, initial, layers)
+
+    def _without_cameras(self, photos: Photos) -> Views:
+        """The photos as what encoder and queries are given; ValueError if these read cameras."""
+        readers = [type(x).__name__ for x in (self.encoder, self.queries) if x.reads_cameras]
+        if readers:
+            raise ValueError(
+                f"{' and '.join(readers)} of this model read cameras, and these photos have none; "
+                "give Views with cameras, or take an encoder that does without (reads_cameras)"
+            )
+        return cast(Views, photos)
 
     def reconstruct(
         self, photos: "str | os.PathLike[str] | Views", **options: Any

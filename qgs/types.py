@@ -134,6 +134,15 @@ def _check_shapes(
         sizes.update(zip(axes, given, strict=True))
 
 
+def _check_unit_images(views: Any) -> None:
+    """Raise ValueError for images that are no floating-point numbers."""
+    if not views.images.is_floating_point():
+        raise ValueError(
+            f"{type(views).__name__}.images must be floating-point numbers in [0, 1], got "
+            f"{views.images.dtype}; divide 8-bit images by 255: `images.float() / 255`"
+        )
+
+
 @dataclass(frozen=True)
 class Cameras(TensorContainer):
     """Pinhole cameras of one image size.
@@ -167,6 +176,22 @@ class Cameras(TensorContainer):
 
 
 @dataclass(frozen=True)
+class Photos(TensorContainer):
+    """Photos of unknown cameras, for models whose encoder and queries do without.
+
+    images: (B, V, 3, H, W) in [0, 1]. times, target_time: as of `Views`.
+    """
+
+    images: Tensor
+    times: Tensor | None = None
+    target_time: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _check_shapes(self, images="B V 3 H W", times="B V", target_time="B 1")
+        _check_unit_images(self)
+
+
+@dataclass(frozen=True)
 class Views(TensorContainer):
     """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V).
 
@@ -185,11 +210,7 @@ class Views(TensorContainer):
         size = dict(zip("HW", self.cameras.size, strict=True))
         shapes = {"images": "B V 3 H W", "masks": "B V 1 H W"}
         _check_shapes(self, size, **shapes, times="B V", target_time="B 1")
-        if not self.images.is_floating_point():
-            raise ValueError(
-                f"Views.images must be floating-point numbers in [0, 1], got {self.images.dtype}; "
-                "divide 8-bit images by 255: `images.float() / 255`"
-            )
+        _check_unit_images(self)
         if self.images.shape[:2] != self.cameras.shape:
             raise ValueError(
                 f"Views.images has {tuple(self.images.shape[:2])} scenes and views, "

@@ -26,11 +26,13 @@ class Encoder(ModelComponent):
 
     ordered_views: whether the order of the views matters. Otherwise, permuting the views permutes
     the tokens.
+    reads_cameras: whether it reads `views.cameras`. One that does not may be given `Photos`.
     tunable: whether `project` makes a memory of other features, which tuning at test time needs.
     """
 
     slot: ClassVar[str] = "encoder"
     ordered_views: ClassVar[bool] = False
+    reads_cameras: ClassVar[bool] = True
     tunable: ClassVar[bool] = False
 
     @classmethod

@@ -20,9 +20,12 @@ class Queries(ModelComponent):
     Spatial fields are float32 in the world frame, (B, N, ...). Queries that read the memory say
     which parts of it they need in `requires`, as `memory.features`. Scenes are independent; a
     state whose scenes have different numbers of queries has a mask.
+
+    reads_cameras: whether they read `views.cameras`. Those that do not may be given `Photos`.
     """
 
     slot: ClassVar[str] = "queries"
+    reads_cameras: ClassVar[bool] = True
 
     @property
     @abstractmethod
@@ -55,6 +58,8 @@ class Queries(ModelComponent):
 
 class LearnedQueries(Queries):
     """Queries that start from parameters alone: the same in all scenes, whatever the photos."""
+
+    reads_cameras = False
 
     @property
     @abstractmethod

@@ -5,10 +5,11 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
-from qgs_plugintools import Case, checks_for, run_check
+from qgs_plugintools import CHECKS, Case, checks_for, run_check
 from torch import Tensor, nn
 
 from qgs.components import GaussianHead, MultiViewViT
+from qgs.components.encoder import keys_and_values
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import PluginError
 from qgs.contracts import (
@@ -30,6 +31,7 @@ from qgs.types import (
     GaussianAttributes,
     ImageMemory,
     LayerPrediction,
+    Photos,
     QueryState,
     Rendering,
     Views,
@@ -327,3 +329,37 @@ def test_a_loss_on_features_needs_a_head_that_gives_them() -> None:
         resolve(wanted, plugins=[PLUGIN])
     wanted["model"]["head"]["type"] = "other/carrying"
     assert resolve(wanted, plugins=[PLUGIN])
+
+
+class PictureEncoder(MultiViewViT):
+    """An encoder that looks at pictures alone."""
+
+    name: ClassVar[str] = "pictures"
+    reads_cameras = False
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        return {n: spec for n, spec in MEMORY_FIELDS.items() if n != "memory.patch_rays"}
+
+    def forward(self, views: Views) -> ImageMemory:
+        x_XPD = self.rgb_embedding(views.images.flatten(0, 1))
+        x_BMD = self.norm(x_XPD.reshape(len(views.images), -1, self.dims.width))
+        keys, values = keys_and_values(x_BMD, self.kv_proj, self.k_norm)
+        return ImageMemory(x_BMD, keys, values)
+
+
+def test_photos_need_cameras_only_where_they_are_read() -> None:
+    plugin = Plugin("blind", CONTRACT_VERSION, (PictureEncoder,))
+    wanted = {**recipe(encoder={"type": "blind/pictures", "patch_size": 8}), "plugins": ["blind"]}
+    model = resolve(wanted, plugins=[plugin]).build_model().eval()
+    given = views()
+    torch.testing.assert_close(
+        model(Photos(given.images)).gaussians.means, model(given).gaussians.means
+    )
+    with pytest.raises(ValueError, match="MultiViewViT of this model read cameras, and these"):
+        made()(Photos(given.images))
+    with pytest.raises(ValueError, match=r"Photos.images must have shape \(B, V, 3, H, W\)"):
+        Photos(given.images[0])
+    case = Case(PictureEncoder.Config(depth=0))
+    check = CHECKS["unread_cameras_make_no_difference"]
+    assert run_check(check, case).verdict == "passed"

@@ -336,3 +336,8 @@ class IgnoresTheMask(ContentSelfAttention):
 class GivesFeaturesUntold(GaussianHead):
     def activate(self, raw):
         return replace(super().activate(raw), features=1 * raw[..., :2])
+
+
+@mutant("unread_cameras_make_no_difference", "has no attribute 'cameras'")
+class ReadsCamerasUntold(MultiViewViT):
+    reads_cameras = False

@@ -12,16 +12,18 @@ from torch import Tensor, nn
 
 from qgs.contracts import (
     AttentionWeights,
+    Encoder,
     LearnedQueries,
     Loss,
     Metric,
     MetricInput,
     Optimizer,
     ParameterGroup,
+    Queries,
     Split,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views, map_tensors
+from qgs.types import GaussianAttributes, ImageMemory, Photos, QueryState, Views, map_tensors
 from qgs.wording import listed
 from qgs_plugintools.case import CannotCheck, Case, expect
 from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of
@@ -533,3 +535,16 @@ def _explanation(module: Any, inputs: Inputs) -> AttentionWeights | None:
     """Attention of all queries, None for a component that does not explain itself."""
     with torch.no_grad():
         return module.explain(*inputs.values(), torch.arange(inputs["state"].features.shape[1]))
+
+
+@check({"encoder", "queries"})
+def check_unread_cameras_make_no_difference(case: Case) -> None:
+    """What declares `reads_cameras = False` gives the same without any cameras."""
+    component = case.component
+    if not issubclass(component, Encoder | Queries) or component.reads_cameras:
+        raise CannotCheck("it reads cameras")
+    module, inputs = case.lively(), inputs_of(case)
+    views = inputs["views"]
+    bare = Photos(views.images, views.times, views.target_time)
+    found = difference(module(*inputs.values()), module(*{**inputs, "views": bare}.values()))
+    expect(not found, f"without cameras, {found}")
