@@ -48,7 +48,7 @@ class VggtFeatures(Encoder):
     """Tokens of VGGT's last layer, without those of cameras and registers (C3G).
 
     It reads images alone, no cameras. Where the model's width is not 2048, a linear layer leads to
-    it. Weights are not read again where a checkpoint has them.
+    it. A checkpoint has all weights, so that only a model that starts needs the file.
     """
 
     name: ClassVar[str] = "vggt_features"
@@ -62,6 +62,7 @@ class VggtFeatures(Encoder):
         VGGT was trained."""
 
     config: Config
+    has_weights: Tensor  # of VGGT, from the file or a checkpoint
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -69,10 +70,9 @@ class VggtFeatures(Encoder):
             self.aggregator = _aggregator_class()()
         own = dims.width == WIDTH
         self.proj = nn.Identity() if own else nn.Linear(WIDTH, dims.width)
-        self.unready = ""
-        if next(self.aggregator.parameters()).device.type != "meta":
-            self.unready = self._load(Path(config.weights).expanduser())
-            self.aggregator.register_load_state_dict_post_hook(self._loaded)
+        on_meta = next(self.aggregator.parameters()).is_meta
+        self.unready = "" if on_meta else self._load(Path(config.weights).expanduser())
+        self.register_buffer("has_weights", torch.tensor(not self.unready))
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
@@ -93,7 +93,7 @@ class VggtFeatures(Encoder):
 
         Raises MissingExtraError without weights, ValueError for images of other sizes.
         """
-        if self.unready:
+        if self.unready and not self.has_weights:
             raise MissingExtraError(f"the encoder c3g/vggt_features cannot be used: {self.unready}")
         count, _, height, width = views.images.shape[1:]
         if height % PATCH or width % PATCH:
@@ -122,11 +122,6 @@ class VggtFeatures(Encoder):
         except Exception as error:  # whatever torch and safetensors raise about a damaged file
             return f"{file.name} does not hold VGGT's weights ({type(error).__name__}: {error})"
         return ""
-
-    def _loaded(self, module: nn.Module, keys: Any) -> None:
-        """A checkpoint that has all weights makes the file needless."""
-        if not any("aggregator." in name for name in keys.missing_keys):
-            self.unready = ""
 
 
 def _of_aggregator(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
