@@ -16,6 +16,7 @@ import qgs
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.registry import load_registry
 from qgs.contracts.schedule import follow
+from qgs.types import named_tensors
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 
@@ -58,12 +59,12 @@ def test_the_dilation_is_divided_by_3_every_1000_steps(step: int) -> None:
 
 def test_the_tiny_recipe_has_the_budget_of_the_others() -> None:
     ours, others = (resolve(RECIPES / f"tiny/{name}.yaml") for name in ("c3g", "locus"))
-    for section in ("data", "views", "optimizer", "evaluation"):
+    for section in ("data", "views", "evaluation"):
         assert ours.tree.get(section) == others.tree.get(section)
+    unread = {"encoder.kv_proj": 0, "encoder.k_norm": 0}
+    assert ours.tree["optimizer"] == {**others.tree["optimizer"], "parts": unread}
     assert ours.tree["training"] == {**others.tree["training"], "judge_inputs": True}
-    model, tokengs = (
-        qgs.compose(RECIPES / f"tiny/{n}.yaml", device="meta") for n in ("c3g", "tokengs")
-    )
+    model = qgs.compose(RECIPES / "tiny/c3g.yaml", device="meta")
     assert model.queries.count * model.head.gaussians_per_query == 2048
     ratio = sizes("tiny/c3g.yaml")["all"] / sizes("tiny/tokengs.yaml")["all"]
     assert 0.9 < ratio < 1.1
@@ -188,6 +189,22 @@ def test_layers_of_both_kinds_may_alternate() -> None:
     }
     model = ran(recipe({**OWN_LAYER, "layers": {"1": second}}, queries=ANCHORED)).build_model()
     assert [type(layer).__name__ for layer in model.decoder] == ["JointLayer", "CrossSelfMlp"]
+
+
+@pytest.mark.parametrize("name", ["tiny/c3g", "c3g/re10k"])
+def test_every_parameter_that_trains_is_read(name: str) -> None:
+    """Processes that train together wait for a gradient of each of them."""
+    small = ("width=16", "heads=2", "queries.count=6", "decoder.depth=2", "supervision.layers=[2]")
+    composed = resolve(RECIPES / f"{name}.yaml", [f"model.{option}" for option in small])
+    model = composed.build_model().train()
+    factors = composed.rate_factors(model)
+    case = Case(CASE.config, image_size=(28, 28) if "re10k" in name else (16, 16))
+    views = Maker(case, Sizes(), torch.Generator().manual_seed(0)).views()
+    gaussians = model(views).gaussians
+    torch.stack([x.sum() for _, x in named_tensors(gaussians)]).sum().backward()
+    unread = {name for name, p in model.named_parameters() if p.grad is None}
+    assert unread == {name for name, factor in factors.items() if factor == 0}
+    assert len(unread) == 4
 
 
 def test_it_learns() -> None:
