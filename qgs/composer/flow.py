@@ -87,11 +87,14 @@ def _writable(component: type[Component], provided: Fields) -> Collection[str]:
 def without_idle_sublayers(parts: Parts, depth: int, problems: Problems) -> Parts:
     """`parts` without what stands in slots that no layer has; what is written there is reported.
 
-    Around a layer that could not be decoded nothing is known to be idle.
+    A template that some layers read is idle in none. Around a layer that could not be decoded
+    nothing is known to be idle.
     """
     kept, told = dict(parts), set[str]()
     decoder = ("model", "decoder")
     places = [(*decoder, "layers", str(index)) for index in range(depth)]
+    classes: list[Any] = [part.component for place in places if (part := parts[(*place, "layer")])]
+    read = {(*decoder, name) for component in classes for name in component.sublayers}
     for place in places:
         layer = parts[(*place, "layer")]
         if layer is None:
@@ -100,7 +103,12 @@ def without_idle_sublayers(parts: Parts, depth: int, problems: Problems) -> Part
         for name in SUBLAYER_SLOTS:
             if name not in has.sublayers:
                 idle = kept.pop((*place, name))
-                if idle and idle.place.node is not None and idle.path not in told:
+                if (
+                    idle
+                    and idle.place.node is not None
+                    and idle.place.source not in read
+                    and idle.path not in told
+                ):
                     told.add(idle.path)
                     reason = f"`{layer.type}` ({layer.chosen_at}) has no slot `{name}`"
                     fix = f"remove it; `{name}: null` drops one that is inherited"

@@ -247,9 +247,10 @@ def _put_decoder(tree: "_Tree", parts: Mapping[KeyPath, Chosen]) -> None:
     for name in LAYER_SLOTS:
         if (*decoder, name) not in parts:
             continue
-        alike = [(part.type, part.options) for path, part in layers.items() if path[-1] == name]
+        standing = [part for path, part in layers.items() if path[-1] == name]
+        alike = [(part.type, part.options) for part in standing]
         same = alike.count(alike[0]) == len(alike)
-        template = parts[(*decoder, "layers", "0", name) if same else (*decoder, name)]
+        template = standing[0] if same else parts[(*decoder, name)]
         tree.put_component((*decoder, name), template)
         templates[name] = (template.type, template.options)
     for path, part in layers.items():

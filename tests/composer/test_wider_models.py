@@ -265,6 +265,20 @@ def test_one_layer_may_be_of_another_build() -> None:
     assert model(views()).gaussians.count == 4096 * 2
 
 
+@pytest.mark.parametrize("joint", ["0", "1"])
+def test_a_decoder_of_two_builds_resolves_to_itself(joint: str) -> None:
+    """Its template fills slots that one of the layers lacks, which is idle in that layer alone."""
+    layers = {joint: {"layer": {"type": "other/joint"}}}
+    chosen = {"type": "qgs/mlp", "ratio": 2.0}
+    given = recipe(decoder={"depth": 2, "feed_forward": chosen, "layers": layers})
+    first = resolve(given, plugins=[PLUGIN]).tree
+    assert first["model"]["decoder"]["feed_forward"]["ratio"] == 2.0
+    assert resolve(first, plugins=[PLUGIN]).tree == first
+    layers[joint] = {**layers[joint], "feed_forward": chosen}
+    (told,) = refused(decoder={"depth": 2, "layers": layers})
+    assert told.startswith(f"model.decoder.layers.{joint}.feed_forward: `other/joint` ")
+
+
 def test_a_decoder_without_layers_refuses_what_would_stand_in_them() -> None:
     told = refused(decoder={"depth": 0, "feed_forward": {"ratio": 2}}, supervision={"layers": [0]})
     reason = "a decoder of depth 0 has no layers, so nothing reads it"

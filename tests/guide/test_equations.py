@@ -31,6 +31,7 @@ Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-at
     self-attention | PE | refinement | means | means, ablation
 Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in features |
     refinement | means | Gaussians in the anchor's frame
+Joint attention (C3G): joint layer | Gaussian of a query | mean of it | image tokens
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation
     | colour along a direction d | rendering
 Objective (both papers): photometric | L1, LPIPS | dynamic | visibility | visibility of anchors |

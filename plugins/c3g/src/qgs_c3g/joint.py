@@ -1,0 +1,87 @@
+"""`c3g/joint`: a decoder layer in which image tokens and queries attend to each other.
+
+Axes: T = M + N tokens, those of the images first.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components import NORM_EPS, Mlp
+from qgs.components.blocks import merge_heads, split_heads
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    ComponentConfig,
+    DecoderLayer,
+    Fields,
+    ModelComponent,
+    ModelDims,
+)
+from qgs.types import ImageMemory, QueryState
+
+
+class JointLayer(DecoderLayer):
+    """Self-attention over [image tokens; queries], then an MLP; both change (C3G).
+
+    x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)). There is no LayerScale:
+    `decoder.layer_scale` has no effect on this layer. Keys, values and rays of the memory stay.
+    """
+
+    name: ClassVar[str] = "joint"
+
+    class Config(ComponentConfig):
+        mlp_ratio: float = Field(default=2.0, ge=1)
+        """Hidden width of the MLP (rounded down) over the model's width."""
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
+
+    config: Config
+
+    def __init__(
+        self,
+        config: Config,
+        dims: ModelDims,
+        sublayers: Mapping[str, ModelComponent],
+        layer_scale: float,
+    ) -> None:
+        super().__init__(config, dims, sublayers, layer_scale)
+        width = dims.width
+        self.norm = nn.LayerNorm(width, config.norm_eps)
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+        self.proj = nn.Linear(width, width)
+        self.mlp_norm = nn.LayerNorm(width, config.norm_eps)
+        self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        """Image tokens of the model's width."""
+        return {"memory.features": MEMORY_FIELDS["memory.features"]}
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        """Weight decay on all (C3G release)."""
+        return True
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        """Queries and image tokens that have read each other; nobody reads a masked query."""
+        tokens = memory.features.shape[1]
+        x_BTD = torch.cat([memory.features, state.features], 1)
+        x_BTD = x_BTD + self.attention(self.norm(x_BTD), state.mask)
+        x_BTD = x_BTD + self.mlp(self.mlp_norm(x_BTD))
+        return state.replace(x_BTD[:, tokens:]), replace(memory, features=x_BTD[:, :tokens])
+
+    def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
+        """softmax(q k / sqrt(d)) v over all tokens but masked queries, (B, T, D)."""
+        q_BhTd, k_BhTd, v_BhTd = (
+            split_heads(part_BTD, self.dims.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
+        )
+        mask_B11T = None
+        if mask_BN is not None:
+            images = x_BTD.shape[1] - mask_BN.shape[1]
+            mask_B11T = F.pad(mask_BN, (images, 0), value=True)[:, None, None]
+        read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask_B11T)
+        return self.proj(merge_heads(read_BhTd))
