@@ -164,6 +164,12 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
         fields |= {name: (spec, chosen) for name, spec in provided if name not in missing}
 
 
+def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
+    """Whether a component requires keys or values of the image memory."""
+    read = {name for part in parts.values() for name in part.component.requires(part.config)}
+    return not read.isdisjoint({"memory.keys", "memory.values"})
+
+
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     """Fields that queries start with and nothing reads but refinements, which only go on with them.
 

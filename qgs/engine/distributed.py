@@ -15,7 +15,7 @@ from types import FrameType
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import InitProcessGroupKwargs
+from accelerate.utils import DistributedDataParallelKwargs, InitProcessGroupKwargs
 from torch import Tensor, nn
 from torch.distributed.fsdp import FSDPModule, fully_shard
 from torch.distributed.tensor import DTensor, distribute_tensor
@@ -27,10 +27,15 @@ TIMEOUT = timedelta(hours=24)
 NCCL would end such runs. A process that died is noticed by the launcher, which ends the others."""
 
 
-def make_accelerator(device: str) -> Accelerator:
-    """The processes that a launcher started, or this one alone; autocast is the trainer's own."""
+def make_accelerator(device: str, unread: bool = False) -> Accelerator:
+    """The processes that a launcher started, or this one alone; autocast is the trainer's own.
+
+    unread: whether some parameters never get a gradient, which processes must then look for.
+    """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
-    return Accelerator(cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[group])
+    parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
+    options = {"cpu": device == "cpu", "mixed_precision": "no"}
+    return Accelerator(**options, kwargs_handlers=[group, parallel])
 
 
 def wants_shards(accelerator: Accelerator) -> bool:

@@ -19,6 +19,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.composer import Recipe
+from qgs.composer.flow import keys_are_read
 from qgs.composer.recipe import annotated
 from qgs.contracts import Outcome, TrainingConfig
 from qgs.data.sampling import Batch
@@ -155,7 +156,7 @@ class Trainer:
         """Everything that has a state, as it is saved where the run is continued; then the data."""
         recipe, config = self.recipe, self.config
         self.optimizer = recipe.build_optimizer()
-        self.accelerator = make_accelerator(device)
+        self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
         saved = None
         if self._resumes:  # a folder that holds a run is this one's from now on
             self.folder.refuse_other(resume=True)

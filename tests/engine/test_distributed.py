@@ -66,6 +66,17 @@ def test_two_processes_have_the_loss_curve_of_one(
     }  # fmt: skip
 
 
+NO_LAYERS = (
+    "model.decoder={depth: 0, cross_attention: null, self_attention: null, feed_forward: null, "
+    "refinement: null}",
+    "model.supervision.layers=[0]",
+)
+
+
+def test_two_processes_train_a_model_whose_keys_nothing_reads(tiny: Tiny, tmp_path: Path) -> None:
+    train_in_two_processes(tiny("tokengs", *NO_LAYERS), tmp_path / "two")
+
+
 @pytest.mark.parametrize("accumulate", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_shards_continue_what_one_process_began(
     tiny: Tiny, tmp_path: Path, accumulate: int
