@@ -370,6 +370,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
         "tuning": reconstruction.tuning,
         "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,
+        "background": reconstruction.model.renderer.config.background,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),
