@@ -14,9 +14,8 @@ Runs: TypeAlias = Annotated[
         metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
     ),
 ]
-Photos: TypeAlias = Annotated[
-    str | None, typer.Option(help="Folder of photos and cameras; default: the recipe's data.")
-]
+PHOTOS_HELP = "Photos and cameras; default: the recipe's data, of shipped models rooms unseen."
+Photos: TypeAlias = Annotated[str | None, typer.Option(help=PHOTOS_HELP)]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change an option of the recipe, such as model.queries.count=128."),
@@ -36,7 +35,6 @@ Size: TypeAlias = Annotated[
 
 
 SET_HELP = "Change an option of the recipe's `views`, such as views.scale=auto; repeatable."
-"""Of commands whose --set changes nothing else."""
 TUNE_HELP = (
     "Fit the queries to the input photos first, in so many steps, or with latents:STEPS what the "
     "model reads of them; 0 for none."

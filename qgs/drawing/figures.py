@@ -140,10 +140,14 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Centred mean over `share` of the values, with a shorter window at both ends."""
-    array = np.asarray(values, dtype=float)
+    """Centred mean over `share` of the values; at both ends the line through the last window.
+
+    A shorter window there would end in the noise of a single value.
+    """
+    array, index = np.asarray(values, dtype=float), np.arange(len(values))
     half = int(len(array) * share / 2)
-    total = np.concatenate([[0.0], np.cumsum(array)])
-    index = np.arange(len(array))
-    reach = np.minimum(half, np.minimum(index, len(array) - 1 - index))
-    return (total[index + reach + 1] - total[index - reach]) / (2 * reach + 1)
+    away = np.arange(-half, half + 1)
+    first = np.clip(index - half, 0, len(array) - len(away))
+    weights = np.full(len(away), 1 / len(away)), away / max(away @ away, 1)
+    means, slopes = (np.correlate(array, each, "valid")[first] for each in weights)
+    return means + slopes * (index - first - half)

@@ -15,8 +15,8 @@ DARK = 0.3
 """Mean of a background below which dark lines could not be seen."""
 FAINT = 0.12
 """Opacity of the Gaussians of other queries, as a part of their own."""
-_PALE = 0.75
-"""Part of the background in the colours of what is not picked."""
+_PALE = 0.4
+"""Part of the background in the colours of Gaussians that are not picked."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def anchor_colors(look: Look, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
         return numbers, colors
     if choice.others == "hidden":
         return numbers[[choice.query]], colors[[choice.query]]
-    paled = faded(colors, 1 - _PALE, look)
+    paled = faded(colors, 0.3, look)
     paled[choice.query] = colors[choice.query]
     return numbers, paled
 

@@ -17,7 +17,7 @@ from qgs.wording import listed
 if TYPE_CHECKING:
     from qgs_viewer.look import Look
 
-app = typer.Typer(help="See a reconstruction in the browser.", add_completion=False)
+app = typer.Typer(help="See a reconstruction in the browser.")
 
 
 @app.command()
@@ -31,8 +31,8 @@ def view(
     photos: Annotated[
         str | None,
         typer.Argument(
-            help="Photos and cameras for a model; default: the data of its recipe, of a model that "
-            "comes with qgs a room that it has not seen."
+            help="Photos and cameras for a model; default: its recipe's data, of shipped models an "
+            "unseen room."
         ),
     ] = None,
     scene: Annotated[
@@ -70,7 +70,10 @@ def view(
     ] = True,
     device: Device = "auto",
 ) -> None:
-    """Turn a reconstruction, pick a query, see its anchor layer by layer and what it reads."""
+    """Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.
+
+    Anchors are shown layer by layer, and the input photos can be changed.
+    """
     if foreign := [text for text in overrides or () if not text.startswith("views.")]:
         raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     pixels = parse_size(size)

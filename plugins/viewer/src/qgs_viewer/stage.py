@@ -178,9 +178,21 @@ class Stage:
         )  # fmt: skip
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
-        """Segments (n, 2, 3), `width` pixels wide."""
+        """Segments (n, 2, 3), `width` pixels wide. color: uint8 RGB of all, or (n, 2, 3) of ends.
+
+        viser 1.1.1 takes colours of ends for linear light, and one colour of all for sRGB.
+        """
         points = lines.float().cpu().numpy()
+        if np.ndim(color) == 3:
+            color = linear_light(color)
         self.scene.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
+
+
+def linear_light(colors: np.ndarray) -> np.ndarray:
+    """uint8 sRGB colours in linear light, uint8."""
+    shares = np.asarray(colors) / 255
+    light = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return (255 * light).round().astype(np.uint8)
 
 
 def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
