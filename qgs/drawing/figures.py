@@ -140,14 +140,12 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Centred mean over `share` of the values; at both ends the line through the last window.
-
-    A shorter window there would end in the noise of a single value.
-    """
+    """Centred mean over `share` of the values; the last whole window goes on straight to each end."""
     array, index = np.asarray(values, dtype=float), np.arange(len(values))
-    half = int(len(array) * share / 2)
-    away = np.arange(-half, half + 1)
-    first = np.clip(index - half, 0, len(array) - len(away))
-    weights = np.full(len(away), 1 / len(away)), away / max(away @ away, 1)
-    means, slopes = (np.correlate(array, each, "valid")[first] for each in weights)
-    return means + slopes * (index - first - half)
+    if (half := int(len(array) * share / 2)) == 0:
+        return array
+    width, ends = 2 * half + 1, (slice(6 * half), slice(-6 * half, None))
+    first = np.clip(index - half, 0, len(array) - width)
+    means, away = np.correlate(array, np.full(width, 1 / width), "valid"), index - first - half
+    slopes = [np.polyfit(index[end], array[end], 1)[0] for end in ends]
+    return means[first] + away * np.where(away < 0, *slopes)
