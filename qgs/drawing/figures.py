@@ -140,7 +140,7 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Centred mean over `share` of the values; the last whole window goes on straight to each end."""
+    """Centred mean over `share` of the values; the last whole window goes straight on to the end."""
     array, index = np.asarray(values, dtype=float), np.arange(len(values))
     if (half := int(len(array) * share / 2)) == 0:
         return array
