@@ -140,11 +140,11 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Centred mean over `share` of the values; the last whole window goes straight on to the end."""
+    """Centred mean over `share` of the values, going straight on from its last whole windows."""
     array, index = np.asarray(values, dtype=float), np.arange(len(values))
     if (half := int(len(array) * share / 2)) == 0:
         return array
-    width, ends = 2 * half + 1, (slice(6 * half), slice(-6 * half, None))
+    width, ends = 2 * half + 1, (slice(2 * half + 1), slice(-6 * half, None))  # steep, then flat
     first = np.clip(index - half, 0, len(array) - width)
     means, away = np.correlate(array, np.full(width, 1 / width), "valid"), index - first - half
     slopes = [np.polyfit(index[end], array[end], 1)[0] for end in ends]
