@@ -20,6 +20,11 @@ def numbered(frame: int, name: str) -> str:
     return f"{frame} ({name})" if name not in ("", str(frame)) else str(frame)
 
 
+def counted(number: int, what: str) -> str:
+    """Such as "1 thread", "12 threads"."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
 def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     """Names of models or recipes, each another: what their folders share and suffixes left out.
 

@@ -194,7 +194,9 @@ class Reconstruction:
         if not rows:
             return ""
         model, nearest = (sum(values) / len(rows) for values in zip(*rows, strict=True))
-        advice = {"or_else": "refine longer, or on more photos"} if self.refinement else {}
+        advice = {"what": f"the {'tuned' if self.tuning else 'feed-forward'} result"}
+        if self.refinement:
+            advice = {"what": "the refined result", "or_else": "refine longer, or on more photos"}
         return worse_than_nearest(Psnr.column, model, nearest, **advice)
 
     @property
@@ -370,6 +372,7 @@ def _camera_record(reconstruction: Reconstruction, path: Cameras) -> dict[str, A
         "tuning": reconstruction.tuning,
         "remarks": list(reconstruction.remarks),
         "refinement": reconstruction.refinement,
+        "background": reconstruction.model.renderer.config.background,
         "to_photos": {
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),

@@ -243,7 +243,8 @@ def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     return ReportSection(
         "What single queries stand for",
         "All Gaussians of five queries in colour, over the scene in grey. Lines lead from each "
-        "Gaussian to the centroid of those of its query. The queries are the heaviest well inside "
+        "Gaussian to the centroid of those of its query; the mean length of these lines is the "
+        "dispersion of the query. The queries are the heaviest well inside "
         "this view that also stand apart from each other.",
         {"": figures},
     )
@@ -272,8 +273,9 @@ def anchors(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     return ReportSection(
         "Where queries look",
         "Every query’s anchor on the first input view, as a dot; twelve that matter to this view "
-        "with their support, where all of it lies before the camera. Photos move the anchors from "
-        "their learned start, the same for every scene, layer by layer.",
+        "with their support, the ball or ellipsoid around an anchor that says how far about it a "
+        "query looks and places its Gaussians, where all of it lies before the camera. Photos move "
+        "the anchors from their learned start, the same for every scene, layer by layer.",
         figures,
         width=180,
     )

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
-from qgs.wording import short_names
+from qgs.wording import counted, short_names
 
 MEBIBYTE = 2**20
 TITLES = {
@@ -83,7 +83,7 @@ def _show(report: dict[str, Any], console: Console) -> None:
 
     recipes, machine = report["recipes"], report["machine"]
     base = recipes[0]
-    threads = "" if base["device"] == "cuda" else f", {machine['threads']} threads"
+    threads = "" if base["device"] == "cuda" else f", {counted(machine['threads'], 'thread')}"
     console.print(
         f"{base['device']} ({machine['processor']}{threads}), {base['precision']}, "
         f"torch {machine['torch']}; {report['rounds']} rounds after {report['warmup']} of warm-up, "

@@ -24,13 +24,13 @@ from qgs.io.files import read_records
 from qgs.io.ply import save_ply
 from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
-from qgs.wording import short_names
+from qgs.wording import counted, short_names
 
 PICTURED_SCENES = 6
 NEXT = {
     "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
-    "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "makes a sharp scene of them",
-    "qgs view MODEL PHOTOS": "shows the scene and its queries in the browser",
+    "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "reconstructs and refines them",
+    "qgs view MODEL PHOTOS": "shows the scene in the browser, to turn and to pick queries in",
     "qgs recipes": "lists recipes, each a model to train or to change",
 }
 """Commands that a reader of a report may want, and what they do."""
@@ -170,6 +170,7 @@ def report_of(
     device = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
     if torch.cuda.is_available():
         device = torch.cuda.get_device_name()
+    threads = counted(torch.get_num_threads(), "thread")
     return Report(
         columns=entries[0].evaluation.columns,
         title=f"{' and '.join(entry.contender.name for entry in entries)}: {scenes.lower()}",
@@ -186,7 +187,7 @@ def report_of(
             "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
             "Views": f"{recipe.views.inputs} inputs, judged on the views between them",
             **facts,
-            "Machine": f"{device}, {torch.get_num_threads()} threads, {platform.system()}",
+            "Machine": f"{device}, {threads}, {platform.system()}",
             "Software": ", ".join(f"{name} {version}" for name, version in software.items()),
         },
     )

@@ -14,12 +14,11 @@ Runs: TypeAlias = Annotated[
         metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
     ),
 ]
-Photos: TypeAlias = Annotated[
-    str | None, typer.Option(help="Folder of photos and cameras; default: the recipe's data.")
-]
+PHOTOS_HELP = "Photos and cameras; default: the recipe's data, of shipped models rooms unseen."
+Photos: TypeAlias = Annotated[str | None, typer.Option(help=PHOTOS_HELP)]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Override, such as model.queries.count=128; repeatable."),
+    typer.Option("--set", help="Change an option of the recipe, such as model.queries.count=128."),
 ]
 Threads: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="CPU threads; all cores if not given.")
@@ -35,7 +34,11 @@ Size: TypeAlias = Annotated[
 ]
 
 
-TUNE_HELP = "Tune queries or latents on the input photos: WHAT, STEPS or WHAT:STEPS; 0 for none."
+SET_HELP = "Change an option of the recipe's `views`, such as views.scale=auto; repeatable."
+TUNE_HELP = (
+    "Fit the queries to the input photos first, in so many steps, or with latents:STEPS what the "
+    "model reads of them; 0 for none."
+)
 Tune: TypeAlias = Annotated[str | None, typer.Option(metavar="[WHAT:]STEPS", help=TUNE_HELP)]
 
 

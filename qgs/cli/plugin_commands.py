@@ -12,6 +12,16 @@ GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
 
 
+HELP = {
+    "data": "Check and pack data sets.",
+    "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
+    "figures": "Figures of trained models for a paper, as PDF and PNG.",
+    "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
+    "check-plugin": "Hold every component of a plugin to its contract.",
+}
+"""What the commands of this repository's other distributions do; their entry points cannot tell."""
+
+
 class CommandGroup(TyperGroup):
     """Our own commands, then those of installed distributions, which never hide one of ours."""
 
@@ -43,7 +53,10 @@ class OfferedCommand(TyperCommand):
         self.offers = offers
         releases = (f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist)
         self.releases = ", ".join(sorted(releases))
-        super().__init__(name, help=f"Commands of {self.releases}.")
+        summaries = {entry.dist.metadata["Summary"] for entry in offers if entry.dist}
+        told = f"{'; '.join(sorted(filter(None, summaries))) or 'Commands'} ({self.releases})"
+        own = self.releases.startswith(f"{DISTRIBUTIONS[GROUP].get(name)} ")
+        super().__init__(name, help=HELP[name] if own else told)
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
@@ -66,4 +79,5 @@ class OfferedCommand(TyperCommand):
                 f"{command} of {self.releases} is no command: `{entry.value}` is "
                 f"{type(app).__name__}, not a typer.Typer; update {self.releases}"
             )
+        app._add_completion = False  # what it would install completes no command of qgs
         return typer.main.get_command(app).make_context(info_name, args, parent, **extra)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qgs.cli.options import Checkpoint, Device, Size, Tune, parse_size, tuning_settings
+from qgs.cli.options import SET_HELP, Checkpoint, Device, Size, Tune, parse_size, tuning_settings
 from qgs.wording import listed, numbered
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def reconstruct(
     ] = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Override of `views`, such as views.scale=auto; repeatable."),
+        typer.Option("--set", help=SET_HELP),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")

@@ -118,7 +118,7 @@ def verdict(trained: Domain, found: Domain) -> str:
     if apart := trained.differences(found):
         return (
             f"the views lie outside what this model was trained on: {', '.join(apart)}. Expect a "
-            "poor result; choose other input views, or train on views like these"
+            "poor result; choose other input views (--frames), or train on views like these"
         )
     return (
         "the cameras lie within what this model was trained on, in distance, direction, depth and "

@@ -140,10 +140,12 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Centred mean over `share` of the values, with a shorter window at both ends."""
-    array = np.asarray(values, dtype=float)
-    half = int(len(array) * share / 2)
-    total = np.concatenate([[0.0], np.cumsum(array)])
-    index = np.arange(len(array))
-    reach = np.minimum(half, np.minimum(index, len(array) - 1 - index))
-    return (total[index + reach + 1] - total[index - reach]) / (2 * reach + 1)
+    """Centred mean over `share` of the values, going straight on from its last whole windows."""
+    array, index = np.asarray(values, dtype=float), np.arange(len(values))
+    if (half := int(len(array) * share / 2)) == 0:
+        return array
+    width, ends = 2 * half + 1, (slice(2 * half + 1), slice(-6 * half, None))  # steep, then flat
+    first = np.clip(index - half, 0, len(array) - width)
+    means, away = np.correlate(array, np.full(width, 1 / width), "valid"), index - first - half
+    slopes = [np.polyfit(index[end], array[end], 1)[0] for end in ends]
+    return means[first] + away * np.where(away < 0, *slopes)

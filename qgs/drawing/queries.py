@@ -130,18 +130,18 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
 
 @dataclass(frozen=True)
 class DrawnQuery:
-    """A query by its index. spread: mean distance of its Gaussians to their centroid."""
+    """A query by its index. dispersion: mean distance of its Gaussians to their centroid."""
 
     index: int
     color: Color
-    spread: float
+    dispersion: float
 
 
 def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> list[DrawnQuery]:
     """`chosen` of the `count` queries of the first scene, each with a colour by its place."""
     distances = token_dispersion(gaussians.means.detach(), gaussians.count // count)[0]
-    spreads = distances.view(count, -1).mean(1)
-    return [DrawnQuery(q, categorical(place), float(spreads[q])) for place, q in enumerate(chosen)]
+    mean = distances.view(count, -1).mean(1)
+    return [DrawnQuery(q, categorical(place), float(mean[q])) for place, q in enumerate(chosen)]
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:

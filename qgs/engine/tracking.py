@@ -116,10 +116,13 @@ class TrainingProgress:
         self._next = now + self._interval
         done, spent = images - self._start[0], seconds - self._start[1]
         gained = used - self._start[2]
-        rate = done / spent if spent else 0.0
-        left = str(timedelta(seconds=round(spent * (1 - used) / gained))) if gained else "?"
+        left = timedelta(seconds=round(max(spent * (1 - used) / gained, 0))) if gained else None
         quality = f"{Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
-        line = f"loss {loss:.4f}  {quality}  {rate:.0f} images/s  {left} left"
+        line = f"loss {loss:.4f}  {quality}"
+        if done and spent:
+            line += f"  {done / spent:.{0 if done > 10 * spent else 1}f} images/s"
+        if left is not None:
+            line += f"  {left} left"
         if self._console.is_terminal:
             self._bar.update(self._task, completed=used, step=step, line=line, refresh=True)
         else:

@@ -32,16 +32,21 @@ _TRAINED_OTHERWISE = "train longer, or on photos like these"
 
 
 def worse_than_nearest(
-    column: Column, model: float | None, nearest: float | None, *, or_else: str = _TRAINED_OTHERWISE
+    column: Column,
+    model: float | None,
+    nearest: float | None,
+    *,
+    what: str = "the result",
+    or_else: str = _TRAINED_OTHERWISE,
 ) -> str:
     """A sentence where `nearest_input` scores better than the model, else "".
 
-    or_else: what may help beside other inputs.
+    what: is worse. or_else: what may help beside other inputs.
     """
     if model is None or nearest is None or column.best((model, nearest)) == model:
         return ""
     return (
-        f"the result is worse than the nearest photo, copied: {column.heading} "
+        f"{what} is worse than the nearest photo, copied: {column.heading} "
         f"{column.shown(model)} against {column.shown(nearest)}. Do not rely on it: choose inputs "
         f"nearer to the views that are wanted, or {or_else}"
     )

@@ -123,7 +123,7 @@ def test_notable_queries_are_heavy_well_inside_the_picture_and_apart(model, gaus
     assert min(indices) in (0, 1)
     assert indices[0] == int(weights[:5].argmax())
     means = placed.means.view(queries, -1, 3)[indices[1]]
-    assert drawn[1].spread == pytest.approx(float((means - means.mean(0)).norm(dim=-1).mean()))
+    assert drawn[1].dispersion == pytest.approx(float((means - means.mean(0)).norm(dim=-1).mean()))
     assert len({query.index for query in notable_queries(model, placed, cameras, 12)}) == 12
 
 
@@ -215,4 +215,17 @@ def test_running_mean_keeps_a_line_straight():
     line = np.linspace(3, 9, 200)
     np.testing.assert_allclose(running_mean(line), line)
     noisy = line + np.random.default_rng(0).normal(size=200)
-    assert np.abs(running_mean(noisy)[10:-10] - line[10:-10]).max() < 1.5
+    assert np.abs(running_mean(noisy) - line).max() < 1.5
+
+
+@pytest.mark.parametrize(("end", "most"), [(0, 0.3), (-1, 0.1)])
+def test_one_odd_value_at_an_end_bends_no_running_mean(end: int, most: float) -> None:
+    values = np.full(4000, 3.0)
+    values[end] = 13.0
+    assert np.abs(running_mean(values) - 3).max() < most
+
+
+@pytest.mark.parametrize("count", [1, 2, 39])
+def test_a_few_values_are_their_own_running_mean(count: int) -> None:
+    values = np.random.default_rng(0).normal(size=count)
+    np.testing.assert_array_equal(running_mean(values), values)

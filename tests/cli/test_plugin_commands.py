@@ -1,15 +1,17 @@
 """Commands of other distributions: listed without an import, and told apart when they fail."""
 
+import re
 import sys
 from collections.abc import Callable
 from importlib.metadata import entry_points
 
 import pytest
+import typer
 from commands import run_qgs
 
 from qgs import DISTRIBUTIONS
 from qgs.cli import COMMANDS
-from qgs.cli.plugin_commands import GROUP
+from qgs.cli.plugin_commands import GROUP, HELP
 
 Offer = Callable[..., None]
 APP = """
@@ -36,10 +38,27 @@ def offer(install: Callable[..., None]) -> Offer:
     return offer
 
 
+def test_our_own_commands_are_listed_by_what_they_do() -> None:
+    """In the words of the commands themselves, which are not imported for it."""
+    assert HELP.keys() == DISTRIBUTIONS[GROUP].keys()
+    listed = " ".join(re.sub(r"[^\w\s.:,-]", " ", run_qgs("--help").output).split())
+    for entry in entry_points(group=GROUP):
+        if entry.name in HELP:
+            told = " ".join(re.sub(r"[^\w\s.:,-]", " ", HELP[entry.name]).split())
+            assert told in listed, entry.name
+            own = typer.main.get_command(entry.load()).help or ""
+            assert own.startswith(HELP[entry.name]), entry.name
+
+
+def test_offered_commands_offer_no_completion_that_would_not_work(offer: Offer) -> None:
+    offer("paint")
+    assert "completion" not in run_qgs("paint", "--help").output
+
+
 def test_it_is_listed_without_an_import_and_imported_when_called(offer: Offer) -> None:
     offer("paint")
     listed = run_qgs("--help")
-    assert "Commands of colours 2.1." in listed.output
+    assert "Commands (colours 2.1)" in listed.output
     assert "_test_colours" not in sys.modules
     called = run_qgs("paint", "first", "21")
     assert called.output == "twice 42\n"

@@ -24,7 +24,7 @@ from qgs.metrics.scales import TOLD, too_many_capped
 from qgs.types import Cameras
 
 FRAMING = "(20% is cut off)"
-NEAREST = "the result is worse than the nearest photo, copied: PSNR "
+NEAREST = "result is worse than the nearest photo, copied: PSNR "
 CAPPED = "of the scales of visible Gaussians are at the cap, model.head.scale_cap: 0.075"
 OUTSIDE = "the views lie outside what this model was trained on"
 WITHIN = "the cameras lie within what this model was trained on"
@@ -112,8 +112,9 @@ def test_a_reconstruction_says_the_same(checkpoint: Path, photos: Path, tmp_path
     for words in (FRAMING, NEAREST, CAPPED, OUTSIDE):
         assert words in result.output
         assert any(words in remark for remark in remarks)
+    assert any(remark.startswith(f"the feed-forward {NEAREST}") for remark in remarks)
     (remark,) = json.loads((tmp_path / "refined/cameras.json").read_text())["remarks"]
-    assert remark.startswith(NEAREST)
+    assert remark.startswith(f"the refined {NEAREST}")
     assert remark.endswith("or refine longer, or on more photos")
     assert remark in result.output
 

@@ -75,6 +75,12 @@ def test_the_viewer(model: str, tmp_path: Path) -> None:
         told = f"query {panel.choice.query}"
         page.until("its words", f"document.body.innerText.includes('{told}')")
 
+        page.key("Escape", 27)
+        page.until("no query", lambda: panel.choice.query is None)
+        page.until("no words", f"!document.body.innerText.includes('{told}')")
+        panel.pick(int(told.split()[1]))
+        page.until("its words again", f"document.body.innerText.includes('{told}')")
+
         page.evaluate("document.querySelector('[role=slider]').focus()")
         for _ in range(panel.look.depth - 1):
             page.key("ArrowLeft", 37)
@@ -109,6 +115,9 @@ def test_a_page_draws_and_asks_for_nothing(tmp_path: Path) -> None:
         page.open(file.as_uri())
         page.until("the canvas", "!!document.querySelector('canvas')")
         drawn(page, tmp_path, "page")
+        shot = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+        grey = (np.abs(shot - 127.5).max(-1) < 1).mean()
+        assert grey > 0.02, "the background of the model, not that of the page"
         assert network(page, file.as_uri()) == []
         assert page.targets == ["worker"], "it sorts the Gaussians as the page is turned"
         assert page.errors == []

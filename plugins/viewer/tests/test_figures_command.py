@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from commands import run_qgs
 from PIL import Image
+from qgs_viewer.figures.command import NAMES
 from qgs_viewer.figures.gallery import FIGURES
 
 import qgs
@@ -20,6 +21,12 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = ["data.test_scenes=2", "evaluation.scenes=2"]
     qgs.save(resolve("recipes/tiny/locus.yaml", [*SMALL, *data]).build_model(), file)
     return file
+
+
+def test_help_names_the_figures() -> None:
+    assert tuple(FIGURES) == NAMES
+    told = "".join(word for word in run_qgs("figures", "--help").output.split() if word != "│")
+    assert all(name in told for name in NAMES)
 
 
 def test_figures_are_written_and_explained(checkpoint: Path, tmp_path: Path) -> None:

@@ -1,12 +1,17 @@
+from copy import deepcopy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from qgs_viewer.choice import FAINT, Choice, anchor_colors, painted, query_color
+from qgs_viewer.choice import FAINT, Choice, anchor_colors, faded, ink, painted, query_color
+from qgs_viewer.look import NEUTRAL, look_inside
 from qgs_viewer.panel import told
 from qgs_viewer.pictures import attention_parts
 from small import KINDS, QUERIES, SIDE, model_of, source_of
 
 import qgs
+from qgs.drawing.figures import INK
 from qgs.geometry.transforms import to_camera, to_pixels
 
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
@@ -116,9 +121,29 @@ def test_a_picked_query_stands_out() -> None:
     np.testing.assert_allclose(colored.colors[mine] * 255, [query_color(4)] * mine.sum(), atol=0.1)
 
 
+def test_the_background_is_that_of_the_model() -> None:
+    look = source_of("locus").look((1, 4))
+    assert look.background == model_of("locus").renderer.config.background == NEUTRAL
+    settings = model_of("locus").renderer.config.model_copy(update={"background": (0.1, 0.2, 0.3)})
+    model = deepcopy(model_of("locus"))
+    model.renderer.config = settings
+    assert look.views is not None
+    assert look_inside(model, look.views).background == (0.1, 0.2, 0.3)
+
+
+def test_what_pales_goes_towards_the_background() -> None:
+    look = replace(source_of("locus").look((1, 4)), background=(0.0, 0.5, 1.0))
+    assert faded((255, 0, 0), np.array([[1.0], [0.0]]), look).tolist() == [
+        [255, 0, 0],
+        [0, 128, 255],
+    ]
+    assert ink(look) == INK
+    assert min(ink(replace(look, background=(0.1, 0.1, 0.1)))) > 200
+
+
 def test_colours_tell_queries_apart() -> None:
     assert len({query_color(query) for query in range(1024)}) > 900
-    numbers, _ = anchor_colors(QUERIES, Choice(query=4, others="hidden"))
+    numbers, _ = anchor_colors(source_of("locus").look((1, 4)), Choice(query=4, others="hidden"))
     assert numbers.tolist() == [4]
 
 

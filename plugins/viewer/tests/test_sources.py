@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from qgs_viewer.files import FinishedScene
+from qgs_viewer.look import NEUTRAL
 from qgs_viewer.sources import FixedSource, ModelSource, Wanted, _difference, open_source
 from small import QUERIES, VIEWS, Walk, model_of
 
@@ -73,7 +74,9 @@ def changed_copy(finished: Path, tmp_path: Path, **record: object) -> Path:
     ("record", "said"),
     [
         ({"model": ""}, "does not tell its model"),
-        ({"tuning": {"steps": 3}}, "tuned or refined"),
+        ({"tuning": {"steps": 3}}, "It was tuned on its photos"),
+        ({"refinement": {"steps": 3}}, "It was refined"),
+        ({"tuning": {"steps": 3}, "refinement": {"steps": 3}}, "It was refined"),
         ({"model": "gone/model.safetensors"}, "no checkpoint at gone/model.safetensors"),
     ],
 )
@@ -87,6 +90,29 @@ def test_without_its_model_it_is_shown_as_it_is(
     assert (look.queries, look.support(0)) == (0, None)
     assert look.views is not None
     assert look.views.images.shape[1] == 2
+
+
+def test_prediction_and_refined_scene_name_each_other(finished: Path, tmp_path: Path) -> None:
+    folder = changed_copy(finished, tmp_path)
+    assert open_source(str(folder), Wanted()).notes == ()
+    changed_copy(finished, folder, refinement={"steps": 3}).rename(folder / "refined")
+    predicted = open_source(str(folder), Wanted())
+    assert isinstance(predicted, ModelSource)
+    assert f"refined on photos: `qgs view {folder / 'refined'}`" in predicted.notes[0]
+    refined = open_source(str(folder / "refined"), Wanted())
+    assert refined.notes[0].endswith(f"with its queries: `qgs view {folder}`.")
+
+
+def test_a_reconstruction_keeps_its_background(finished: Path, tmp_path: Path) -> None:
+    folder = changed_copy(finished, tmp_path, model="", background=[0.0, 0.5, 1.0])
+    assert open_source(str(folder), Wanted()).look(()).background == (0.0, 0.5, 1.0)
+    told = json.loads((finished / "scene/cameras.json").read_text())
+    assert told["background"] == [0.5, 0.5, 0.5]
+    (folder / "cameras.json").write_text(json.dumps({k: told[k] for k in ("scene", "views")}))
+    assert open_source(str(folder), Wanted()).look(()).background == NEUTRAL
+    (folder / "cameras.json").write_text(json.dumps({**told, "background": [0.5]}))
+    with pytest.raises(ValueError, match=r"cameras\.json is no record"):
+        open_source(str(folder), Wanted())
 
 
 def test_another_model_of_the_name_is_noticed(finished: Path, tmp_path: Path) -> None:

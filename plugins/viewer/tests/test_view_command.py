@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small import QUERIES, model_of
 from typer.testing import CliRunner
 
 import qgs
@@ -57,6 +58,32 @@ def test_other_machines_are_told_the_address(ply: Path, opened: list[str], monke
     assert error is None
     assert opened[0].startswith("http://localhost:")
     assert f"http://192.0.2.7:{opened[0].rpartition(':')[2]}" in told
+
+
+def test_a_page_shows_the_query_that_was_asked_for(opened: list[str], tmp_path: Path) -> None:
+    qgs.save(model_of("locus"), tmp_path / "model.safetensors")
+    source = str(tmp_path / "model.safetensors")
+    told, error = view(source, "--html", str(tmp_path / "plain.html"))
+    assert error is None
+    assert "choose one for the page with --query" in " ".join(told.split())
+    _, error = view(source, "--html", str(tmp_path / "picked.html"), "--query", "3")
+    assert error is None
+    assert (tmp_path / "picked.html").read_text() != (tmp_path / "plain.html").read_text()
+    for more in (["--html", str(tmp_path / "none.html")], ["--port", "0"]):
+        _, error = view(source, *more, "--query", str(QUERIES))
+        assert f"--query {QUERIES} cannot be picked: there are 0 to {QUERIES - 1}" in str(error)
+    assert not (tmp_path / "none.html").exists()
+    _, error = view(source, "--port", "0", "--query", "3")
+    assert error is None
+
+
+def test_a_ply_has_no_query_to_pick(ply: Path, opened: list[str], tmp_path: Path) -> None:
+    told, error = view(str(ply), "--html", str(tmp_path / "page.html"))
+    assert error is None
+    assert "--query" not in told
+    _, error = view(str(ply), "--port", "0", "--query", "0")
+    assert "no query is known of it" in str(error)
+    assert opened == []
 
 
 def test_a_page_never_replaces_a_file(ply: Path, opened: list[str], tmp_path: Path) -> None:

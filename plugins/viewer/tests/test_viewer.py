@@ -127,13 +127,77 @@ def all_handles(gui: "viser.GuiApi") -> Iterator[object]:
         waiting += getattr(handle, "_children", {}).values()
 
 
+def button_of(server: "viser.ViserServer", label: str) -> "viser.GuiButtonHandle":
+    buttons = [h for h in all_handles(server.gui) if isinstance(h, viser.GuiButtonHandle)]
+    (found,) = [button for button in buttons if button.label == label]
+    return found
+
+
+def test_a_picked_query_is_let_go(server, panel) -> None:
+    from types import SimpleNamespace
+
+    button = button_of(server, "Show all (Esc)")
+    assert not button.visible
+    panel.pick(3)
+    assert button.visible
+    button.value = True
+    assert (panel.choice.query, panel.number.value, button.visible) == (None, -1, False)
+    panel.pick(3)
+    nowhere = SimpleNamespace(ray_origin=(0.0, 0.0, -3.0), ray_direction=(0.0, 0.0, -1.0))
+    panel._clicked(nowhere)
+    assert panel.choice.query is None
+    panel._clicked(nowhere)
+    assert nodes(server) == {*BASE, "/anchors"}
+
+
+def test_what_is_read_more_has_broader_and_stronger_lines(server, panel) -> None:
+    panel.pick(3)
+    reading = panel.look.strongest(3, panel.choice.layer, panel.choice.patches, 1.0)
+    shares = (reading.shares / reading.shares.max()).numpy()
+    groups = [server.scene.get_handle_by_name(f"/reading/{width}") for width in range(3)]
+    thick = [group.thickness for group in groups if group is not None]
+    assert thick == sorted(set(thick))
+    ends = {tuple(end): (g.thickness, c) for g in groups if g for end, c in lines_of(g)}
+    points = reading.points.float().numpy()
+    assert len(ends) == len(points) == panel.choice.patches
+    marks = np.array(server.scene.get_handle_by_name("/patches").colors).astype(float)
+    behind = 255 * np.array(panel.look.background)
+    apart = np.linalg.norm(marks - behind, axis=1)
+    np.testing.assert_allclose(apart / apart[0], 0.08 + 0.92 * shares, atol=0.03)
+
+
+def lines_of(group: "viser.LineSegmentsHandle") -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(points[1], color[0]) for points, color in zip(group.points, group.colors, strict=True)]
+
+
+@pytest.mark.parametrize("background", [(0.5, 0.5, 0.5), (0.0, 0.25, 1.0)])
+def test_gaussians_stand_before_the_background_of_their_model(background) -> None:
+    """In a browser and in pages alike: what a scene serialises is what a page draws."""
+    from dataclasses import replace
+    from io import BytesIO
+
+    from PIL import Image
+    from qgs_viewer.choice import Choice
+    from qgs_viewer.server import quiet_server
+    from qgs_viewer.stage import Stage
+
+    look = replace(source_of("locus").look((1, 4)), background=background)
+    with quiet_server() as own:
+        Stage(own.scene).put(look, Choice())
+        messages = own._websock_server._broadcast_buffer.message_from_id.values()
+        (sent,) = [m for m in messages if type(m).__name__ == "BackgroundImageMessage"]
+    assert sent.format == "png"
+    pixels = np.asarray(Image.open(BytesIO(sent.rgb_data)).convert("RGB")).reshape(-1, 3)
+    np.testing.assert_allclose(pixels, 255 * np.array([background] * len(pixels)), atol=1)
+
+
 def test_many_photos_are_named_and_taken_by_a_button(server, monkeypatch) -> None:
     from qgs_viewer import panel as module
 
     monkeypatch.setattr(module, "MOST_BOXES", 3)
     server.gui.reset()
     panel = module.Panel(server, source_of("locus"))
-    (button,) = [h for h in all_handles(server.gui) if isinstance(h, viser.GuiButtonHandle)]
+    button = button_of(server, "Reconstruct")
     before = panel.look
     panel.frames.value = "0,4"
     assert panel.look is before

@@ -41,7 +41,7 @@ def new_plugin(
         Path | None, typer.Option(help="New folder, never overwritten; default: ./qgs-NAME.")
     ] = None,
 ) -> None:
-    """Write a plugin to start from: one component, its contract tests, a recipe that uses it."""
+    """Write a plugin to start from: one component, its contract tests, a recipe."""
     check_name(name)
     folder = (out or Path(distribution_of(name))).expanduser()
     write_plugin(name, folder)

@@ -6,14 +6,17 @@ from typing import Literal
 
 import numpy as np
 
-from qgs.drawing.figures import Color
+from qgs.drawing.figures import INK, Color
 from qgs_viewer.look import Look
 from qgs_viewer.placement import Splats
 
 Others = Literal["shown", "faint", "hidden"]
+DARK = 0.3
+"""Mean of a background below which dark lines could not be seen."""
 FAINT = 0.12
 """Opacity of the Gaussians of other queries, as a part of their own."""
-_GREY = 0.75
+_PALE = 0.4
+"""Part of the background in the colours of Gaussians that are not picked."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +48,27 @@ def query_colors(count: int) -> np.ndarray:
     return np.array([query_color(query) for query in range(count)], np.uint8).reshape(-1, 3)
 
 
-def anchor_colors(count: int, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
-    """Which of `count` anchors are shown, by number, and their colours uint8."""
-    colors, numbers = query_colors(count), np.arange(count)
+def anchor_colors(look: Look, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Which anchors are shown, by number, and their colours uint8."""
+    colors, numbers = query_colors(look.queries), np.arange(look.queries)
     if choice.query is None or choice.others == "shown":
         return numbers, colors
     if choice.others == "hidden":
         return numbers[[choice.query]], colors[[choice.query]]
-    paled = (0.3 * colors + 0.7 * 235).astype(np.uint8)
+    paled = faded(colors, 0.3, look)
     paled[choice.query] = colors[choice.query]
     return numbers, paled
+
+
+def faded(colors: np.ndarray | Color, strength: float | np.ndarray, look: Look) -> np.ndarray:
+    """uint8 colours mixed with the background of `look`, of which strength 0 is all."""
+    mixed = strength * np.array(colors) + (1 - strength) * 255 * np.array(look.background)
+    return mixed.round().astype(np.uint8)
+
+
+def ink(look: Look) -> Color:
+    """The colour of lines that stand out from the background of `look`."""
+    return INK if np.mean(look.background) > DARK else (235, 235, 235)
 
 
 def painted(look: Look, choice: Choice) -> Splats:
@@ -70,6 +84,7 @@ def painted(look: Look, choice: Choice) -> Splats:
         mine[look.members(choice.query)] = True
         part = FAINT if choice.others == "faint" else 0.0
         opacities = np.where(mine[:, None], np.maximum(opacities, 0.5), opacities * part)
-        greys = colors.mean(1, keepdims=True) * (1 - _GREY) + _GREY
+        greys = colors.mean(1, keepdims=True) * (1 - _PALE) + np.array(look.background) * _PALE
         colors = np.where(mine[:, None], colors, greys)
-    return replace(found, colors=colors, opacities=opacities.astype(np.float32))
+    kinds = {"colors": colors, "opacities": opacities}
+    return replace(found, **{name: part.astype(np.float32) for name, part in kinds.items()})

@@ -6,13 +6,16 @@ import socket
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device, Size, parse_size
+from qgs.cli.options import SET_HELP, Device, Size, parse_size
 from qgs.wording import listed
+
+if TYPE_CHECKING:
+    from qgs_viewer.look import Look
 
 app = typer.Typer(help="See a reconstruction in the browser.")
 
@@ -27,7 +30,10 @@ def view(
     ],
     photos: Annotated[
         str | None,
-        typer.Argument(help="Photos and cameras for a model; default: the data of its recipe."),
+        typer.Argument(
+            help="Photos and cameras for a model; default: its recipe's data, of shipped models an "
+            "unseen room."
+        ),
     ] = None,
     scene: Annotated[
         str | None, typer.Option(help="Name of the scene, where there are several.")
@@ -41,10 +47,17 @@ def view(
     size: Size = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Override of `views`, such as views.scale=auto; repeatable."),
+        typer.Option("--set", help=SET_HELP),
+    ] = None,
+    query: Annotated[
+        int | None, typer.Option(min=0, help="Query that is picked at first; default: none.")
     ] = None,
     html: Annotated[
-        Path | None, typer.Option(help="Write the scene as one new HTML page; serve nothing.")
+        Path | None,
+        typer.Option(
+            help="Write the scene as one new HTML page to turn; serve nothing. Queries cannot be "
+            "picked in it: --query chooses one."
+        ),
     ] = None,
     host: Annotated[
         str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see it.")
@@ -57,7 +70,10 @@ def view(
     ] = True,
     device: Device = "auto",
 ) -> None:
-    """Turn a reconstruction, pick a query, see its anchor layer by layer and what it reads."""
+    """Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.
+
+    Anchors are shown layer by layer, and the input photos can be changed.
+    """
     if foreign := [text for text in overrides or () if not text.startswith("views.")]:
         raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     pixels = parse_size(size)
@@ -74,19 +90,31 @@ def view(
     for note in opened.notes:
         console.print(note, soft_wrap=True, highlight=False, markup=False)
     if html is not None:
+        from qgs_viewer.choice import Choice
         from qgs_viewer.page import scene_html
 
-        page = scene_html(opened.look(opened.frames))
+        look = opened.look(opened.frames)
+        refuse_missing(query, look)
+        page = scene_html(look, Choice(query=query, layer=look.depth))
         refuse_existing(html)
         write_text(html, page)
         console.print(f"wrote {html}", soft_wrap=True)
+        if look.queries:
+            console.print(
+                "The page can be turned; to pick queries in it, leave out --html, or choose one "
+                "for the page with --query.",
+                soft_wrap=True, highlight=False,
+            )  # fmt: skip
         return
 
     from qgs_viewer.panel import Panel
     from qgs_viewer.server import quiet_server
 
     with quiet_server(host, port, opened.title) as server:
-        Panel(server, opened)
+        panel = Panel(server, opened)
+        refuse_missing(query, panel.look)
+        if query is not None:
+            panel.pick(query)
         name = "localhost" if host in {"127.0.0.1", "0.0.0.0"} else host
         port = server.get_port()
         where = f"http://{name}:{port}"
@@ -97,6 +125,13 @@ def view(
             webbrowser.open(where)
         with suppress(KeyboardInterrupt):
             server.sleep_forever()
+
+
+def refuse_missing(query: int | None, look: Look) -> None:
+    """Raise ValueError for a query that `look` does not have."""
+    if query is not None and query >= look.queries:
+        there = f"there are 0 to {look.queries - 1}" if look.queries else "no query is known of it"
+        raise ValueError(f"--query {query} cannot be picked: {there}")
 
 
 def _own_address() -> str:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,9 +14,12 @@ from torch import Tensor
 from qgs.contracts import Scene
 from qgs.io.ply import load_ply
 from qgs.types import Cameras, Gaussians
+from qgs_viewer.look import NEUTRAL, Background
 
 PLY, CAMERAS = "gaussians.ply", "cameras.json"
 """What a folder of a finished reconstruction holds."""
+REFINED = "refined"
+"""The folder in it with what `--refine` made of it."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +27,16 @@ class Finished:
     """A reconstruction that `qgs reconstruct` wrote: its Gaussians and views, in its world.
 
     inputs: numbers of the input views in `scene`. model: what made the Gaussians, as it was named;
-    "" where they were tuned or refined, or are of a release that did not tell.
+    "" where it does not tell. changed: what was done to them since. background: RGB in [0, 1] that
+    they were made before.
     """
 
     gaussians: Gaussians
     scene: "FinishedScene"
     inputs: Sequence[int]
     model: str
+    changed: Literal["", "tuned", "refined"] = ""
+    background: Background = NEUTRAL
 
 
 class FinishedScene(Scene):
@@ -80,11 +86,12 @@ def read_finished(folder: Path) -> Finished:
         scene = FinishedScene(str(told["scene"]), folder, views)
         inputs = [place for place, view in enumerate(views) if view["kind"] == "input"]
         scene.images(range(len(views)))  # so that a file that is missing is told now
-        changed = told.get("tuning") or told.get("refinement")
-        model = "" if changed else str(told.get("model") or "")
+        red, green, blue = (min(max(float(c), 0), 1) for c in told.get("background") or NEUTRAL)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(
             f"{record} is no record of a reconstruction ({type(error).__name__}: {error}); make it "
             "again with `qgs reconstruct`, or view the PLY alone"
         ) from error
-    return Finished(gaussians, scene, inputs, model)
+    changed = "refined" if told.get("refinement") else "tuned" if told.get("tuning") else ""
+    model = str(told.get("model") or "")
+    return Finished(gaussians, scene, inputs, model, changed, (red, green, blue))

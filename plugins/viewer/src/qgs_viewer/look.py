@@ -8,10 +8,14 @@ import torch
 from torch import Tensor
 
 from qgs.analysis.trace import Trace, trace
-from qgs.contracts import AttentionWeights
+from qgs.contracts import AttentionWeights, RendererConfig
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
 from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
+
+Background = tuple[float, float, float]
+NEUTRAL: Background = RendererConfig().background
+"""Behind Gaussians that nothing is known of: what models are trained with unless told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Look:
     """Gaussians (1, G), the views (1, V) they were made of with labels, and their place.
 
     inside: None where no model is known, so that there are no queries. frames: numbers of the views
-    in their scene.
+    in their scene. background: RGB in [0, 1] that the Gaussians are meant to be seen before.
     """
 
     gaussians: Gaussians
@@ -37,6 +41,7 @@ class Look:
     frames: Sequence[int] = ()
     placement: Placement = field(default_factory=Placement.identity)
     inside: Inside | None = None
+    background: Background = NEUTRAL
     _traces: dict[int, tuple[Trace, int]] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -170,4 +175,5 @@ def look_inside(
     inside = Inside(model, memory, states)
     placement = placement or Placement.identity()
     labels = labels or [f"view {view}" for view in range(views.images.shape[1])]
-    return Look(prediction.gaussians, views, labels, frames, placement, inside)
+    background = model.renderer.config.background
+    return Look(prediction.gaussians, views, labels, frames, placement, inside, background)

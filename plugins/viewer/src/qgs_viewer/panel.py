@@ -59,7 +59,8 @@ class Panel:
         told = f"**{plain(self.source.title)}**\n\n{self.look.gaussians.count:,} Gaussians"
         if queries:
             told += f" of {queries:,} queries. Click on one"
-            told += "." if self.look.support(0) is None else ", or on an anchor."
+            told += " or" if self.look.support(0) is None else ", on an anchor, or"
+            told += " type its number; Esc, or a click beside everything, shows all again."
         gui.add_markdown(told)
         if queries:
             names = ("of the scene", "by query")
@@ -73,15 +74,22 @@ class Panel:
         gui, depth = self.server.gui, self.look.depth
         with gui.add_folder("query"):
             last = self.look.queries - 1
-            hint = f"0 to {last}, or {NONE} for none"
+            hint = f"0 to {last}, or {NONE} for all"
             self.number = gui.add_number("query", NONE, min=NONE, max=last, step=1, hint=hint)
             self._on(self.number, self._picked)
+            self.everything = gui.add_button("Show all (Esc)", visible=False)
+            self.everything.on_click(lambda _: self.pick(None))
+            gui.add_command("Show all queries", hotkey="escape").on_trigger(
+                lambda _: self.pick(None)
+            )
             self.others = gui.add_dropdown("other queries", get_args(Others), initial_value="faint")
             self._on(self.others, lambda: {"others": self.others.value})
             hint = "Supports are those after this layer; 0 is the learned start."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
             self._on(self.layer, lambda: {"layer": int(self.layer.value)})
-            hint = "Lines to the patches that the query attends to most in this layer."
+            hint = (
+                "Lines to so many patches that the query attends to most; broad and strong is much."
+            )
             self.patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
             self._on(self.patches, lambda: {"patches": int(self.patches.value)})
             if self.look.support(0) is not None:
@@ -101,8 +109,11 @@ class Panel:
 
     def _inputs(self) -> None:
         gui, labels = self.server.gui, self.source.labels
-        with gui.add_folder("input photos"):
+        with gui.add_folder("reconstructed from"):
             if len(labels) <= MOST_BOXES:
+                gui.add_markdown(
+                    "Ticked photos are the inputs. Tick others: the scene is made anew."
+                )
                 chosen = set(self.source.frames)
                 self.boxes = [gui.add_checkbox(x, f in chosen) for f, x in enumerate(labels)]
                 for box in self.boxes:
@@ -110,7 +121,7 @@ class Panel:
             else:
                 text = ",".join(map(str, self.source.frames))
                 hint = f"Numbers or file names, commas between; 0 to {len(labels) - 1}."
-                self.frames = gui.add_text("frames", text, hint=hint)
+                self.frames = gui.add_text("input photos", text, hint=hint)
                 gui.add_button("Reconstruct").on_click(self._reframed)
 
     def _on(self, control: Any, change: Callable[[], dict[str, Any]]) -> None:
@@ -131,7 +142,7 @@ class Panel:
             self.choice = choice
 
     def pick(self, query: int | None) -> None:
-        """Pick a query, or none."""
+        """Pick a query, or none: then all are shown."""
         self.number.value = NONE if query is None else query  # calls back
 
     def take(self, frames: Sequence[int]) -> None:
@@ -158,6 +169,7 @@ class Panel:
             handle.visible = part in found
             if part in found:
                 handle.image = found[part]
+        self.everything.visible = query is not None
         self._said.content = "" if query is None else told(look, query, layer)
 
     def _reframed(self, event: Any) -> None:
@@ -189,14 +201,13 @@ class Panel:
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         with self._lock:
             query = self.under(np.array(event.ray_origin), np.array(event.ray_direction))
-            if query is not None:
-                self.pick(query)
+            self.pick(query)
 
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
         """The query under a ray of what is shown: by its anchor, or by its Gaussians."""
         found = self.look.support(self.choice.layer) if self.choice.anchors else None
         if found is not None:
-            numbers, _ = anchor_colors(self.look.queries, self.choice)
+            numbers, _ = anchor_colors(self.look, self.choice)
             centers = found.centers[0].numpy()[numbers]
             anchor = near_ray(centers, origin, direction, self.stage.anchor_radius)
             if anchor is not None:

@@ -9,11 +9,11 @@ from qgs_viewer.look import Look
 SIDE = 192
 """Pixels on the longer side of each photo."""
 COLUMNS = 2
-PARTS = ("content", "geometry", "result")
+PARTS = ("result", "content", "geometry")
 
 
 def attention_parts(look: Look, query: int, layer: int) -> dict[str, Picture]:
-    """Content logits, geometry bias and attention of a query, by PARTS; less those it lacks.
+    """Attention, content logits and geometry bias of a query, by PARTS; less those it lacks.
 
     All input photos in one picture, COLUMNS in a row; means over heads.
     """
@@ -21,7 +21,7 @@ def attention_parts(look: Look, query: int, layer: int) -> dict[str, Picture]:
     if weights is None or look.views is None:
         return {}
     photos = [enlarged(rgb_picture(image), SIDE) for image in look.views.images[0]]
-    parts = (weights.content, weights.geometry, weights.weights)
+    parts = (weights.weights, weights.content, weights.geometry)
     return {
         name: _sheet(attention_pictures(photos, patch_maps(part[0, :, 0], look.grid)))
         for name, part in zip(PARTS, parts, strict=True)

@@ -48,10 +48,11 @@ def scene_section(exhibits: Sequence[Exhibit]) -> ReportSection:
     return ReportSection(
         "The scene, to turn",
         "The Gaussians of the first scene above in 3D, with the input photos where they were "
-        "taken, and the anchors of the last layer as dots where there are any: of a query that is "
-        "notable in the first view of it also the support, its way through the layers as a dark "
-        "line, and lines to the patches that it reads most. Drag to turn, scroll to come closer; "
-        "W, A, S, D, Q and E walk.",
+        "taken. Where a model has anchors, dots are those of the last layer, and one query is "
+        "drawn in full: its support (the ball or ellipsoid around its anchor), the way of its "
+        "anchor through the layers as a dark line, and lines to the patches that it reads most. "
+        "Drag to turn, scroll to come closer; W, A, S, D, Q and E walk. To pick other queries, see "
+        "the scene with the command qgs view, such as qgs view rooms/locus-64.",
         {"": [tile]},
         width=600,
     )
@@ -63,7 +64,7 @@ def refinement_section(exhibits: Sequence[Exhibit]) -> ReportSection:
     return _drawn(
         "How layers move and size anchors",
         "The first scene from above, with the way of every anchor from its learned start (circle) "
-        "to the last layer (dot); then the radius of the supports, and how far each layer moves "
+        "to the last layer (dot); then the radius of their supports, and how far each layer moves "
         "the anchors: the line is the median over queries, bands hold half and 90 % of them.",
         refinement.figure(anchored) if anchored else None,
     )
@@ -73,10 +74,11 @@ def self_attention_section(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Self-attention of some queries as a graph, first and last layer, of models that tell it."""
     told, chosen = graph.telling(exhibits)
     return _drawn(
-        "Which queries read which",
-        f"The first scene from above, input cameras as triangles. Every dark dot is a query: its "
-        f"anchor before the layer, or where it has none, the place of what it adds to the photos. "
-        f"Lines lead from {graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
+        "Which queries read which: self-attention",
+        f"Queries read not only the photos but, by self-attention, each other. The first scene "
+        f"from above, input cameras as triangles. Every dark dot is a query: its anchor before the "
+        f"layer, or where it has none, the place of what it adds to the photos. Lines lead from "
+        f"{graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
         graph.figure(told, chosen) if told else None,
     )
 
@@ -92,11 +94,12 @@ def dispersion_section(shown: Shown, samples: Sequence[Sample]) -> ReportSection
     }
     labels = dispersion.scene_labels(samples)
     return _drawn(
-        "How far the Gaussians of a query scatter",
-        "Their distance to the centroid of those of their query, in every scene above: its mean, "
-        "which a few far Gaussians rule, and its median, in units of the models’ world; dashed the "
-        "mean over these scenes. Small where a query stands for one place. Where the values lie "
-        "far apart the scale is logarithmic: then the ends of bars count, not their lengths.",
+        "How far the Gaussians of a query scatter: dispersion",
+        "The distance of Gaussians to the centroid of those of their query, in every scene above: "
+        "its mean, which a few far Gaussians rule, and its median, in units of the models’ world; "
+        "dashed the mean over these scenes. Small where a query stands for one place. Where the "
+        "values lie far apart the scale is logarithmic: then the ends of bars count, not their "
+        "lengths.",
         dispersion.figure(found, labels) if len(samples) > 1 else None,
     )
 

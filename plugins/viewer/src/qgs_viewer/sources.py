@@ -22,7 +22,7 @@ from qgs.io.checkpoint import load, load_recipe
 from qgs.io.ply import load_ply
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
-from qgs_viewer.files import CAMERAS, PLY, Finished, read_finished
+from qgs_viewer.files import CAMERAS, PLY, REFINED, Finished, read_finished
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.placement import Placement
 
@@ -147,32 +147,56 @@ def _of_finished(folder: Path, device: str) -> Source:
     title = f"{found.scene.name} ({folder.name})"
     views = views_in((torch.eye(4).double(), torch.ones(())), found.scene, tuple(found.inputs))
     labels = [found.scene.label(frame) for frame in found.inputs]
-    plain = Look(found.gaussians, views, labels, tuple(found.inputs))
-    if not found.model:
-        why = "It was tuned or refined, or does not tell its model: its queries are not known."
-        return FixedSource(plain, title, (why,))
-    if "://" in found.model:
-        note = (
-            f"Its model is at {found.model}, which is fetched only where you name it, so its "
-            f"queries are not shown: view the model with `qgs view {found.model} PHOTOS`."
-        )
-        return FixedSource(plain, title, (note,))
+    plain = Look(found.gaussians, views, labels, tuple(found.inputs), background=found.background)
+    beside = _refined_beside(folder)
+    if note := _no_queries(found, folder):
+        return FixedSource(plain, title, (note, *beside))
     try:
         file = checkpoint_of(found.model)
         model, recipe = load(file, device), load_recipe(file)
         fixed = _finished_views(found, recipe.views)
-        source = ModelSource(model, found.scene, fixed, found.inputs, title)
+        source = ModelSource(model, found.scene, fixed, found.inputs, title, beside)
         means = source.look(found.inputs).gaussians.means
     except (ValueError, OSError) as error:
         note = f"Its model cannot be used, so its queries are not shown: {error}"
-        return FixedSource(plain, title, (note,))
+        return FixedSource(plain, title, (note, *beside))
     if differs := _difference(means, found.gaussians.means):
         note = (
             f"{found.model} makes other Gaussians of these photos today ({differs}), so its "
             "queries are not shown."
         )
-        return FixedSource(plain, title, (note,))
+        return FixedSource(plain, title, (note, *beside))
     return source
+
+
+def _no_queries(found: Finished, folder: Path) -> str:
+    """Why queries of a reconstruction are not looked for; "" where they are."""
+    if found.changed == "refined":
+        parent = folder.resolve().parent
+        text = "It was refined: its Gaussians are no longer those of queries."
+        if folder.resolve().name == REFINED and (parent / CAMERAS).is_file():
+            shown = folder.parent if folder.name == REFINED else parent
+            text += f" What the model predicted, with its queries: `qgs view {shown}`."
+        return text
+    if found.changed == "tuned":
+        text = "It was tuned on its photos: its model alone does not make these Gaussians, so its"
+        return f"{text} queries are not shown."
+    if not found.model:
+        return "Its cameras.json does not tell its model, so its queries are not known."
+    if "://" in found.model:
+        return (
+            f"Its model is at {found.model}, which is fetched only where you name it, so its "
+            f"queries are not shown: view the model with `qgs view {found.model} PHOTOS`."
+        )
+    return ""
+
+
+def _refined_beside(folder: Path) -> tuple[str, ...]:
+    """A note where `qgs reconstruct --refine` left a refined scene in `folder` too."""
+    refined = folder / REFINED
+    if not (refined / CAMERAS).is_file():
+        return ()
+    return (f"This is what the model predicted; refined on photos: `qgs view {refined}`.",)
 
 
 def _finished_views(found: Finished, views: ViewsConfig) -> ViewsConfig:

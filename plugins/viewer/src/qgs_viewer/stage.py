@@ -9,11 +9,10 @@ import viser
 from torch import Tensor
 from viser.transforms import SO3
 
-from qgs.drawing.figures import INK, MUTED
 from qgs.drawing.images import enlarged, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
-from qgs_viewer.choice import Choice, anchor_colors, painted, query_color
+from qgs_viewer.choice import Choice, anchor_colors, faded, ink, painted, query_color
 from qgs_viewer.look import Look
 from qgs_viewer.placement import corners, on_photo
 
@@ -21,6 +20,10 @@ PHOTO_SIDE = 256
 """Pixels on the longer side of photos in the scene: small ones are enlarged, large ones reduced."""
 FRUSTUM = 0.12
 """Depth of a camera's frustum, per distance from the input cameras to the scene."""
+WIDER = (0.25, 0.6)
+"""Shares of the most that is read from which lines are broader."""
+FAINTEST = 0.08
+"""Strength of the colour of what is hardly read."""
 SOLID = 0.1
 """Opacity of the Gaussians that tell how large a scene is."""
 _VIEWS = "/views"
@@ -44,6 +47,8 @@ class Stage:
         unit: what photos and anchors are sized by, by default `distance_to` the look.
         """
         self.unit = unit or distance_to(look)
+        plain = np.full((8, 8, 3), 255.0) * look.background
+        self.scene.set_background_image(plain.round().astype(np.uint8), "png")
         self._draw_photos(look, every)
         self.update(look, choice)
 
@@ -91,7 +96,7 @@ class Stage:
         depth = self.photo_depth / place.scale
         ends = place.points(on_photo(cameras, corners(cameras.size), depth))
         eyes = place.points(cameras.c2w[:, :3, 3])
-        self._lines(f"{_VIEWS}/inputs", frustum_lines(eyes, ends), INK, 2.0)
+        self._lines(f"{_VIEWS}/inputs", frustum_lines(eyes, ends), ink(look), 2.0)
         for view, image in enumerate(look.views.images[0]):
             corner, right, _, left = ends[view]
             turned = place.rotation @ cameras.c2w[view, :3, :3].cpu().double()
@@ -106,14 +111,14 @@ class Stage:
         if every is not None:
             ends = on_photo(every, corners(every.size), self.photo_depth / 2)
             lines = frustum_lines(every.c2w[:, :3, 3], ends)
-            self._lines(f"{_VIEWS}/others", lines, MUTED, 1.0)
+            self._lines(f"{_VIEWS}/others", lines, faded(ink(look), 0.6, look), 1.0)
 
     def _draw_anchors(self, look: Look, choice: Choice) -> None:
         found = look.support(choice.layer)
         if found is None or not choice.anchors:
             self.scene.remove_by_name("/anchors")
             return
-        numbers, colors = anchor_colors(look.queries, choice)
+        numbers, colors = anchor_colors(look, choice)
         self.scene.add_point_cloud(
             "/anchors", found.centers[0].float().numpy()[numbers], colors,
             point_size=self.anchor_radius, point_shape="circle", precision="float32",
@@ -140,13 +145,14 @@ class Stage:
             self.scene.remove_by_name("/path")
             return
         points = torch.stack([s.centers[0, choice.query] for s in found if s is not None])
-        self._lines("/path", torch.stack([points[:-1], points[1:]], 1), INK, 3.0)
+        self._lines("/path", torch.stack([points[:-1], points[1:]], 1), ink(look), 3.0)
 
     def _draw_reading(self, look: Look, choice: Choice) -> None:
         """Lines from where the query was when it read to the patches that it read most.
 
-        A square of half its width marks each, a little nearer to the camera than the photo, which
-        would hide it.
+        What is read more is stronger in colour, by its share of the most that is read, and has a
+        broader line. A square of half its width marks each patch, a little nearer to the camera
+        than the photo, which would hide it.
         """
         reading = None
         if choice.query is not None and choice.layer and choice.patches:
@@ -158,19 +164,35 @@ class Stage:
             return
         hub = look.hub(choice.query, choice.layer - 1).expand_as(reading.points)
         lines = torch.stack([hub, reading.points], 1)
-        strength = 0.25 + 0.75 * (reading.shares / reading.shares.max())[:, None].numpy()
-        pale = strength * np.array(query_color(choice.query)) + (1 - strength) * 235
-        colors = pale.round().astype(np.uint8)
-        self._lines("/reading", lines, colors[:, None].repeat(2, 1), 2.0)
+        shares = (reading.shares / reading.shares.max().clamp_min(1e-30))[:, None].numpy()
+        colors = faded(query_color(choice.query), FAINTEST + (1 - FAINTEST) * shares, look)
+        self.scene.add_frame("/reading", show_axes=False)
+        for width, among in enumerate(np.digitize(shares[:, 0], WIDER) == np.arange(3)[:, None]):
+            name, pairs = f"/reading/{width}", colors[among, None].repeat(2, 1)
+            self.scene.remove_by_name(name)
+            if among.any():
+                self._lines(name, lines[torch.from_numpy(among)], pairs, 1.0 + 1.5 * width)
         self.scene.add_point_cloud(
             "/patches", reading.points.float().numpy(), colors,
             point_size=reading.side / 4, point_shape="square", precision="float32",
         )  # fmt: skip
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
-        """Segments (n, 2, 3), `width` pixels wide."""
+        """Segments (n, 2, 3), `width` pixels wide. color: uint8 RGB of all, or (n, 2, 3) of ends.
+
+        viser 1.1.1 takes colours of ends for linear light, and one colour of all for sRGB.
+        """
         points = lines.float().cpu().numpy()
+        if np.ndim(color) == 3:
+            color = linear_light(color)
         self.scene.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
+
+
+def linear_light(colors: np.ndarray) -> np.ndarray:
+    """uint8 sRGB colours in linear light, uint8."""
+    shares = np.asarray(colors) / 255
+    light = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return (255 * light).round().astype(np.uint8)
 
 
 def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:

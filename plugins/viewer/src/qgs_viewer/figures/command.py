@@ -10,6 +10,12 @@ from rich.console import Console
 
 from qgs.cli.options import Device, Photos, Runs
 
+NAMES = (
+    "global_gaussians", "novel_views", "anchors", "refinement", "cross_attention",
+    "self_attention", "dispersion", "curves",
+)  # fmt: skip
+"""Of the figures, in their order; here so that help waits for no drawing."""
+
 app = typer.Typer(help="Figures for a paper.")
 
 
@@ -25,17 +31,19 @@ def figures(
         typer.Option(min=0, help="Query of the figures of one query; default: a notable one."),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Make this figure; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help=f"Make this figure: {', '.join(NAMES)}; repeatable."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="New folder; default: figures, figures-2, ...")
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Figures of trained models side by side, as PDF and PNG, with figures.md that explains them.
+    """Figures of trained models for a paper, as PDF and PNG.
 
-    Gaussians of a query in the whole scene, novel views with depth and error, anchors and supports,
-    cross- and self-attention, dispersion by scene, refinement by layer, training curves.
+    Models stand side by side; figures.md explains each figure. Gaussians of a query in the whole
+    scene, novel views with depth and error, anchors and supports, cross- and self-attention,
+    dispersion by scene, refinement by layer, training curves.
     """
     from qgs.cli.demo import new_folder
     from qgs.engine.distributed import choose_device

@@ -34,8 +34,8 @@ def made(show: Exhibition) -> Made:
     """See `figure`."""
     chosen = drawn_queries(show.exhibits, show.query)
     told = [
-        f"{name}: query {query.index}, whose Gaussians lie {query.spread:.3g} from their centroid "
-        "in the mean"
+        f"{name}: query {query.index}, whose Gaussians lie {query.dispersion:.3g} from their "
+        "centroid in the mean"
         for name, query in chosen.items()
     ]
     why = "The one that was asked for" if show.query is not None else "The heaviest one well inside"
@@ -76,7 +76,7 @@ def _row(axes: Sequence[Axes], shown: Exhibit, query: DrawnQuery) -> None:
     white = torch.ones(3)
     picture_panel(axes[0], rgb_picture(model.render(gaussians, camera, white).rgb[0, 0]))
     picture_panel(axes[1], query_picture(model, gaussians, [query], camera, white))
-    tag(axes[1], f"query {query.index}: mean distance to centroid {query.spread:.3g}")
+    tag(axes[1], f"query {query.index}: mean distance to centroid {query.dispersion:.3g}")
     row_label(axes[0], shown.name)
     for axis in axes:
         _frusta(axis, inputs, camera, length)
