@@ -260,6 +260,8 @@ def _recipe_with(case: Case) -> dict[str, Any]:
         "renderer": {"type": "qgs/torch"},
         "decoder": {"depth": dims.depth},
     }
+    if slot == "encoder" and "memory.keys" not in case.component.provides(case.config):
+        model |= {"decoder": {"depth": 0}, "supervision": {"layers": [0]}}  # nobody reads keys
     losses = {"photometric": {"type": "qgs/photometric"}}
     recipe: dict[str, Any] = {"recipe": 1, "plugins": [PLUGIN], "model": model, "losses": losses}
     if slot in LAYER_SLOTS:
