@@ -19,7 +19,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
     Nothing is required, as in overlays; without a `type` the options of all its slot may stand.
     """
-    layer = {name: _component(name) for name in LAYER_SLOTS}
+    layer = {name: _or_null(_component(name)) for name in LAYER_SLOTS}
     layers = {
         "description": "Overrides of single layers, by their index from 0.",
         "type": "object",
@@ -45,7 +45,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
         "model": _section(("model",), parts | {"decoder": decoder}),
     }
     for name, section in SECTIONS.items():
-        description, component = summary_of(SLOTS[name].contract), {"anyOf": [_ref(name), _NULL]}
+        description, component = summary_of(SLOTS[name].contract), _or_null(_ref(name))
         if section.named:
             description = f"By name: {description}"
             component = {"type": "object", "additionalProperties": component}
@@ -102,6 +102,12 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
 
 def _component(slot: str) -> dict[str, Any]:
     return _ref(slot) | {"description": summary_of(SLOTS[slot].contract)}
+
+
+def _or_null(component: dict[str, Any]) -> dict[str, Any]:
+    """Null drops what is inherited."""
+    told = {key: component[key] for key in component.keys() & {"description"}}
+    return {**told, "anyOf": [{"$ref": component["$ref"]}, _NULL]}
 
 
 def _ref(slot: str) -> dict[str, Any]:

@@ -71,6 +71,11 @@ def test_mistakes_do_not_validate(recipe, schema):
         jsonschema.validate(recipe, schema)
 
 
+def test_null_drops_what_is_inherited(schema):
+    decoder = {"depth": 0, "cross_attention": None, "layers": {"1": {"feed_forward": None}}}
+    jsonschema.validate({"model": {"decoder": decoder}, "losses": {"visibility": None}}, schema)
+
+
 def test_schedules_validate_where_options_may_follow(schema):
     ramp = {"schedule": "cosine", "from": 1, "to": 0.1, "over": [0, 100]}
     jumps = {"schedule": "steps", "values": [10, 1], "at": [100]}
