@@ -39,6 +39,10 @@ HEAD = D * 64 * 14 + 64 * 14
 TOKENGS_2026_6 = 362_695_680
 
 
+GSLRM_BLOCK = (D * 3 * D + D * D) + 2 * (D * 4 * D) + 2 * D
+GSLRM = (9 * 8 * 8 * D + D) + 24 * GSLRM_BLOCK + (D + D * 8 * 8 * (3 + 3 + 3 + 4 + 1))
+
+
 def parameters(recipe: str) -> int:
     path = RECIPES / recipe
     model = qgs.compose(path, overrides=[f"model.queries.count={N}"], device="meta")
@@ -58,6 +62,13 @@ def test_tokengs_2026_6(views: int, loss: str) -> None:
     encoder = EMBEDDINGS + 12 * ENCODER_BLOCK + READOUT + OF_LATENTS
     assert encoder + N * D + DECODER_BLOCK + HEAD == TOKENGS_2026_6
     assert parameters(f"tokengs/latent_{views}views_{loss}.yaml") == TOKENGS_2026_6
+
+
+@pytest.mark.parametrize("recipe", ["re10k", "dl3dv"])
+def test_gslrm(recipe: str) -> None:
+    """The paper: 300 million parameters in 24 blocks of width 1024."""
+    model = qgs.compose(RECIPES / "gslrm" / f"{recipe}.yaml", device="meta")
+    assert sum(parameter.numel() for parameter in model.parameters()) == GSLRM == 303_548_416
 
 
 def test_what_locusgs_adds_to_tokengs() -> None:
