@@ -37,7 +37,10 @@ class PixelQueries(Queries):
     """A query for each image token, with its features, that knows the rays of its patch."""
 
     name: ClassVar[str] = "pixels"
-    count = None
+
+    @property
+    def count(self) -> None:
+        """As many as there are image tokens."""
 
     @classmethod
     def requires(cls, config: ComponentConfig) -> Fields:
