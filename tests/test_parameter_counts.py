@@ -41,6 +41,10 @@ TIME_EMBEDDING = D * 2 * 8 * 8 + D
 DYNAMIC = TOKENGS_2026_6 + (1024 + 256 - N) * D + 2 * TIME_EMBEDDING
 
 
+GSLRM_BLOCK = (D * 3 * D + D * D) + 2 * (D * 4 * D) + 2 * D
+GSLRM = (9 * 8 * 8 * D + D) + 24 * GSLRM_BLOCK + (D + D * 8 * 8 * (3 + 3 + 3 + 4 + 1))
+
+
 def parameters(recipe: str) -> int:
     path = RECIPES / recipe
     model = qgs.compose(path, overrides=[f"model.queries.count={N}"], device="meta")
@@ -65,6 +69,13 @@ def test_tokengs_2026_6(views: int, loss: str) -> None:
 def test_dynamic_tokengs() -> None:
     model = qgs.compose(RECIPES / "tokengs/dynamic.yaml", device="meta")
     assert sum(parameter.numel() for parameter in model.parameters()) == DYNAMIC == 360_076_288
+
+
+@pytest.mark.parametrize("recipe", ["re10k", "dl3dv"])
+def test_gslrm(recipe: str) -> None:
+    """The paper: 300 million parameters in 24 blocks of width 1024."""
+    model = qgs.compose(RECIPES / "gslrm" / f"{recipe}.yaml", device="meta")
+    assert sum(parameter.numel() for parameter in model.parameters()) == GSLRM == 303_548_416
 
 
 def test_what_locusgs_adds_to_tokengs() -> None:

@@ -289,6 +289,8 @@ def attention(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     view = sample.targets.cameras[:, :1]
     for contender, (prediction, *_) in shown:
         model = contender.model
+        if not model.depth:
+            continue
         (drawn,) = notable_queries(model, prediction.gaussians, view, 1)
         with trace(model, layers=[model.depth], queries=[drawn.index]) as record:
             model(sample.inputs)

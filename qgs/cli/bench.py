@@ -100,7 +100,7 @@ def _show(report: dict[str, Any], console: Console) -> None:
     rows = [
         (
             " x ".join(map(str, (recipe["views"], *recipe["size"]))),
-            f"{recipe['gaussians']:,}",
+            f"{recipe['gaussians']:,}" if recipe["gaussians"] else "by the views",
             f"{recipe['parameters']['count']:,}",
             f"{recipe['parameters']['ratio']:.3f}",
             f"{recipe['parameters']['weight_bytes'] / MEBIBYTE:,.2f}",

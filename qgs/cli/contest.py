@@ -109,8 +109,10 @@ def entry_of(
 
 def _about(recipe: Recipe) -> str:
     """What the queries are and how they read the photos, in the words of these components."""
-    places = ("queries",), ("decoder", "layers", "0", "cross_attention")
-    chosen = [recipe.parts["model", *place] for place in places]
+    first = ("model", "decoder", "layers", "0")
+    readers = (*first, "cross_attention"), (*first, "layer"), ("model", "encoder")
+    reader = next(place for place in readers if place in recipe.parts)
+    chosen = [recipe.parts[place] for place in (("model", "queries"), reader)]
     return " ".join(f"{part.type}: {summary_of(part.component)}" for part in chosen)
 
 

@@ -75,7 +75,8 @@ class LatentBottleneck(MultiscaleReadout):
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
-        return {name: spec for name, spec in MEMORY_FIELDS.items() if name != "memory.patch_rays"}
+        of_patches = ("memory.patch_rays", "memory.grid")
+        return {name: spec for name, spec in MEMORY_FIELDS.items() if name not in of_patches}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """No weight decay on the latents (TokenGS release)."""

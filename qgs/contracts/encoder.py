@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from qgs.contracts.component import ComponentConfig, Fields, FieldSpec, ModelComponent
@@ -14,6 +15,7 @@ MEMORY_FIELDS: Fields = {
     "memory.values": FieldSpec(("D/h",)),
     "memory.features": FieldSpec(("D",)),
     "memory.patch_rays": FieldSpec((6,), frame="world"),
+    "memory.grid": FieldSpec((3,), torch.int64),  # no tensor: three numbers for all tokens
 }
 
 

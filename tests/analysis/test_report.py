@@ -112,6 +112,13 @@ def test_queries_without_a_place_have_no_anchor_section():
     assert "token" not in re.sub(r"data:[^\"]+|[a-z]*TokenGS", "", page)
 
 
+def test_a_model_without_layers_has_no_attention_to_show():
+    model = {**PLAIN["model"], "decoder": {"depth": 0}, "supervision": {"layers": [0]}}
+    page = page_of({**PLAIN, "model": model}, "without layers")
+    assert "What one query reads" not in page
+    assert page.count("<h2>") == 6
+
+
 def test_names_cannot_break_the_page():
     page = page_of(PLAIN, "<script>alert(1)</script>")
     assert "<script>alert" not in page

@@ -41,6 +41,13 @@ def test_tokengs_against_locusgs(tmp_path: Path) -> None:
     assert re.search(r"tokengs +│ 3 x 16 x 24", result.output)
 
 
+def test_a_model_whose_gaussians_depend_on_the_views() -> None:
+    words = ("--size", "16x24", "--rounds", "2", "--warmup", "0", "--device", "cpu")
+    result = run_qgs("bench", RECIPES / "tiny/gslrm.yaml", *words, "--set", "model.width=16")
+    assert result.exit_code == 0, result.output
+    assert re.search(r"gslrm +│ 2 x 16 x 24 +│ by the views", result.output)
+
+
 def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     assert bench(TOKENGS, "--json", file).exit_code == 0

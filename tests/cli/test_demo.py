@@ -10,7 +10,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import qgs
-from qgs.cli.contest import curves_of, resolve_fairly
+from qgs.cli.contest import _about, curves_of, resolve_fairly
 from qgs.cli.demo import new_folder
 from qgs.cli.trained import WINDOWS, checkpoints, judge, remarks
 from qgs.composer import resolve
@@ -237,6 +237,14 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo" / "report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo")
+
+
+@pytest.mark.parametrize(("depth", "reader"), [(0, "qgs/multiview_vit: "), (1, "qgs/content: ")])
+def test_a_model_is_told_by_its_queries_and_by_what_reads_the_photos(depth, reader):
+    model = {"decoder": {"depth": depth}, "supervision": {"layers": [depth]}}
+    told = _about(resolve({"recipe": 1, "model": model}))
+    assert told.startswith("qgs/latent: ")
+    assert reader in told
 
 
 def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from qgs.composer.registry import available_plugins, load_registry
 from qgs.composer.schema import recipe_schema
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-SHIPPED = ["c3g", "ellipsoid", "locus", "rooms"]
+SHIPPED = ["c3g", "ellipsoid", "gslrm", "locus", "rooms"]
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +69,11 @@ def test_recipes_validate(path, schema):
 def test_mistakes_do_not_validate(recipe, schema):
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(recipe, schema)
+
+
+def test_null_drops_what_is_inherited(schema):
+    decoder = {"depth": 0, "cross_attention": None, "layers": {"1": {"feed_forward": None}}}
+    jsonschema.validate({"model": {"decoder": decoder}, "losses": {"visibility": None}}, schema)
 
 
 def test_schedules_validate_where_options_may_follow(schema):

@@ -58,6 +58,21 @@ class TokenQueries(Queries):
         return QueryState(self.norm(memory.features))
 
 
+class RowQueries(TokenQueries):
+    """A query for every row of patches."""
+
+    name: ClassVar[str] = "rows"
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        return {**FEATURES, "memory.grid": MEMORY_FIELDS["memory.grid"]}
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        assert memory.grid is not None
+        x_BVRCD = self.norm(memory.features).unflatten(1, memory.grid)
+        return QueryState(x_BVRCD.mean(3).flatten(1, 2))
+
+
 class BrightQueries(TokenQueries):
     """Queries of the tokens, of which dark ones are left out: their number varies by scene."""
 
@@ -149,7 +164,7 @@ class FeatureHead(GaussianHead):
         return replace(super().forward(state), features=x_BNK2)
 
 
-OF_PHOTOS = (TokenQueries, BrightQueries, JointLayer, BlindEncoder, WideQueries)
+OF_PHOTOS = (TokenQueries, RowQueries, BrightQueries, JointLayer, BlindEncoder, WideQueries)
 COMPONENTS = (*OF_PHOTOS, FeatureLoss, FeatureHead)
 PLUGIN = Plugin("other", CONTRACT_VERSION, COMPONENTS)
 NO_LAYERS = {"depth": 0}
@@ -310,6 +325,19 @@ def test_what_needs_keys_or_rays_is_refused_beside_an_encoder_without() -> None:
     assert wide(views()).gaussians.count == 24
     with pytest.raises(KeyError, match="the image memory has no keys; its encoder does not"):
         wide.encoder(views())["keys"]
+
+
+def test_what_needs_the_grid_is_refused_beside_learned_latents() -> None:
+    rows: Any = {
+        "queries": {"type": "other/rows"},
+        "decoder": NO_LAYERS,
+        "supervision": {"layers": [0]},
+    }
+    assert made(**rows)(views()).gaussians.count == 2 * 3 * 2  # views, rows, K
+    latents = {"type": "qgs/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
+    (told,) = refused(**rows, encoder=latents)
+    assert "`other/rows` needs memory.grid (3 int64), which nothing before it provides" in told
+    assert "use `qgs/multiview_vit` in the slot `encoder`" in told
 
 
 def test_a_layer_that_forgets_the_memory_is_reported() -> None:

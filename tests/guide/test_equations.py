@@ -32,6 +32,8 @@ Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-at
 Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in features |
     refinement | means | Gaussians in the anchor's frame
 Joint attention (C3G): joint layer | Gaussian of a query | mean of it | image tokens
+GS-LRM: token of a patch | block of GS-LRM | ray of a Gaussian | distance | means of pixels |
+    attributes of pixels
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation
     | colour along a direction d | rendering
 Objective (both papers): photometric | L1, LPIPS | dynamic | visibility | visibility of anchors |
@@ -56,6 +58,11 @@ CONSTANTS = [
     ("colour, scale, opacity, rotation", "opacity_bias", "sigmoid(t - {:g})"),
     ("rendering", "dilation", "dilation {:g} px²"),
     ("photometric", "ssim_weight", "MSE + {:g} (1 - SSIM) / 2"),
+    ("distance", "near", "(1 - w) · {:g} +"),
+    ("distance", "far", "w · {:g},"),
+    ("attributes of pixels", "scale_bias", "exp(min(t - {:g}"),
+    ("attributes of pixels", "scale_limit", "{:g}))"),
+    ("attributes of pixels", "opacity_bias", "sigmoid(t - {:g})"),
     ("visibility", "weight", "weight {:.1f}"),
     ("visibility", "clamp", "at most {:g}"),
     ("visibility of anchors", "weight", "weight {:g}"),

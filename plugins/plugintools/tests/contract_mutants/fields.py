@@ -104,6 +104,19 @@ class ReadsAFieldOfThePrediction(Loss):
         return {"small": small if radius is None else small + radius.mean()}
 
 
+@mutant(CHECK, "NoneType")
+class ReadsTheGridUndeclared(ContentCrossAttention):
+    def forward(self, state, memory):
+        return super().forward(state, memory) / memory.grid[0]
+
+
+@mutant("requires_are_read", "requires memory.grid, which")
+class RequiresTheGridForNothing(ContentCrossAttention):
+    @classmethod
+    def requires(cls, config):
+        return {**super().requires(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
+
+
 @mutant(
     "requires_are_read",
     "requires memory.features, which",

@@ -232,6 +232,16 @@ class IgnoresImages(ChangedEncoder):
         return replace(views, images=0 * views.images)
 
 
+@mutant(
+    "tokens_are_those_of_the_grid",
+    "says that there is a grid, and there is none",
+    also="view_permutation",
+)
+class PromisesAGrid(MultiViewViT):
+    def forward(self, views):
+        return replace(super().forward(views), grid=None)
+
+
 LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
 
 

@@ -110,6 +110,10 @@ class TurnsAutocastOff(PlacesByALayer):
 class ReadsTheFirstViewMost(ContentCrossAttention):
     ordered_views = True
 
+    @classmethod
+    def requires(cls, config):
+        return {**super().requires(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
+
     def forward(self, state, memory):
         views = memory.grid[0]
         values = memory.values.unflatten(2, (views, -1))

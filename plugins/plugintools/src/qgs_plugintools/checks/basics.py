@@ -116,6 +116,7 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
                     *sizes_of(spec, case.dims),
                 )
                 for name, spec in case.component.provides(case.config).items()
+                if name != "memory.grid"  # no tensor
             }
         case "queries" | "refinement" | "layer":
             count = module.count if case.slot == "queries" else count

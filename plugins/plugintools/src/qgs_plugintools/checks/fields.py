@@ -1,5 +1,6 @@
 """Fields of the state: what a component reads and writes is what it declares, and recipes obey."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -65,6 +66,9 @@ def check_reads_within_requires(case: Case) -> None:
         unread = {name for name in leaves(inputs) if name.startswith("rendering.")}
     poisoned = mapped(inputs, lambda name, x: x + torch.nan if name in unread else x)
     names = ", ".join(sorted(unread))
+    if "memory" in inputs and "memory.grid" not in required:
+        poisoned["memory"] = replace(poisoned["memory"], grid=None)
+        unread |= {"memory.grid"}
     for mode in each_mode(module):
         asked: set[str] = set()
         with seeded(0):
@@ -123,13 +127,24 @@ def check_requires_are_read(case: Case) -> None:
     module, inputs = case.lively(), inputs_of(case)
     outputs = module(*inputs.values())
     for field in case.component.requires(case.config):
-        rendered = f"rendering.{field.removeprefix('gaussians.')}"
-        full = {name for name in leaves(inputs) if name.endswith((field, rendered))}
-        others = [leaves(inputs_of(case, seed=seed)) for seed in (1, 2, 3)]
-        others.append(leaves(map_tensors(lambda x: x.roll(1, 1), inputs)))  # rays have no seed
-        changed = [mapped(inputs, lambda n, x, o=o, f=full: o[n] if n in f else x) for o in others]
+        changed = list(_with_others(case, inputs, field))
         read = any(difference(outputs, module(*given.values())) for given in changed)
         expect(read, f"it requires {field}, which changes nothing")
+
+
+def _with_others(case: Case, inputs: Inputs, field: str) -> Iterator[Inputs]:
+    """`inputs` with something else for a required field."""
+    if field == "memory.grid":
+        views, rows, columns = inputs["memory"].grid
+        for grid in ((views, columns, rows), (columns, rows, views)):
+            yield {**inputs, "memory": replace(inputs["memory"], grid=grid)}
+        return
+    rendered = f"rendering.{field.removeprefix('gaussians.')}"
+    full = {name for name in leaves(inputs) if name.endswith((field, rendered))}
+    others = [leaves(inputs_of(case, seed=seed)) for seed in (1, 2, 3)]
+    others.append(leaves(map_tensors(lambda x: x.roll(1, 1), inputs)))  # rays have no seed
+    for other in others:
+        yield mapped(inputs, lambda n, x, o=other: o[n] if n in full else x)
 
 
 @check({"layer", "refinement", "queries"})

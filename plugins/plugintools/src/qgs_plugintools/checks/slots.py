@@ -346,6 +346,8 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         views = map_tensors(lambda x: x[:1], views)
         memory = module(views)
         if memory.grid is None:
+            declared = "memory.grid" in case.component.provides(case.config)
+            expect(not declared, "`provides` says that there is a grid, and there is none")
             continue
         patch, grid = _patch_size(where, views, memory), memory.grid
         tokens = torch.randperm(math.prod(grid), generator=torch.Generator().manual_seed(0))

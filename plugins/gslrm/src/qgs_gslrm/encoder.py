@@ -1,0 +1,126 @@
+"""`gslrm/transformer`: patches of colours and rays, one linear layer, a plain transformer."""
+
+from collections.abc import Iterable
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components import NORM_EPS
+from qgs.components.blocks import merge_heads, split_heads
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    ComponentConfig,
+    Encoder,
+    Fields,
+    ModelDims,
+    Problem,
+    RecipeContext,
+)
+from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.types import ImageMemory, Views
+
+CHANNELS = 9
+"""Per pixel: 2 RGB - 1, moment o x d and unit direction d of its ray (paper, section 3.1)."""
+
+
+class Block(nn.Module):
+    """Pre-norm self-attention and MLP (exact GELU), no biases: (B, M, D) -> (B, M, D)."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: float, norm_eps: float) -> None:
+        super().__init__()
+        self.heads = heads
+        hidden = int(mlp_ratio * width)
+        self.norm1 = nn.LayerNorm(width, norm_eps, bias=False)
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+        self.proj = nn.Linear(width, width, bias=False)
+        self.norm2 = nn.LayerNorm(width, norm_eps, bias=False)
+        self.fc1 = nn.Linear(width, hidden, bias=False)
+        self.fc2 = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x_BMD: Tensor) -> Tensor:
+        """The tokens after both."""
+        parts = self.qkv(self.norm1(x_BMD)).chunk(3, -1)
+        q_BhMd, k_BhMd, v_BhMd = (split_heads(part, self.heads) for part in parts)
+        read_BhMd = F.scaled_dot_product_attention(q_BhMd, k_BhMd, v_BhMd)
+        x_BMD = x_BMD + self.proj(merge_heads(read_BhMd))
+        return x_BMD + self.fc2(F.gelu(self.fc1(self.norm2(x_BMD))))
+
+
+class Transformer(Encoder):
+    """A token for each patch of all views, through blocks of self-attention over all of them.
+
+    Its memory has features, rays and the grid, but neither keys nor values: GS-LRM has no decoder.
+    """
+
+    name: ClassVar[str] = "transformer"
+
+    class Config(ComponentConfig):
+        """Defaults are the paper's."""
+
+        patch_size: int = Field(default=8, ge=1)
+        """P, side of a patch, pixels; must divide both sides of the image."""
+        depth: int = Field(default=24, ge=0, le=256)
+        """Number of blocks."""
+        mlp_ratio: float = Field(default=4.0, ge=1)
+        """Hidden width of the MLPs (rounded down) over the model's width."""
+        init_std: float = Field(default=0.02, gt=0)
+        """Standard deviation of the normal distribution that all weights of linear layers start
+        from."""
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.embedding = nn.Linear(CHANNELS * config.patch_size**2, dims.width, bias=False)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps, bias=False)
+        self.blocks = nn.ModuleList(
+            Block(dims.width, dims.heads, config.mlp_ratio, config.norm_eps)
+            for _ in range(config.depth)
+        )
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.normal_(module.weight, std=config.init_std)
+
+    @classmethod
+    def provides(cls, config: Config) -> Fields:
+        """Features, rays and the grid."""
+        known = ("memory.features", "memory.patch_rays", "memory.grid")
+        return {name: MEMORY_FIELDS[name] for name in known}
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """A patch that does not divide the images."""
+        size, patch = context.image_size, config.patch_size
+        if size and any(side % patch for side in size):
+            nearest = [max(round(side / patch), 1) * patch for side in size]
+            yield Problem(
+                "patch_size",
+                f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
+                f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
+            )
+
+    def forward(self, views: Views) -> ImageMemory:
+        """Features (B, M, D), before any last norm, which belongs to the head.
+
+        Raises ValueError when the patch does not divide the images.
+        """
+        patch, (height, width) = self.config.patch_size, views.cameras.size
+        if height % patch or width % patch:
+            raise ValueError(
+                f"images of {height} x {width} cannot be cut into patches of {patch}; "
+                "resize the views, or compose the model with another patch_size"
+            )
+        plucker_BV6HW = plucker_rays(views.cameras)
+        pixels_BV9HW = torch.cat([2 * views.images - 1, plucker_BV6HW], 2)
+        x_BMC = rearrange(pixels_BV9HW, "b v c (h p) (w q) -> b (v h w) (p q c)", p=patch, q=patch)
+        x_BMD = self.norm(self.embedding(x_BMC))
+        for block in self.blocks:
+            x_BMD = block(x_BMD)
+        grid = (views.images.shape[1], height // patch, width // patch)
+        return ImageMemory(x_BMD, patch_rays=patch_rays(plucker_BV6HW, patch), grid=grid)

@@ -1,0 +1,141 @@
+"""`gslrm/pixels`, `gslrm/along_rays`: a query for each image token, means along rays of pixels."""
+
+import math
+from typing import ClassVar, Self
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    Centers,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    OptionError,
+    Queries,
+)
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras, ImageMemory, QueryState, Views
+
+PATCH = "gslrm.patch"
+
+PATCH_FIELD: Fields = {
+    PATCH: FieldSpec(
+        (4, 3),
+        frame="world",
+        encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
+    )
+}
+"""The rays of all points of a patch (B, N, 4, 3): they are affine in the place on the patch."""
+
+
+class PixelQueries(Queries):
+    """A query for each image token, with its features, that knows the rays of its patch."""
+
+    name: ClassVar[str] = "pixels"
+
+    @property
+    def count(self) -> None:
+        """As many as there are image tokens."""
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        """Tokens of patches, as wide as the model."""
+        return {name: MEMORY_FIELDS[name] for name in ("memory.features", "memory.grid")}
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        """The rays of the patch."""
+        return PATCH_FIELD
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """Features (B, M, D) of the tokens, `gslrm.patch` (B, M, 4, 3)."""
+        assert memory.grid is not None
+        _, rows, columns = memory.grid
+        return QueryState(memory.features, {PATCH: patches(views.cameras, rows, columns)})
+
+
+@full_precision
+def patches(cameras: Cameras, rows: int, columns: int) -> Tensor:
+    """`gslrm.patch` of images (B, V) cut into rows x columns patches: (B, V*rows*columns, 4, 3)."""
+    (height, width), c2w = cameras.size, cameras.c2w
+    options = {"dtype": c2w.dtype, "device": c2w.device}
+    left = torch.arange(columns, **options) * (width / columns)
+    upper = torch.arange(rows, **options) * (height / rows)
+    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
+    x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
+    y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
+    zero, one = torch.zeros_like(x_BVRC), torch.ones_like(x_BVRC)
+    across, down = (width / columns / fx)[..., None], (height / rows / fy)[..., None]
+    parts = ((x_BVRC, y_BVRC, one), (across + zero, zero, zero), (zero, down + zero, zero))
+    local_BVRC33 = torch.stack([torch.stack(part, -1) for part in parts], -2)
+    world_BVRC33 = torch.einsum("bvij,bvrckj->bvrcki", c2w[..., :3, :3], local_BVRC33)
+    origin_BVRC13 = c2w[:, :, None, None, None, :3, 3].expand_as(world_BVRC33[..., :1, :])
+    return torch.cat([origin_BVRC13, world_BVRC33], -2).flatten(1, 3)
+
+
+@full_precision
+def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """World-frame origins (B, N, 1, 3) and unit directions (B, N, K, 3) of K = `count` rays.
+
+    They go through the centres of a grid of K equal cells of the patch, row by row, as nearly
+    square as K allows: through those of its pixels where K is their number.
+    """
+    origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
+    rows = next(n for n in range(math.isqrt(count), 0, -1) if count % n == 0)
+    columns = count // rows
+    u_c = (torch.arange(columns).to(patch_BN43) + 0.5) / columns
+    v_r = (torch.arange(rows).to(patch_BN43) + 0.5) / rows
+    along_BNc3 = across_BN3[..., None, :] * u_c[:, None]
+    along_BNr3 = corner_BN3[..., None, :] + down_BN3[..., None, :] * v_r[:, None]
+    directions = rearrange(along_BNr3, "b n r x -> b n r 1 x") + along_BNc3[..., None, :, :]
+    return origin_BN3[..., None, :], F.normalize(directions.flatten(2, 3), dim=-1)
+
+
+class AlongRays(Centers):
+    """mean = o + t d on the ray of the Gaussian's pixel, t = (1 - w) near + w far.
+
+    w is the sigmoid of the mean of the three raw offsets; d is a unit vector. K Gaussians of a
+    query stand on the rays of `patch_rays_at`.
+    """
+
+    name: ClassVar[str] = "along_rays"
+
+    class Config(ComponentConfig):
+        near: float = Field(default=0.0, ge=0)
+        """Least distance from the camera, world units."""
+        far: float = Field(default=500.0, gt=0)
+        """Largest distance from the camera, world units (500 for scenes, in the paper)."""
+
+        @model_validator(mode="after")
+        def _far_is_beyond_near(self) -> Self:
+            if self.far <= self.near:
+                raise OptionError(
+                    f"far must be beyond near, got near {self.near:g} and far {self.far:g}",
+                    "give the distances at which the scene begins and ends, near first",
+                )
+            return self
+
+    config: Config
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """The rays of the patch."""
+        return PATCH_FIELD
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        origins, directions = patch_rays_at(state[PATCH], offsets.shape[2])
+        return _placed(origins, directions, offsets, self.config.near, self.config.far)
+
+
+@full_precision
+def _placed(
+    origins: Tensor, directions: Tensor, offsets: Tensor, near: float, far: float
+) -> Tensor:
+    w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
+    return origins + ((1 - w_BNK1) * near + w_BNK1 * far) * directions
