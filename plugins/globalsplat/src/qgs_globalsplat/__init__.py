@@ -36,7 +36,7 @@ plugin = Plugin(
             "masked_queries_are_not_read": "what a mask leaves out here are not places without a "
             "query, but tokens that decode nothing: registers, which the others read"
         },
-        PatchEncoder.Config(): {
+        PatchEncoder.Config(): {  # type: ignore[reportUnhashable]  # frozen, which pyright misses
             "view_permutation": "its registers are of no view, so that its memory has no grid to "
             "permute by; its patches are permuted with their views, as without registers"
         },
