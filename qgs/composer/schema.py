@@ -101,7 +101,8 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
 
 
 def _component(slot: str) -> dict[str, Any]:
-    return _ref(slot) | {"description": summary_of(SLOTS[slot].contract)}
+    """A component, or null, which drops an inherited one."""
+    return {"anyOf": [_ref(slot), _NULL], "description": summary_of(SLOTS[slot].contract)}
 
 
 def _ref(slot: str) -> dict[str, Any]:
