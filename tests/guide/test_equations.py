@@ -30,6 +30,9 @@ Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-at
     self-attention | PE | refinement | means | means, ablation
 Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in features |
     refinement | means | Gaussians in the anchor's frame
+GlobalSplat (its paper; what is ours is in the README of the plugin): token of a patch | streams |
+    round | candidates | merging | Gaussians of a token | rotation from 6D | shifted means |
+    soft frustum | regularisers | two passes
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation
     | colour along a direction d | rendering
 Objective (both papers): photometric | L1, LPIPS | visibility | visibility of anchors |
@@ -57,6 +60,16 @@ CONSTANTS = [
     ("visibility", "weight", "weight {:.1f}"),
     ("visibility", "clamp", "at most {:g}"),
     ("visibility of anchors", "weight", "weight {:g}"),
+    ("streams", "std", "N(0, {:g})"),
+    ("round", "block_layer_scale", "LayerScale {:g}"),
+    ("candidates", "scale_bias", "log scale + ({:g})"),
+    ("candidates", "scale_max", "ln {:g} + 2"),
+    ("candidates", "opacity_bias", "softplus(t + ({:g}))"),
+    ("shifted means", "z_offset", "δ + (0, 0, {:g})"),
+    ("soft frustum", "weight", "weight {:g}"),
+    ("regularisers", "opacity_weight", "{:g} mean α"),
+    ("two passes", "alpha_weight", "{:g} \\|A"),
+    ("two passes", "depth_weight", "{:g} \\|D"),
 ]
 """Name of a row, option, how the row's formula gives the option's default."""
 
