@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 DISTRIBUTIONS = {
-    "qgs.plugins": {name: f"query-gaussians-{name}" for name in ("locus", "ellipsoid", "globalsplat", "rooms")},
+    "qgs.plugins": {
+        name: f"query-gaussians-{name}" for name in ("locus", "ellipsoid", "globalsplat", "rooms")
+    },
     "qgs.commands": {"data": "query-gaussians-datatools"}
     | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
