@@ -34,7 +34,8 @@ class Round(DecoderLayer):
         """Defaults are GlobalSplat's."""
 
         memory_width: int | None = Field(default=None, ge=1)
-        """Width of the image memory's features; null for the model's width."""
+        """Width of the image memory's features where the encoder has one of its own (of
+        globalsplat/patches, rgb_width + ray_width); null for features of the model's width."""
         blocks: int = Field(default=2, ge=0)
         """ViT blocks of each stream."""
         block_layer_scale: float = Field(default=0.01, gt=0)
