@@ -31,7 +31,8 @@ __version__ = "0.1.0"
 
 DISTRIBUTIONS = {
     "qgs.plugins": {
-        name: f"query-gaussians-{name}" for name in ("locus", "ellipsoid", "rooms", "c3g", "gslrm")
+        name: f"query-gaussians-{name}"
+        for name in ("locus", "ellipsoid", "rooms", "c3g", "gslrm", "globalsplat")
     },
     "qgs.commands": {"data": "query-gaussians-datatools"}
     | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")

@@ -21,7 +21,17 @@ from qgs_plugintools.new_command import rendered
 import qgs
 
 ROOT = Path(__file__).parents[1]
-PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "rooms", "datatools", "viewer", "plugintools")
+PLUGINS = (
+    "locus",
+    "ellipsoid",
+    "c3g",
+    "gslrm",
+    "globalsplat",
+    "rooms",
+    "datatools",
+    "viewer",
+    "plugintools",
+)
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "qgs": "query-gaussians",

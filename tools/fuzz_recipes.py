@@ -223,7 +223,8 @@ def sections(case: Case) -> None:
     which = case.random.choice(["losses", "metrics", "plugins", "optimizer", "data"])
     many = {f"n{n}": case.random.choice([{"type": kinds[n % 5]}, None]) for n in range(count)}
     if which == "plugins":
-        known = ["locus", "rooms", "ellipsoid", "qgs", "none", 3, None, "../x", "a" * 500]
+        names = ["locus", "rooms", "ellipsoid", "globalsplat", "qgs", "none", "../x", "a" * 500]
+        known = [*names, 3, None]
         case.tree["plugins"] = [case.random.choice(known) for _ in range(min(count, 300))]
     elif which == "optimizer":
         patterns = ["*", "model.*", "encoder", "losses.*", "[", "x", "decoder.layers.*.*", "*" * 90]

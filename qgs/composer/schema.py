@@ -101,7 +101,7 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
 
 
 def _component(slot: str) -> dict[str, Any]:
-    """null drops what is inherited."""
+    """A component, or null, which drops an inherited one."""
     return {"anyOf": [_ref(slot), _NULL], "description": summary_of(SLOTS[slot].contract)}
 
 

@@ -34,6 +34,9 @@ Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in fe
 Joint attention (C3G): joint layer | Gaussian of a query | mean of it | image tokens
 GS-LRM: token of a patch | block of GS-LRM | ray of a Gaussian | distance | means of pixels |
     attributes of pixels
+GlobalSplat (its paper; what is ours is in the README of the plugin): token of a patch | streams |
+    round | candidates | merging | Gaussians of a token | rotation from 6D | shifted means |
+    soft frustum | regularisers | two passes
 Gaussians (both papers): position | free means | colour, scale, opacity, rotation
     | colour along a direction d | rendering
 Objective (both papers): photometric | L1, LPIPS | dynamic | visibility | visibility of anchors |
@@ -66,6 +69,16 @@ CONSTANTS = [
     ("visibility", "weight", "weight {:.1f}"),
     ("visibility", "clamp", "at most {:g}"),
     ("visibility of anchors", "weight", "weight {:g}"),
+    ("streams", "std", "N(0, {:g})"),
+    ("round", "block_layer_scale", "LayerScale {:g}"),
+    ("candidates", "scale_bias", "log scale + ({:g})"),
+    ("candidates", "scale_max", "ln {:g} + 2"),
+    ("candidates", "opacity_bias", "softplus(t + ({:g}))"),
+    ("shifted means", "z_offset", "δ + (0, 0, {:g})"),
+    ("soft frustum", "weight", "weight {:g}"),
+    ("regularisers", "opacity_weight", "{:g} mean α"),
+    ("two passes", "alpha_weight", "{:g} \\|A"),
+    ("two passes", "depth_weight", "{:g} \\|D"),
 ]
 """Name of a row, option, how the row's formula gives the option's default."""
 

@@ -53,6 +53,7 @@ class VggtFeatures(Encoder):
 
     name: ClassVar[str] = "vggt_features"
     ordered_views = True  # VGGT marks the first one
+    reads_cameras = False
 
     class Config(ComponentConfig):
         weights: str = Field(min_length=1)

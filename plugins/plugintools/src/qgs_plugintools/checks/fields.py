@@ -297,8 +297,9 @@ def _recipe_with(case: Case) -> dict[str, Any]:
     }
     losses = {"photometric": {"type": "qgs/photometric"}}
     recipe: dict[str, Any] = {"recipe": 1, "plugins": [PLUGIN], "model": model, "losses": losses}
-    if slot == "encoder" and "memory.keys" not in case.component.provides(case.config):
-        model |= {"decoder": {"depth": 0}, "supervision": {"layers": [0]}}  # no layer could read it
+    of_encoder = case.component.provides(case.config) if slot == "encoder" else MEMORY_FIELDS
+    if not {"memory.keys", "memory.values"} <= of_encoder.keys():  # the default layers read both
+        model |= {"decoder": {"depth": 0}, "supervision": {"layers": [0]}}
     if slot in LAYER_SLOTS:
         model["decoder"][slot] = chosen
     elif slot in MODEL_SLOTS:

@@ -1,0 +1,49 @@
+"""GlobalSplat for qgs: scene tokens in two streams, candidates merged by gates, two passes."""
+
+from qgs.contracts import ExpectedError, Plugin
+from qgs_globalsplat.encoder import PatchEncoder
+from qgs_globalsplat.head import MergingHead, ShiftedCenters
+from qgs_globalsplat.losses import Frustum, Regularisers
+from qgs_globalsplat.objective import TwoPasses
+from qgs_globalsplat.rounds import Round
+from qgs_globalsplat.slots import SlotQueries
+
+plugin = Plugin(
+    name="globalsplat",
+    contract_version=2,
+    components=(
+        PatchEncoder,
+        SlotQueries,
+        Round,
+        MergingHead,
+        ShiftedCenters,
+        Frustum,
+        Regularisers,
+        TwoPasses,
+    ),
+    examples=(
+        PatchEncoder.Config(patch_size=4, rgb_width=24, ray_width=16, bands=2, registers=0),
+        SlotQueries.Config(count=12, extra=3, std=0.3),
+        SlotQueries.Config(count=8, extra=0),
+        Round.Config(memory_width=40, blocks=1, mlp_ratio=2.0, block_layer_scale=0.3),
+        MergingHead.Config(candidates=8, level=1.25, position_std=0.1),
+        MergingHead.Config(candidates=4, level=2.0, sh_degree=0),
+        MergingHead.Config(candidates=8, level=0.0, sh_degree=1, scale_min=0.3, scale_max=0.5),
+        Frustum.Config(weight=1.0, softness=0.2),
+    ),
+    exemptions={
+        Round: {
+            "masked_queries_are_not_read": "what a mask leaves out here are not places without a "
+            "query, but tokens that decode nothing: registers, which the others read"
+        },
+        PatchEncoder.Config(): {  # type: ignore[reportUnhashable]  # frozen, which pyright misses
+            "view_permutation": "its registers are of no view, so that its memory has no grid to "
+            "permute by; its patches are permuted with their views, as without registers"
+        },
+        TwoPasses: {
+            "objective_gives_an_outcome": ExpectedError(
+                ValueError, "it refuses two input views, of which both passes would be the same"
+            )
+        },
+    },
+)

@@ -1,0 +1,176 @@
+"""`globalsplat/merging_head`, `globalsplat/shifted`: from two streams to Gaussians."""
+
+import math
+from collections.abc import Iterable
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field, field_validator
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    Centers,
+    ComponentConfig,
+    Fields,
+    Head,
+    ModelDims,
+    OptionError,
+    Problem,
+    RecipeContext,
+)
+from qgs.geometry.precision import full_precision
+from qgs.types import GaussianAttributes, QueryState
+from qgs_globalsplat.merging import growth, merged, rotation_6d, stages
+from qgs_globalsplat.slots import TEXTURE, TEXTURE_FIELD
+
+CHANNELS = (3, 3, 6, 1)
+"""Of geometry, per candidate: position, log scale, rotation, opacity; then the gate."""
+C0 = 0.28209479177387814
+"""The spherical harmonic of degree 0."""
+
+
+class MergingHead(Head):
+    """Candidates of every token, whose blocks a softmax gate merges into K = 2^level Gaussians.
+
+    Geometry decodes position, log scale, 6D rotation, opacity and gate; texture the coefficients of
+    spherical harmonics. Blocks are averaged: positions, rotations, coefficients, log scales, to
+    which log(size of the block) / 3 is added, and logs of transmittance, which opacities are.
+    Between two whole levels both are shown, with logs of transmittance scaled by their shares.
+    """
+
+    name: ClassVar[str] = "merging_head"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"level"})
+
+    class Config(ComponentConfig):
+        """Defaults are GlobalSplat's, with `level` at its end; how weights start is ours."""
+
+        candidates: int = Field(default=16, ge=1)
+        """Candidates of each token, a power of two."""
+        level: float = Field(default=3.0, ge=0)
+        """s: each token gives 2^s Gaussians; between whole numbers, those of both neighbours."""
+        sh_degree: int = Field(default=3, ge=0, le=3)
+        """Degree of the spherical harmonics; 0 for colours that are the same from anywhere."""
+        init_std: float = Field(default=0.02, gt=0)
+        """Standard deviation of the truncated normal that the weights start from."""
+        position_std: float | None = Field(default=None, gt=0)
+        """The same for the weights that make positions; null for `init_std`."""
+        scale_bias: float = -2.0
+        """Added to raw log scales."""
+        scale_min: float = Field(default=1e-4, gt=0)
+        """Scales of candidates are at least 1/e of it, world units."""
+        scale_max: float = Field(default=0.05, gt=0)
+        """Scales of candidates are at most e^2 times it, world units."""
+        opacity_bias: float = -5.0
+        """Added to the opacity logits."""
+
+        @field_validator("candidates")
+        @classmethod
+        def _is_a_power_of_two(cls, candidates: int) -> int:
+            if candidates & (candidates - 1):
+                nearest = 2 ** round(math.log2(candidates))
+                raise OptionError(f"must be a power of two, got {candidates}", f"write {nearest}")
+            return candidates
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.coefficients = (config.sh_degree + 1) ** 2
+        self.geometry_norm = nn.LayerNorm(dims.width)
+        self.geometry = nn.Linear(dims.width, config.candidates * (sum(CHANNELS) + 1))
+        self.texture_norm = nn.LayerNorm(dims.width)
+        self.texture = nn.Linear(dims.width, config.candidates * self.coefficients * 3)
+        for linear in (self.geometry, self.texture):
+            nn.init.zeros_(linear.bias)
+            nn.init.trunc_normal_(linear.weight, std=config.init_std)
+        if config.position_std is not None:
+            rows_C3D = torch.empty(config.candidates, CHANNELS[0], dims.width)
+            nn.init.trunc_normal_(rows_C3D, std=config.position_std)
+            with torch.no_grad():
+                self.geometry.weight.unflatten(0, (config.candidates, -1))[:, :3] = rows_C3D
+
+    @classmethod
+    def requires(cls, config: ComponentConfig) -> Fields:
+        """The stream of texture."""
+        return TEXTURE_FIELD
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """More Gaussians than candidates; scales without a range."""
+        most = int(math.log2(config.candidates))
+        if config.level > most:
+            reason = f"2^{config.level:g} Gaussians cannot be merged of {config.candidates}"
+            yield Problem("level", reason, f"write at most {most}, or raise `candidates`")
+        if config.scale_min >= config.scale_max:
+            reason = f"it is not below `scale_max`, {config.scale_max:g}"
+            yield Problem("scale_min", reason, "write a smaller one")
+
+    @property
+    def gaussians_per_query(self) -> int:
+        """K at the present level; during a blend that of both its levels."""
+        return sum(count for count, _ in stages(self.config.level))
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        """Candidates, merged, and what they are of Gaussians."""
+        each = (self.config.candidates, -1)
+        geometry = self.geometry(self.geometry_norm(state.features)).unflatten(-1, each)
+        texture = self.texture(self.texture_norm(state[TEXTURE])).unflatten(-1, each)
+        return self.activate(geometry, texture)
+
+    @full_precision
+    def activate(self, geometry: Tensor, texture: Tensor) -> GaussianAttributes:
+        """Raw channels (B, N, C, 14) and (B, N, C, 48) to attributes, in float32 or better."""
+        gates = geometry[..., -1]
+        candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
+        parts = []
+        for count, share in stages(self.config.level):
+            x = merged(candidates, gates, count)
+            *place, log_scale, rotation, clear, texture = x.split(
+                (*CHANNELS, texture.shape[-1]), -1
+            )
+            log_scale = log_scale + growth(self.config.candidates, count)
+            parts.append(torch.cat([*place, log_scale, rotation, share * clear, texture], -1))
+        return self._attributes(torch.cat(parts, 2))
+
+    def bounded(self, raw: Tensor) -> Tensor:
+        """Raw candidates (..., 13), with what is merged: log scales and logs of transmittance."""
+        place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
+        config = self.config
+        low, high = math.log(config.scale_min) - 1, math.log(config.scale_max) + 2
+        log_scale = (log_scale + config.scale_bias).clamp(low, high)
+        rotation = rotation + rotation.new_tensor([1, 0, 0, 0, 1, 0])
+        clear = -F.softplus(opacity + config.opacity_bias)
+        return torch.cat([place, log_scale, rotation, clear], -1)
+
+    def _attributes(self, x_BNKX: Tensor) -> GaussianAttributes:
+        """Of merged candidates."""
+        offsets, log_scale, rotation, clear, texture = x_BNKX.split(
+            (*CHANNELS, 3 * self.coefficients), -1
+        )
+        sh_BNKC3 = texture.unflatten(-1, (self.coefficients, 3))
+        return GaussianAttributes(
+            offsets=offsets,
+            scales=log_scale.exp(),
+            quats=rotation_6d(rotation),
+            opacities=-torch.expm1(clear[..., 0]),
+            colors=0.5 + C0 * sh_BNKC3[..., 0, :],
+            sh=sh_BNKC3[..., 1:, :] if self.config.sh_degree else None,
+        )
+
+
+class ShiftedCenters(Centers):
+    """mean = offset + (0, 0, z_offset)."""
+
+    name: ClassVar[str] = "shifted"
+
+    class Config(ComponentConfig):
+        z_offset: float = 1.5
+        """Added to z, world units."""
+
+    config: Config
+
+    @full_precision
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        return offsets + offsets.new_tensor([0.0, 0.0, self.config.z_offset])

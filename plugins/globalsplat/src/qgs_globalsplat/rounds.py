@@ -1,0 +1,109 @@
+"""`globalsplat/round`: a decoder layer of two streams that read the photos, then are mixed."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.components import NORM_EPS, CrossAttentionCore, LayerScale, Mlp
+from qgs.components.encoder import EncoderBlock, keys_and_values
+from qgs.contracts import (
+    ComponentConfig,
+    DecoderLayer,
+    Fields,
+    FieldSpec,
+    ModelComponent,
+    ModelDims,
+)
+from qgs.types import ImageMemory, QueryState
+from qgs_globalsplat.slots import TEXTURE, TEXTURE_FIELD
+
+
+class Round(DecoderLayer):
+    """Each stream: cross-attention, MLP, ViT blocks over the tokens; then a mixer of both.
+
+    `decoder.layer_scale` is that of cross-attention, MLP and mixer (GlobalSplat: 1e-3). Tokens that
+    the mask leaves out decode no Gaussians, but all tokens read them: they are registers.
+    """
+
+    name: ClassVar[str] = "round"
+
+    class Config(ComponentConfig):
+        """Defaults are GlobalSplat's."""
+
+        memory_width: int | None = Field(default=None, ge=1)
+        """Width of the image memory's features where the encoder has one of its own (of
+        globalsplat/patches, rgb_width + ray_width); null for features of the model's width."""
+        blocks: int = Field(default=2, ge=0)
+        """ViT blocks of each stream."""
+        block_layer_scale: float = Field(default=0.01, gt=0)
+        """Initial value of every LayerScale factor of the ViT blocks."""
+        mlp_ratio: float = Field(default=4.0, ge=1)
+        """Hidden width (rounded down) of the streams' MLPs over the model's width."""
+
+    def __init__(
+        self,
+        config: Config,
+        dims: ModelDims,
+        sublayers: Mapping[str, ModelComponent],
+        layer_scale: float,
+    ) -> None:
+        super().__init__(config, dims, sublayers, layer_scale)
+        self.geometry = Stream(config, dims, layer_scale)
+        self.texture = Stream(config, dims, layer_scale)
+        self.geometry_norm = nn.LayerNorm(dims.width)
+        self.texture_norm = nn.LayerNorm(dims.width)
+        self.mixer = Mlp(2 * dims.width, dims.width, 2 * dims.width)
+        self.mixer_scale = LayerScale(2 * dims.width, layer_scale)
+
+    @classmethod
+    def requires(cls, config: Config) -> Fields:
+        """Features of the memory, as wide as the options say, and the stream of texture."""
+        return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
+
+    @classmethod
+    def provides(cls, config: ComponentConfig) -> Fields:
+        """The stream of texture, updated."""
+        return TEXTURE_FIELD
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        """One round; the memory is passed on."""
+        geometry_BND = self.geometry(state.features, memory.features)
+        texture_BND = self.texture(state[TEXTURE], memory.features)
+        both = [self.geometry_norm(geometry_BND), self.texture_norm(texture_BND)]
+        update = self.mixer_scale(self.mixer(torch.cat(both, -1)))
+        to_geometry_BND, to_texture_BND = update.chunk(2, -1)
+        fields = {TEXTURE: texture_BND + to_texture_BND}
+        return state.replace(geometry_BND + to_geometry_BND, fields), memory
+
+
+class Stream(nn.Module):
+    """(x (B, N, D), memory (B, M, C)) -> x: pre-norm, each update scaled and added."""
+
+    def __init__(self, config: Round.Config, dims: ModelDims, layer_scale: float) -> None:
+        super().__init__()
+        width, memory_width = dims.width, config.memory_width or dims.width
+        self.memory_norm = nn.LayerNorm(memory_width)
+        self.kv_proj = nn.Linear(memory_width, 2 * width)
+        self.k_norm = nn.LayerNorm(width // dims.heads)
+        self.cross_attention = CrossAttentionCore(width, dims.heads)
+        self.cross_scale = LayerScale(width, layer_scale)
+        self.norm = nn.LayerNorm(width)
+        self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
+        self.mlp_scale = LayerScale(width, layer_scale)
+        scale = config.block_layer_scale
+        self.blocks = nn.ModuleList(
+            EncoderBlock(width, dims.heads, config.mlp_ratio, scale, NORM_EPS)
+            for _ in range(config.blocks)
+        )
+
+    def forward(self, x_BND: Tensor, memory_BMC: Tensor) -> Tensor:
+        """The stream after its reading, its MLP and its blocks."""
+        keys, values = keys_and_values(self.memory_norm(memory_BMC), self.kv_proj, self.k_norm)
+        x_BND = x_BND + self.cross_scale(self.cross_attention(x_BND, keys, values))
+        x_BND = x_BND + self.mlp_scale(self.mlp(self.norm(x_BND)))
+        for block in self.blocks:
+            x_BND = block(x_BND)
+        return x_BND
