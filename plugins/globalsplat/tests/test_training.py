@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import qgs
-from qgs.composer import Recipe, resolve
+from qgs.composer import Recipe, RecipeError, resolve
 from qgs.engine.training import train
 
 TINY = Path(__file__).parents[3] / "recipes" / "tiny" / "globalsplat.yaml"
@@ -36,6 +36,6 @@ def test_two_passes_train_and_their_terms_are_recorded(tmp_path: Path) -> None:
     assert qgs.compose(TINY, overrides=[GROWING]).head.gaussians_per_query == 1  # of the first one
 
 
-def test_two_views_end_the_first_step_with_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="two_passes needs at least 3 input views, got 2"):
-        train(small(TWO), tmp_path / "run", device="cpu")
+def test_two_views_are_refused_with_the_reason() -> None:
+    with pytest.raises(RecipeError, match=r"(?s)at least 3 input views, got 2.*raise views.inputs"):
+        small(TWO)

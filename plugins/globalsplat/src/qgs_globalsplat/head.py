@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import (
+    GAUSSIAN_FIELDS,
     Centers,
     ComponentConfig,
     Fields,
@@ -105,6 +106,12 @@ class MergingHead(Head):
         if config.scale_min >= config.scale_max:
             reason = f"it is not below `scale_max`, {config.scale_max:g}"
             yield Problem("scale_min", reason, "write a smaller one")
+
+    @classmethod
+    def provides(cls, config: Config) -> Fields:
+        """Harmonics, unless their degree is 0."""
+        sh = "gaussians.sh"
+        return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
 
     @property
     def gaussians_per_query(self) -> int:
