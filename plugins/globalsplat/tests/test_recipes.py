@@ -130,7 +130,8 @@ SMALL = (
 def test_it_learns_a_picture_in_a_blink() -> None:
     """With every loss; PSNR rises by more than 4 dB in 60 steps."""
     torch.manual_seed(0)
-    recipe = resolve(RECIPES / "tiny" / "globalsplat.yaml", SMALL)
+    regularised = [*SMALL, "losses.regularisers={type: globalsplat/regularisers}"]
+    recipe = resolve(RECIPES / "tiny" / "globalsplat.yaml", regularised)
     model, losses = recipe.build_model().train(), recipe.build_losses()
     shown = photos(1)
     views = shown.joined(shown)
