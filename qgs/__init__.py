@@ -31,7 +31,7 @@ __version__ = "0.1.0"
 
 DISTRIBUTIONS = {
     "qgs.plugins": {name: f"query-gaussians-{name}" for name in ("locus", "ellipsoid", "rooms")},
-    "qgs.commands": {"data": "query-gaussians-datatools"}
+    "qgs.commands": {"data": "query-gaussians-datatools", "study": "query-gaussians-studies"}
     | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
 }

@@ -21,7 +21,7 @@ from qgs_plugintools.new_command import rendered
 import qgs
 
 ROOT = Path(__file__).parents[1]
-PLUGINS = ("locus", "ellipsoid", "rooms", "datatools", "viewer", "plugintools")
+PLUGINS = ("locus", "ellipsoid", "rooms", "datatools", "viewer", "studies", "plugintools")
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "qgs": "query-gaussians",
