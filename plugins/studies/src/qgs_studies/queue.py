@@ -148,7 +148,7 @@ class Queue:
                 stdout=log,
                 stderr=log,
                 env=environment,
-                start_new_session=True,  # Ctrl-C is for the queue, which tells its runs once
+                process_group=0,  # Ctrl-C is for the queue, which tells its runs once
             )
         self._processes[run] = process, slot
         self._started += 1
