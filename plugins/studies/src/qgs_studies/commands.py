@@ -36,7 +36,8 @@ def study(
         int | None, typer.Option(min=1, help="Most runs that this call makes; default: all.")
     ] = None,
     slurm: Annotated[
-        bool, typer.Option("--slurm", help="Write OUT/slurm.sh, an array of workers; train nothing.")
+        bool,
+        typer.Option("--slurm", help="Write OUT/slurm.sh, an array of workers; train nothing."),
     ] = False,
     device: Device = "auto",
 ) -> None:
@@ -109,3 +110,13 @@ def _gpus(device: str) -> list[str]:
 
 def _report(plan: Plan, console: Console) -> None:
     """Write what there is of results, and show the table."""
+    from qgs_studies.output import show, write_all
+    from qgs_studies.results import Results
+
+    results = Results(plan)
+    if not results.columns:
+        console.print("no run is finished: there is nothing to report yet")
+        return
+    page = write_all(results)
+    show(results, console)
+    console.print(f"written to {page}", soft_wrap=True, highlight=False)

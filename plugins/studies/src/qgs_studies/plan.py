@@ -214,7 +214,8 @@ def _build_all(study: Study, recipes: Mapping[str, Recipe]) -> None:
         try:
             recipe.build_optimizer()
             recipe.rate_factors(recipe.build_model("meta"))
-            recipe.build_losses(), recipe.build_objective()
+            recipe.build_losses()
+            recipe.build_objective()
             if recipe.init_from:
                 checkpoint_of(recipe.init_from)
         except (ValueError, OSError) as error:
@@ -232,9 +233,7 @@ def _check_data(study: Study, recipes: Mapping[str, Recipe]) -> None:
                 continue
             opened.add(key)
             _refuse_unknown_metrics(study, judged)
-            EvaluationPlan(
-                judged.build_data(), judged.views, judged.evaluation, index_of(judged)
-            )
+            EvaluationPlan(judged.build_data(), judged.views, judged.evaluation, index_of(judged))
 
 
 def _refuse_unknown_metrics(study: Study, recipe: Recipe) -> None:

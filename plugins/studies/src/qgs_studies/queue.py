@@ -157,7 +157,7 @@ class Queue:
         why = f"its process was ended by signal {-code}" if code < 0 else f"exit code {code}"
         if code == FAILED and run.failure.is_file():
             why = run.failure.read_text(encoding="utf-8").strip()
-        elif 128 < code:
+        elif code > 128:
             why = f"it was stopped by {signal.Signals(code - 128).name}"
         if code < 0 or code > 128:  # from outside: somebody wanted it, or memory ran out
             why += "; the same command goes on with it"

@@ -75,7 +75,7 @@ class StudySettings(ComponentConfig):
     """Options of data, views, training, evaluation and metrics in which variants may differ."""
     hypotheses: tuple[Hypothesis, ...] = ()
     """What is expected; a text stands for its claim."""
-    published: dict[str, float] = {}
+    published: dict[str, float] = Field(default_factory=dict)
     """The metric as published, by variant: shown beside ours, with the rank correlation."""
 
     @field_validator("seeds")

@@ -82,7 +82,9 @@ def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: 
     for name in ("", *evaluations):
         if run.judged(name):
             continue
-        judged = judged_by(recipe, read_evaluation(evaluation_file(folder, name))) if name else recipe
+        judged = (
+            judged_by(recipe, read_evaluation(evaluation_file(folder, name))) if name else recipe
+        )
         seen = load_domain(result.folder.checkpoint)
         evaluation = evaluate(result.model, judged, result.steps, trained_on=seen)
         evaluation.write(run.evaluation(name))
