@@ -102,8 +102,21 @@ def evaluation_file(folder: Path, name: str) -> Path:
 def planned(study: Study, folder: Path) -> Plan:
     """Compose all variants and check the study as a whole; nothing is written or trained.
 
-    Raises RecipeError with all that is wrong, what data sources raise, and ValueError where
-    `folder` has runs of a variant, or results of an evaluation, that were another then.
+    Raises as `composed`, what data sources raise, and ValueError where `folder` has runs of a
+    variant, or results of an evaluation, that were another then.
+    """
+    recipes = composed(study)
+    _check_data(study, recipes)
+    plan = Plan(study, folder, recipes)
+    _refuse_changed(plan)
+    return plan
+
+
+def composed(study: Study) -> dict[str, Recipe]:
+    """The recipes of all variants, with the study's budget.
+
+    Raises RecipeError with all that is wrong with them and with what differs between them, and
+    what building them raises.
     """
     problems, recipes = Problems("study"), dict[str, Recipe]()
     for name, node in study.variants.items():
@@ -121,10 +134,7 @@ def planned(study: Study, folder: Path) -> Plan:
                 _judged_by(recipe, node, f"evaluations.{label}, of {name}", problems)
     problems.raise_any()
     _build_all(study, recipes)
-    _check_data(study, recipes)
-    plan = Plan(study, folder, recipes)
-    _refuse_changed(plan)
-    return plan
+    return recipes
 
 
 def judged_by(recipe: Recipe, node: MapNode) -> Recipe:

@@ -135,7 +135,7 @@ def read_study(file: str | Path) -> Study:
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """The tree of `file` laid over the study that it extends, names of recipes made absolute."""
+    """The tree of `file` laid over the study that it extends, names of files made absolute."""
     origin = Origin(str(file))
     try:
         written = file.read_bytes()
@@ -181,7 +181,11 @@ def _named(base: MapNode, over: MapNode) -> MapNode:
 
 
 def _absolute(tree: MapNode, folder: Path, problems: Problems) -> MapNode:
-    """`tree` whose names of recipes, relative to `folder`, are paths that hold anywhere."""
+    """`tree` whose names of recipes, relative to `folder`, are paths that hold anywhere.
+
+    So is the name of an evaluation index, where it is relative to `folder` and not to the working
+    directory.
+    """
 
     def paths(node: object, origin: Origin, option: str) -> ListNode:
         items = node if isinstance(node, ListNode) else ListNode(origin, [(node, origin)])
@@ -204,6 +208,11 @@ def _absolute(tree: MapNode, folder: Path, problems: Problems) -> MapNode:
         elif isinstance(node, MapNode) and node.get("extends") is not None:
             at = node.origins["extends"]
             node["extends"] = paths(node["extends"], at, f"{option}.extends")
+    for node in (tree.child("overlay"), *(n for n in tree.child("evaluations").values())):
+        section = node.child("evaluation") if isinstance(node, MapNode) else MapNode(tree.origin)
+        index = section.get("index")
+        if isinstance(index, str) and (folder / index).is_file():
+            section["index"] = str((folder / index).resolve())
     return tree
 
 
