@@ -14,7 +14,8 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 22_000, 200
 FORMER_NAME = re.compile(
-    r"\bqgs-(locus|ellipsoid|rooms|datatools|viewer|studies|plugintools)\b|pip install (qgs)\b|\bqgs\["
+    r"\bqgs-(locus|ellipsoid|rooms|datatools|viewer|studies|plugintools)\b"
+    r"|pip install (qgs)\b|\bqgs\["
 )
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 

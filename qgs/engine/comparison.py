@@ -282,7 +282,7 @@ def crossed_interval(values: np.ndarray) -> tuple[float, float] | None:
 
 def t_quantile(freedom: float) -> float:
     """What |t| of Student's distribution exceeds with probability 1 - CONFIDENCE."""
-    angles = np.linspace(0.0, np.pi / 2, 400_001)  # t = sqrt(freedom) * tan(angle)
+    angles = np.linspace(0.0, np.pi / 2, 40_001)  # t = sqrt(freedom) * tan(angle)
     density = np.cos(angles) ** (freedom - 1)
     below = np.cumsum(density) - (density + density[0]) / 2
     return float(np.sqrt(freedom) * np.tan(np.interp(CONFIDENCE * below[-1], below, angles)))

@@ -29,6 +29,9 @@ _POLL_SECONDS = 0.3
 _SHOW_SECONDS = 2.0
 _LOOK_SECONDS = 5.0  # between two looks at runs of others
 _TAIL = 4096  # bytes of a history that hold its last record
+DEATHS = 3
+"""Processes of a run that may die one after the other before it counts as failed."""
+
 _PATIENCE = 120.0  # seconds that stopped runs have to save
 
 
@@ -58,6 +61,7 @@ class Queue:
     gpus: Sequence[str] = ()
     _processes: dict[Run, tuple[subprocess.Popen[bytes], int]] = field(default_factory=dict)
     _failed: dict[Run, str] = field(default_factory=dict)
+    _deaths: dict[Run, tuple[int, int]] = field(default_factory=dict)
     _started: int = 0
     _stopping: str | None = None
     _looked: float = 0.0
@@ -108,7 +112,7 @@ class Queue:
             del self._processes[run]
             if code == TAKEN:
                 self._started -= 1
-            elif code and not self._stopping:
+            elif code and not self._stopping and not self._goes_on(run, code):
                 self._fail(run, code)
         if self._stopping:
             return False
@@ -153,14 +157,29 @@ class Queue:
         self._processes[run] = process, slot
         self._started += 1
 
+    def _goes_on(self, run: Run, code: int) -> bool:
+        """Whether a run whose process was ended from outside is to be taken up again, and say so.
+
+        It is, unless DEATHS processes in a row died without a step that was saved.
+        """
+        if 0 <= code <= 128:
+            return False
+        state = run.folder / "state.safetensors"
+        saved = state.stat().st_mtime_ns if state.is_file() else 0
+        before, times = self._deaths.get(run, (saved, 0))
+        self._deaths[run] = saved, (times + 1 if saved == before else 1)
+        if self._deaths[run][1] >= DEATHS:
+            return False
+        self._say(f"{run}: its process {_ended(code)}; it goes on from where it was saved")
+        self._started -= 1
+        return True
+
     def _fail(self, run: Run, code: int) -> None:
-        why = f"its process was ended by signal {-code}" if code < 0 else f"exit code {code}"
+        why = f"its process {_ended(code)}"
         if code == FAILED and run.failure.is_file():
             why = run.failure.read_text(encoding="utf-8").strip()
-        elif code > 128:
-            why = f"it was stopped by {signal.Signals(code - 128).name}"
-        if code < 0 or code > 128:  # from outside: somebody wanted it, or memory ran out
-            why += "; the same command goes on with it"
+        elif code < 0 or code > 128:
+            why += f" {DEATHS} times without a save between; memory may be short"
         self._failed[run] = why
         self._say(f"{run} failed: {why.splitlines()[0]} (see {run.log})")
 
@@ -214,6 +233,13 @@ class Queue:
         if self._elsewhere:
             table.caption = f"elsewhere: {listed(sorted(set(self._elsewhere.values())))}"
         return table
+
+
+def _ended(code: int) -> str:
+    """How a process ended, by its exit code."""
+    if code < 0 or code > 128:
+        return f"was ended by {signal.Signals(-code if code < 0 else code - 128).name}"
+    return f"ended with exit code {code}"
 
 
 class _Nothing:

@@ -161,10 +161,10 @@ class Results:
         if not apart:
             return f"Not known yet: {reference} and another variant share no finished seed."
         best = max(apart, key=lambda name: sign * apart[name].mean)
-        lead, among = apart[best], f", the best of {len(apart)}" if len(apart) > 1 else ""
+        lead, among = apart[best], f", the best of {len(apart)}," if len(apart) > 1 else ""
         told = f"{column.heading} {self.shown(lead.mean)}{self._sureness(lead, sign)}"
         if len(lead.by_seed) < 2:
-            return f"Not known: {best}{among} has {told}, of one training a side."
+            return f"Not known: {best}{among} has {told}."
         if lead.low is None or lead.high is None:
             return f"Not known: {best}{among} has {told}, without an interval."
         low = min(sign * lead.low, sign * lead.high)
