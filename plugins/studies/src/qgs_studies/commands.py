@@ -43,9 +43,25 @@ def study(
 ) -> None:
     """Train every variant with every seed, judge them alike, and answer: better, and how sure?
 
-    The study is checked as a whole before anything trains. Give the same command again, or on
-    other machines that see OUT, at any time: each run is trained once, whatever was killed goes on,
-    and only what is missing runs. OUT/study.html has the answer, OUT/table.* the numbers.
+    It is checked as a whole before anything trains. Give the same command again, or on other
+    machines that see OUT, at any time: each run is trained once, whatever was killed goes on, and
+    only what is missing runs. OUT/study.html has the answer, OUT/table.* the numbers.
+
+    Studies that come with qgs: studies/tiny/structural.yaml and others, see docs/studies.md. One of
+    your recipe mine.yaml against LocusGS is a file such as
+
+    \b
+        study: 1
+        base: tiny/locus.yaml
+        variants:
+          locus:
+          mine: mine.yaml
+          wider: {model: {decoder: {cross_attention: {sigma0: 0.2}}}}
+        reference: locus
+        seeds: [0, 1, 2]
+        budget: {steps: 2100}
+        hypotheses:
+          - mine > locus
     """
     from qgs_studies.plan import leftover_runs, planned, write_plan
     from qgs_studies.study import read_study
