@@ -43,12 +43,13 @@ def study(
 ) -> None:
     """Train every variant with every seed, judge them alike, and answer: better, and how sure?
 
-    It is checked as a whole before anything trains. Give the same command again, or on other
-    machines that see OUT, at any time: each run is trained once, whatever was killed goes on, and
-    only what is missing runs. OUT/study.html has the answer, OUT/table.* the numbers.
+    It is checked as a whole before anything trains. Give the same command
+    again, or on other machines that see OUT, at any time: each run is
+    trained once, whatever was killed goes on, only what is missing runs.
+    OUT/study.html has the answer, OUT/table.* the numbers.
 
-    Studies that come with qgs: studies/tiny/structural.yaml and others, see docs/studies.md. One of
-    your recipe mine.yaml against LocusGS is a file such as
+    Studies that come with qgs: studies/tiny/structural.yaml and others,
+    see docs/studies.md. One of your recipe mine.yaml against LocusGS:
 
     \b
         study: 1

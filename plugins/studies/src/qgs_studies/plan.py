@@ -145,11 +145,18 @@ def judged_by(recipe: Recipe, node: MapNode) -> Recipe:
 
 
 def write_plan(plan: Plan) -> None:
-    """The recipes and evaluations, from which workers train and judge."""
+    """The recipes and evaluations, from which workers train and judge; equal ones stay as they are.
+
+    So a newer version that knows more options leaves the files readable for an older one at work.
+    """
     for name, recipe in plan.recipes.items():
-        write_text(recipe_file(plan.folder, name), annotated(recipe) + "\n")
+        file = recipe_file(plan.folder, name)
+        if not file.is_file() or differences(resolve(file), recipe):
+            write_text(file, annotated(recipe) + "\n")
     for name, node in plan.study.evaluations.items():
-        write_text(evaluation_file(plan.folder, name), dump(_plain(node)))
+        file = evaluation_file(plan.folder, name)
+        if not file.is_file() or read_evaluation(file) != node:
+            write_text(file, dump(_plain(node)))
 
 
 def read_evaluation(file: Path) -> MapNode:
