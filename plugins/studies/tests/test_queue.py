@@ -1,11 +1,13 @@
 """Studies that run: queues on one folder, kills, what is added later. Trainings of seconds."""
 
+import json
 import re
 from pathlib import Path
 
 import kill_study
 import pytest
 from commands import run_qgs
+from qgs_studies.queue import Progress, _cell, last_record
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 
@@ -66,3 +68,26 @@ def test_a_study_is_checked_and_given_to_slurm_without_training(study: Path) -> 
     assert f"study {study} --out {out} --workers 1 --runs 1 --threads 1" in script
     assert not (out / "runs").exists()
     assert sorted(p.name for p in (out / "variants").iterdir()) == ["flat.yaml", "locus.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("progress", "shown"),
+    [
+        (Progress("done", 1.0, 9.0, 20), "done"),
+        (Progress("running", 0.25), "25%"),
+        (Progress("elsewhere", 0.5), "50% elsewhere"),
+        (Progress("waiting", 0.5), "waiting at 50%"),
+        (Progress("waiting"), "waiting"),
+        (Progress("failed", 0.5), "failed"),
+    ],
+)
+def test_cells_of_the_live_table(progress: Progress, shown: str) -> None:
+    assert _cell(progress) == shown
+
+
+def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path: Path) -> None:
+    history = tmp_path / "history.jsonl"
+    assert last_record(history) == (0, 0.0)
+    lines = [json.dumps({"step": n, "seconds": n / 2, "loss": "x" * 100}) for n in range(1, 90)]
+    history.write_text("\n".join(lines) + '\n{"step": 90, "sec')
+    assert last_record(history) == (89, 44.5)

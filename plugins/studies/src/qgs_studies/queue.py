@@ -119,16 +119,15 @@ class Queue:
         missing = [run for run in self.plan.runs if run not in self._failed]
         missing = [run for run in missing if not self.plan.done(run)]
         free = [run for run in missing if run not in self._processes]
-        if time.monotonic() - self._looked > _LOOK_SECONDS or len(self._elsewhere) < 1:
+        if time.monotonic() - self._looked > _LOOK_SECONDS:
             self._looked = time.monotonic()
-            owners = {run: owner(run) for run in free}
-            self._elsewhere = {run: who for run, who in owners.items() if who}
-        startable = [run for run in free if run not in self._elsewhere]
-        for run in startable[: max(self.workers - len(self._processes), 0)]:
-            if self.most is not None and self._started >= self.most:
+            self._elsewhere = {run: who for run in free if (who := owner(run))}
+        for run in free:
+            if len(self._processes) >= self.workers or self._started == self.most:
                 break
-            self._start(run)
-        if self.most is not None and self._started >= self.most:
+            if run not in self._elsewhere:
+                self._start(run)
+        if self.most is not None:  # others are free to take what is left
             return bool(self._processes)
         return bool(missing)
 
@@ -251,7 +250,8 @@ class _Nothing:
 def _cell(progress: Progress) -> str:
     if progress.state in ("running", "elsewhere"):
         return f"{progress.used:.0%}{'' if progress.state == 'running' else ' elsewhere'}"
-    return f"waiting at {progress.used:.0%}" if progress.used else progress.state
+    resumes = progress.state == "waiting" and progress.used
+    return f"waiting at {progress.used:.0%}" if resumes else progress.state
 
 
 def used_of(training: TrainingConfig, step: int, seconds: float) -> float:
