@@ -34,7 +34,7 @@ DISTRIBUTIONS = {
         name: f"query-gaussians-{name}"
         for name in ("locus", "ellipsoid", "rooms", "c3g", "gslrm", "globalsplat")
     },
-    "qgs.commands": {"data": "query-gaussians-datatools"}
+    "qgs.commands": {"data": "query-gaussians-datatools", "study": "query-gaussians-studies"}
     | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
 }

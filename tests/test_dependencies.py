@@ -30,6 +30,7 @@ PLUGINS = (
     "rooms",
     "datatools",
     "viewer",
+    "studies",
     "plugintools",
 )
 DISTRIBUTIONS = {

@@ -19,7 +19,10 @@ OVERLAYS = (
 )
 """Laid over recipes with data; they say nothing of its type."""
 
-FILES = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
+FILES = sorted(
+    path.relative_to(RECIPES).as_posix()
+    for path in {*RECIPES.rglob("*.yaml")} - {*RECIPES.glob("studies/**/*.yaml")}
+)
 EXPERIMENTS = ("re10k", "re10k_4096", "dl3dv", *(f"dl3dv_4096_{n}views" for n in (2, 4, 6)))
 PAIRS = ["tiny/{}.yaml", *(f"{{}}/{name}.yaml" for name in EXPERIMENTS)]
 ABLATIONS = {

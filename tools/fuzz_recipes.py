@@ -88,7 +88,8 @@ def base(name: str) -> tuple[dict[str, Any], Recipe]:
 @cache
 def names() -> list[str]:
     """The shipped recipes that resolve alone."""
-    found = [path.relative_to(RECIPES).as_posix() for path in sorted(RECIPES.rglob("*.yaml"))]
+    files = sorted({*RECIPES.rglob("*.yaml")} - {*RECIPES.glob("studies/**/*.yaml")})
+    found = [path.relative_to(RECIPES).as_posix() for path in files]
     return [name for name in found if not name.startswith(("finetune/dl3dv", "rooms/budget"))]
 
 

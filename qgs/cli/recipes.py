@@ -24,7 +24,8 @@ def recipes(
     from qgs.composer.files import files_of, recipe_folder
 
     home = recipe_folder().resolve()
-    known = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
+    found = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
+    known = {label: path for label, path in found.items() if not label.startswith("studies/")}
     if name is None and out is None:
         width = max(map(len, known), default=0)
         for label, path in known.items():

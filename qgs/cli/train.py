@@ -61,7 +61,7 @@ def train(
         if result.stopped_by:
             console.print(f"stopped early by {result.stopped_by}; not evaluated")
             console.print("continue with the same command and --resume", highlight=False)
-        elif finished and run.evaluation.exists():
+        elif finished and (run.evaluation / "protocol.json").exists():  # the last file of one
             console.print(f"evaluated before, see {run.evaluation}")
         else:
             trained_on = load_domain(run.checkpoint)

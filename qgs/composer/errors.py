@@ -30,20 +30,27 @@ MAX_PROBLEMS = 50
 
 
 class RecipeError(ValueError):
-    """A recipe that cannot work. `problems` holds what was found, by file and line."""
+    """A recipe that cannot work. `problems` holds what was found, by file and line.
 
-    def __init__(self, problems: Iterable[RecipeProblem]) -> None:
+    what: the kind of file that was read.
+    """
+
+    def __init__(self, problems: Iterable[RecipeProblem], what: str = "recipe") -> None:
         ordered = sorted(set(problems), key=lambda p: (p.file, p.line, p.option, p.reason, p.fix))
         self.problems = tuple(ordered)
         title = "1 problem" if len(ordered) == 1 else f"{len(ordered)} problems"
         more = ", and perhaps more: mend these first" if len(ordered) == MAX_PROBLEMS else ""
-        super().__init__("\n".join([f"{title} in the recipe{more}", *map(str, ordered)]))
+        super().__init__("\n".join([f"{title} in the {what}{more}", *map(str, ordered)]))
 
 
 class Problems:
-    """Collects problems while a recipe is read, so that all are reported at once."""
+    """Collects problems while a recipe is read, so that all are reported at once.
 
-    def __init__(self) -> None:
+    what: the kind of file that is read.
+    """
+
+    def __init__(self, what: str = "recipe") -> None:
+        self._what = what
         self._found: dict[RecipeProblem, None] = {}
         self._stopped = False
 
@@ -70,7 +77,7 @@ class Problems:
         """Raise RecipeError if anything was found, chained to what plugins raised."""
         if not self._found:
             return
-        error = RecipeError(self._found)
+        error = RecipeError(self._found, self._what)
         causes = [problem.cause for problem in error.problems if problem.cause]
         if not causes:
             raise error

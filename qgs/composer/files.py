@@ -101,6 +101,8 @@ def read_recipe(
     files = _Files(problems, count)
     if not isinstance(recipe, Mapping):
         return files.read(found_recipe(Path(recipe), recipe), (), None)
+    if isinstance(recipe, MapNode):  # which knows where it was written
+        return files.with_bases(recipe, Path(), ())
     origin = Origin("<mapping>")
     try:
         node = from_plain(recipe, origin, count)

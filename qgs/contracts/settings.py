@@ -30,6 +30,10 @@ class ViewsConfig(ComponentConfig):
     """Factor of all translations, see `scale`; no effect with "auto"."""
     mirror: float = Field(default=0.5, ge=0, le=1)
     """Probability of mirroring a training sample in x."""
+    pose_noise: float = Field(default=0.0, ge=0, le=45)
+    """Degrees by which the poses of the inputs are off, in training and evaluation: the standard
+    deviation, about each axis, of their rotation and of their direction from the first input,
+    which sets the world and is exact, as targets are. What is reconstructed keeps its poses."""
 
     @field_validator("gap")
     @classmethod

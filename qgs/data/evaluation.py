@@ -126,10 +126,11 @@ class EvaluationPlan:
                     raise ValueError(f"{self._times[name]} test scenes of the data have this name")
                 place = self._places[name]
                 scene = self._scenes[place]
+                noise = np.random.default_rng([self._evaluation.seed, place])
                 for frames in self._choices(scene, place):
                     if self.framing is None:
                         self.framing = framing(scene, frames[0][0])
-                    yield make_sample(scene, *frames, self._views, mirror=False)
+                    yield make_sample(scene, *frames, self._views, mirror=False, noise=noise)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 

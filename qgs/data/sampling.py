@@ -5,8 +5,9 @@ Everything here is a pure function of its arguments and of the random generator 
 Images are moved by NumPy, on one thread: torch's would wait for cores that training holds.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -133,17 +134,39 @@ def draw_frames(
 
 
 def make_sample(
-    scene: Scene, input_frames: Frames, target_frames: Frames, views: ViewsConfig, mirror: bool
+    scene: Scene,
+    input_frames: Frames,
+    target_frames: Frames,
+    views: ViewsConfig,
+    mirror: bool,
+    noise: np.random.Generator | None = None,
 ) -> Sample:
-    """Decode frames, normalise poses in the scene's precision, mirror if asked; float32."""
+    """Decode frames, normalise poses in the scene's precision, mirror if asked; float32.
+
+    noise: of which `views.pose_noise` is drawn; None leaves poses as they are.
+    """
     world = own_world(scene, input_frames, views)
     both = views_in(world, scene, (*input_frames, *target_frames))
-    both = mirrored_views(both) if mirror else both
     count = len(input_frames)
+    if noise is not None and views.pose_noise:
+        c2w = both.cameras.c2w[0].clone()
+        c2w[:count] = shaken(c2w[:count], math.radians(views.pose_noise), noise)
+        both = replace(both, cameras=replace(both.cameras, c2w=c2w[None]))
+    both = mirrored_views(both) if mirror else both
     inputs, targets = both.select(slice(0, count)), both.select(slice(count, None))
     names = {frame: scene.frame_name(frame) for frame in (*input_frames, *target_frames)}
     names = {frame: name for frame, name in names.items() if name != str(frame)}
     return Sample(scene.name, inputs, targets, input_frames, target_frames, names)
+
+
+def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
+    """Poses (F, 4, 4), all but the first off by `angle`, see `ViewsConfig.pose_noise`; radians."""
+    turns, moves = torch.from_numpy(rng.normal(0, angle, (2, len(c2w), 3))).to(c2w)
+    cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
+    off, apart = c2w.clone(), (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
+    off[1:, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
+    off[1:, :3, 3] += (moves * apart)[1:]
+    return off
 
 
 def views_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Views:

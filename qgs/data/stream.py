@@ -146,7 +146,7 @@ class SampleStream:
         mirror = bool(rng.random() < self._views.mirror)
         inputs, targets = draw_frames(scene, self._views, rng)
         try:
-            return make_sample(scene, inputs, targets, self._views, mirror)
+            return make_sample(scene, inputs, targets, self._views, mirror, rng)
         except Exception as error:
             raise SampleError(_what_failed(scene, (*inputs, *targets), error)) from error
 

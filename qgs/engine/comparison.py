@@ -1,7 +1,11 @@
-"""Two evaluations, scene by scene: mean differences, their uncertainty, wins and losses."""
+"""Two evaluations, scene by scene: mean differences, their uncertainty, wins and losses.
 
+Several trainings of one recipe count as one side, whose interval then covers trainings too.
+"""
+
+import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ from qgs.engine.results import (
     print_table,
 )
 from qgs.io.files import write_text
-from qgs.wording import listed
+from qgs.wording import listed, short_names
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
@@ -31,13 +35,15 @@ _AT_A_TIME = 1_000_000  # numbers that the bootstrap draws, which bounds its mem
 class Difference:
     """One metric over the scenes that both results have; differences are first minus second.
 
-    low, high: the 95 % interval of the mean difference over scenes, None for fewer than two.
+    trainings: pairs of them, of one of which low and high say nothing.
+    low, high: the 95 % interval of the mean difference, None for fewer than two scenes.
     wins, losses: scenes in which the first is better, or worse; the rest are equal.
     """
 
     metric: str
     column: Column
     scenes: int
+    trainings: int
     first: float
     second: float
     difference: float
@@ -65,6 +71,7 @@ class Comparison:
         return {
             "first": first.name,
             "second": second.name,
+            "steps": [[run.step for run in side.runs or [side]] for side in (first, second)],
             "same_protocol": first.protocol.sha256 == second.protocol.sha256,
             "other_frames": list(self.moved),
             "differences": [asdict(difference) for difference in self.differences],
@@ -90,7 +97,8 @@ class Comparison:
 
     def rows(self) -> list[list[str]]:
         """The table, headers first; one digit finer than an evaluation's."""
-        rows = [["metric", "first", "second", "difference", "95 % interval", "won : lost"]]
+        names = short_names([self.first.name, self.second.name])
+        rows = [["metric", *names, "difference", "95 % interval", "won : lost"]]
         for d in self.differences:
             digits = d.column.digits + 1
             means = [f"{d.first:.{digits}f}", f"{d.second:.{digits}f}"]
@@ -102,10 +110,21 @@ class Comparison:
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
         first, second, facts = self.first, self.second, self.record()
-        yield (
-            f"difference: {first.name} minus {second.name}, mean over scenes; interval: percentile "
-            f"bootstrap over scenes, {RESAMPLES:,} resamples"
+        trainings = self.differences[0].trainings if self.differences else 1
+        covers = (
+            f"{trainings} trainings a side and scenes, both random ({CROSSED})"
+            if trainings > 1
+            else f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples); one training a "
+            "side: says nothing of training"
         )
+        yield f"difference: {first.name} minus {second.name}, mean over scenes; interval: {covers}"
+        steps = [np.mean([r.step for r in s.runs or [s] if r.step] or [0]) for s in (first, second)]
+        for side, mean in zip((first, second), steps, strict=True):
+            seeds = listed(run.seed for run in side.runs or [side] if run.seed is not None)
+            of = f" of a budget of {side.budget}, seed {seeds}" if side.budget else ""
+            yield f"{side.name}: {f'{mean:,.0f} steps' if mean else 'steps not known'}{of}"
+        if min(steps) and max(steps) > 1.02 * min(steps):
+            yield f"unequal training: {max(steps) / min(steps):.2f} times the steps of the other"
         if len(self.shared) == 1:
             yield "one scene is too few for an interval"
         if null := facts["null"]:
@@ -172,6 +191,7 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
     Raises ValueError for fewer than two, one folder twice and no scene in common, and unless
     `across_protocols` for different protocols and scenes judged on different frames.
     """
+    results = grouped(results)
     names = [result.name for result in results]
     if len(names) < 2 or len(set(names)) < len(names):
         raise ValueError(f"a comparison takes two or more different results, got {names}")
@@ -189,7 +209,8 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         shared = [name for name in first.scenes if name in other.scenes]
         if not shared:
             raise ValueError(f"{first.name} and {other.name} have no scene in common")
-        moved = [name for name in shared if first.frames[name] != other.frames[name]]
+        every = [*(first.runs or [first]), *(other.runs or [other])]
+        moved = [name for name in shared if len({run.frames[name] for run in every}) > 1]
         if moved and not across_protocols:
             raise ValueError(
                 f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, "
@@ -201,6 +222,70 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         pairs.append(Comparison(first, other, shared, moved, [d for d in found if d]))
     protocols = {r.name: f"{r.protocol.name}, sha256 {r.protocol.sha256}" for r in results}
     return Comparisons(protocols, pairs)
+
+
+def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
+    """Trainings of one recipe with several seeds as one result, where there are others too.
+
+    Its values are means over its `runs`, of the scenes that all of them judged.
+    """
+    groups: dict[Any, list[StoredResults]] = {}
+    for number, result in enumerate(results):
+        key = (result.recipe, result.protocol.sha256) if result.recipe else number
+        groups.setdefault(key, []).append(result)
+    if len(groups) < 2:
+        return results
+    several = [len({run.seed for run in runs}) == len(runs) > 1 for runs in groups.values()]
+    found = zip(groups.values(), several, strict=True)
+    return [side for runs, one in found for side in ([_mean(runs)] if one else runs)]
+
+
+def _mean(runs: Sequence[StoredResults]) -> StoredResults:
+    first, names = runs[0], [run.name for run in runs]
+    shared = [scene for scene in first.scenes if all(scene in run.scenes for run in runs)]
+    scenes = {
+        scene: {
+            key: float(np.mean([run.scenes[scene][key] for run in runs]))
+            for key in first.scenes[scene]
+            if all(key in run.scenes[scene] for run in runs)
+        }
+        for scene in shared
+    }
+    folder = os.path.commonpath(names) if len({*map(os.path.isabs, names)}) == 1 else ""
+    return replace(first, name=folder or ", ".join(names), scenes=scenes, runs=tuple(runs))
+
+
+CROSSED = "two-way variance, t with the degrees of freedom of Hillis 2007"
+
+
+def crossed_interval(values: np.ndarray) -> tuple[float, float] | None:
+    """Interval of the mean of differences (S, C) of S >= 2 trainings, each on the same C scenes.
+
+    Both are random: it holds for other trainings and for other scenes. The variance of the mean is
+    that of two-way analysis of variance, its degrees of freedom at least S - 1, as for readers and
+    cases (Hillis 2007, doi.org/10.1002/sim.2532). None for fewer than two trainings.
+    """
+    trainings, scenes = values.shape
+    if trainings < 2:
+        return None
+    mean, of_training, of_scene = values.mean(), values.mean(1), values.mean(0)
+    between, extra = scenes * of_training.var(ddof=1), 0.0
+    if scenes > 1:
+        rest = values - of_training[:, None] - of_scene + mean
+        noise = (rest**2).sum() / ((trainings - 1) * (scenes - 1))
+        extra = max(trainings * of_scene.var(ddof=1) - noise, 0.0)
+    whole = between + extra
+    freedom = (trainings - 1) * min((whole / between) ** 2, 1e4) if between else 1e4
+    half = t_quantile(freedom) * np.sqrt(whole / values.size)
+    return float(mean - half), float(mean + half)
+
+
+def t_quantile(freedom: float) -> float:
+    """What |t| of Student's distribution exceeds with probability 1 - CONFIDENCE."""
+    angles = np.linspace(0.0, np.pi / 2, 40_001)  # t = sqrt(freedom) * tan(angle)
+    density = np.cos(angles) ** (freedom - 1)
+    below = np.cumsum(density) - (density + density[0]) / 2
+    return float(np.sqrt(freedom) * np.tan(np.interp(CONFIDENCE * below[-1], below, angles)))
 
 
 def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
@@ -225,17 +310,22 @@ def _difference(
 ) -> Difference | None:
     """None where no scene has the metric in both."""
     column, value = first.columns[metric], f"model_{metric}"
-    scenes = [(first.scenes[name], second.scenes[name]) for name in shared]
-    values = np.array([[a[value], b[value]] for a, b in scenes if value in a and value in b])
-    if not len(values):
+    pairs = _trainings(first, second)
+    every = [run for pair in pairs for run in pair]
+    scenes = [name for name in shared if all(value in run.scenes.get(name, ()) for run in every)]
+    if not scenes:
         return None
+    values = np.array(
+        [[[run.scenes[name][value] for name in scenes] for run in pair] for pair in pairs]
+    )
     apart = values[:, 0] - values[:, 1]
-    better = apart if column.better == "higher" else -apart
-    low, high = paired_interval(apart) or (None, None)
+    better = apart.mean(0) if column.better == "higher" else -apart.mean(0)
+    low, high = crossed_interval(apart) or paired_interval(apart[0]) or (None, None)
     return Difference(
         metric=metric,
         column=column,
-        scenes=len(values),
+        scenes=len(scenes),
+        trainings=len(pairs),
         first=float(values[:, 0].mean()),
         second=float(values[:, 1].mean()),
         difference=float(apart.mean()),
@@ -244,3 +334,15 @@ def _difference(
         wins=int((better > 0).sum()),
         losses=int((better < 0).sum()),
     )
+
+
+def _trainings(
+    first: StoredResults, second: StoredResults
+) -> Sequence[tuple[StoredResults, StoredResults]]:
+    """Pairs of equal seeds, else in their order; the means where a side has a single training."""
+    ours, theirs = ({run.seed: run for run in side.runs} for side in (first, second))
+    if len(common := [seed for seed in ours if seed in theirs]) > 1:
+        return [(ours[seed], theirs[seed]) for seed in common]
+    if min(len(ours), len(theirs)) > 1:
+        return [*zip(ours.values(), theirs.values(), strict=False)]
+    return [(first, second)]

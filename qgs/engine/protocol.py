@@ -88,12 +88,13 @@ def protocol_of(
             options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
             metrics[path[-1]] = {"type": chosen.type, "definition": metric.definition, **options}
     factor = () if recipe.views.scale == "auto" else ("scale_factor",)
+    noise = {"noise": [recipe.views.pose_noise, evaluation.seed]} if recipe.views.pose_noise else {}
     content = {
         "format": 2,
         "image_size": list(config.image_size),
         "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
         "data": data,
-        "poses": recipe.views.model_dump(include={"frame", "scale", *factor}),
+        "poses": recipe.views.model_dump(include={"frame", "scale", *factor}) | noise,
         "views": judged,
         "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
         "metrics": metrics,

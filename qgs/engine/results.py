@@ -13,6 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from qgs.composer.errors import Problems
+from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
 from qgs.data.sampling import Frames
@@ -293,8 +295,10 @@ class StoredResults:
     """Results of one evaluation. name: the folder, as it was given.
 
     scenes: `SceneScore.values` of the judged scenes. frames: their input and target frames, as
-    scenes.csv writes them. wanted: how many scenes the protocol names. columns, missing and null
-    as in `Evaluation`.
+    scenes.csv writes them. wanted: how many scenes the protocol names. columns, missing, null and
+    step as in `Evaluation`.
+    Of a run folder, recipe: its resolved recipe as JSON, without the seed; seed and budget.
+    runs: the trainings whose mean this is, none of a single one.
     """
 
     name: str
@@ -305,6 +309,11 @@ class StoredResults:
     wanted: int
     missing: Sequence[str] = ()
     null: Sequence[str] = ()
+    step: int | None = None
+    recipe: str = ""
+    seed: int | None = None
+    budget: str = ""
+    runs: Sequence["StoredResults"] = ()
 
 
 def read_results(path: str | Path) -> StoredResults:
@@ -338,9 +347,22 @@ def read_results(path: str | Path) -> StoredResults:
             wanted=summary["scenes_in_protocol"],
             missing=list(summary["missing"]),
             null=summary["null_entries"],
+            step=summary["step"],
+            **_training(folder.parent / "recipe.yaml"),
         )
     except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(
             f"the results in {folder} cannot be read ({type(error).__name__}: {error}): they were "
             "changed, or written by an earlier version; evaluate again with `qgs eval`"
         ) from error
+
+
+def _training(recipe: Path) -> dict[str, Any]:
+    """Of the resolved recipe of a run, what `StoredResults` tells; nothing where there is none."""
+    if not recipe.is_file():
+        return {}
+    tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
+    seed, training = tree.pop("seed"), tree["training"]
+    seconds = training["seconds"]
+    budget = f"{seconds:g} s" if seconds else f"{training['steps']:,} steps"
+    return {"recipe": json.dumps(tree), "seed": seed, "budget": budget}

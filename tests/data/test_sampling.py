@@ -5,10 +5,12 @@ import pytest
 import torch
 from line_scenes import Line, Lines
 
+from qgs.composer import resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views
 from qgs.data.stream import training_batches
+from qgs.engine.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth
 from qgs.types import Cameras, Views
 
@@ -230,3 +232,37 @@ def test_a_point_behind_or_beside_the_cameras_is_not_looked_at():
     )[:, :3, :3]  # fmt: skip
     assert look_at_depth(walk[:2]) == pytest.approx(200 * 5**0.5)
     assert look_at_depth(walk[:, :3]) == look_at_depth(walk)
+
+
+def test_pose_noise_moves_inputs_but_the_first_and_nothing_else() -> None:
+    """Rotations and directions from the first input are off by the angle, about every axis."""
+    scene, views = Line(9), ViewsConfig(inputs=3, pose_noise=2.0)
+    plain = make_sample(scene, (1, 4, 7), (2, 5), views, False)
+    rng = np.random.default_rng(0)
+    noisy = [make_sample(scene, (1, 4, 7), (2, 5), views, False, rng) for _ in range(400)]
+    poses = torch.stack([sample.inputs.cameras.c2w[0] for sample in noisy])
+    exact = plain.inputs.cameras.c2w[0]
+    assert all(torch.equal(s.targets.cameras.c2w, plain.targets.cameras.c2w) for s in noisy)
+    assert torch.equal(poses[:, 0], exact[:1].expand(400, 4, 4))
+    turned = exact[1:, :3, :3].mT @ poses[:, 1:, :3, :3]
+    assert torch.allclose(turned @ turned.mT, torch.eye(3).expand_as(turned), atol=1e-5)
+    angles = torch.rad2deg(torch.stack([turned[..., 2, 1], turned[..., 0, 2], turned[..., 1, 0]]))
+    assert angles.std(dim=(1, 2)) == pytest.approx([2.0] * 3, rel=0.15)
+    apart = (exact[1:, :3, 3] - exact[0, :3, 3]).norm(dim=-1, keepdim=True)
+    moved = torch.rad2deg((poses[:, 1:, :3, 3] - exact[1:, :3, 3]) / apart)
+    assert moved.std(dim=(0, 1)) == pytest.approx([2.0] * 3, rel=0.15)
+
+
+def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol() -> None:
+    recipe = resolve("recipes/tiny/tokengs.yaml", ["views.pose_noise=3", "evaluation.scenes=2"])
+    source = recipe.build_data()
+    first, second = (
+        [s.inputs.cameras.c2w for s in evaluation_samples(source, recipe.views, recipe.evaluation)]
+        for _ in range(2)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    exact = resolve("recipes/tiny/tokengs.yaml", ["evaluation.scenes=2"])
+    clean = evaluation_samples(source, exact.views, exact.evaluation)
+    assert not torch.equal(first[0], clean[0].inputs.cameras.c2w)
+    assert protocol_of(recipe).content["poses"]["noise"] == [3.0, 0]
+    assert "noise" not in protocol_of(exact).content["poses"]

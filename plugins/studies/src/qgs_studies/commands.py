@@ -1,0 +1,139 @@
+"""`qgs study`."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from qgs.cli.options import Device
+
+if TYPE_CHECKING:
+    from qgs_studies.plan import Plan
+
+app = typer.Typer(help="Train variants of a model by seeds, and tell what differs.")
+
+
+@app.command()
+def study(
+    file: Annotated[
+        str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the study; what is there already is not run again.")
+    ],
+    workers: Annotated[
+        int, typer.Option(min=0, help="Runs at a time here; 0 trains nothing, and only reports.")
+    ] = 1,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads of a run; default: cores / workers.")
+    ] = None,
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="Most runs that this call makes; default: all.")
+    ] = None,
+    slurm: Annotated[
+        bool,
+        typer.Option("--slurm", help="Write OUT/slurm.sh, an array of workers; train nothing."),
+    ] = False,
+    device: Device = "auto",
+) -> None:
+    """Train every variant with every seed, judge them alike, and answer: better, and how sure?
+
+    It is checked as a whole before anything trains. Give the same command
+    again, or on other machines that see OUT, at any time: each run is
+    trained once, whatever was killed goes on, only what is missing runs.
+    OUT/study.html has the answer, OUT/table.* the numbers.
+
+    Studies that come with qgs: studies/tiny/structural.yaml and others,
+    see docs/studies.md. One of your recipe mine.yaml against LocusGS:
+
+    \b
+        study: 1
+        base: tiny/locus.yaml
+        variants:
+          locus:
+          mine: mine.yaml
+          wider: {model: {decoder: {cross_attention: {sigma0: 0.2}}}}
+        reference: locus
+        seeds: [0, 1, 2]
+        budget: {steps: 2100}
+        hypotheses:
+          - mine > locus
+    """
+    from qgs_studies.plan import leftover_runs, planned, write_plan
+    from qgs_studies.study import read_study
+
+    console = Console()
+    with console.status("composing and checking all variants"):
+        plan = planned(read_study(file), out)
+        write_plan(plan)
+    for name, recipe in plan.recipes.items():
+        for warning in recipe.warnings:
+            console.print(f"warning: {name}: {warning}", highlight=False, soft_wrap=True)
+    missing = [run for run in plan.runs if not plan.done(run)]
+    seeds = plan.study.settings.seeds
+    told = f"{len(plan.recipes)} variants x {len(seeds)} seeds: {len(plan.runs)} runs"
+    console.print(f"{told}, {len(missing)} of them missing", highlight=False)
+    if left := leftover_runs(plan):
+        console.print(f"{len(left)} runs in {out} are not in this study: kept, not shown")
+    if slurm:
+        from qgs_studies.slurm import write_script
+
+        script = write_script(plan, file, len(missing), threads or 1)
+        console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
+        return
+    stopped, failed = None, 0
+    if workers and missing:
+        stopped, failed = _work(plan, workers, threads, device, runs, console)
+    _report(plan, console)
+    if stopped:
+        console.print(f"stopped by {stopped}; the same command goes on", highlight=False)
+        raise typer.Exit(128 + signal.Signals[stopped])
+    if failed:
+        raise typer.Exit(1)
+
+
+def _work(
+    plan: Plan,
+    workers: int,
+    threads: int | None,
+    device: str,
+    most: int | None,
+    console: Console,
+) -> tuple[str | None, int]:
+    """The signal that ended the queue, and how many runs failed."""
+    from qgs_studies.queue import Queue
+
+    threads = threads or max(len(os.sched_getaffinity(0)) // workers, 1)
+    queue = Queue(plan, workers, threads, device, console, most, _gpus(device))
+    return queue.work(), len(queue.failures)
+
+
+def _gpus(device: str) -> list[str]:
+    """GPUs that may be used, as CUDA_VISIBLE_DEVICES names them."""
+    if device == "cpu":
+        return []
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [name for name in given.split(",") if name]
+    import torch
+
+    return [str(number) for number in range(torch.cuda.device_count())]
+
+
+def _report(plan: Plan, console: Console) -> None:
+    """Write what there is of results, and show the table."""
+    from qgs_studies.output import show, write_all
+    from qgs_studies.results import Results
+
+    results = Results(plan)
+    if not results.columns:
+        console.print("no run is finished: there is nothing to report yet")
+        return
+    page = write_all(results)
+    show(results, console)
+    console.print(f"written to {page}", soft_wrap=True, highlight=False)

@@ -1,0 +1,120 @@
+"""Figures of a study: points of every seed with intervals, learning curves."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from qgs.drawing.figures import (
+    INK,
+    MUTED,
+    categorical,
+    figure_style,
+    hex_color,
+    running_mean,
+)
+from qgs.io.files import read_records, replacing
+from qgs.metrics.images import Psnr
+from qgs_studies.hypotheses import MAIN
+from qgs_studies.results import Results, Row
+
+_POINTS = 200  # of a learning curve
+
+
+def write_figures(results: Results) -> None:
+    """OUT/figures: values and curves, as PDF and PNG; values of every evaluation."""
+    figures = {
+        f"values-{n}" if n else "values": values_figure(results, n) for n in _judged(results)
+    }
+    figures["curves"] = curves_figure(results)
+    for name, figure in figures.items():
+        if figure is None:
+            continue
+        for suffix in ("pdf", "png"):
+            with replacing(results.plan.folder / "figures" / f"{name}.{suffix}") as path:
+                metadata = {"CreationDate": None} if suffix == "pdf" else None
+                with figure_style():
+                    figure.savefig(path, format=suffix, dpi=160, metadata=metadata)
+
+
+def _judged(results: Results) -> list[str]:
+    return [name for name in results.plan.evaluations if results.rows(name)]
+
+
+def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
+    """The study's metric of every seed, and the differences to the reference with intervals."""
+    rows = [row for row in results.rows(evaluation) if results.metric in row.scores]
+    if not rows:
+        return None
+    column, metric = results.column, results.metric
+    unit = f", {column.unit}" if column.unit else ""
+    seeds = list(results.plan.study.settings.seeds)
+    with figure_style():
+        figure = Figure(figsize=(8.4, 0.9 + 0.32 * len(rows)), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        for place, row in enumerate(rows):
+            _points(left, place, row.scores[metric].by_seed, seeds)
+            left.plot(row.scores[metric].mean, place, "|", color=hex_color(INK), markersize=14)
+            _difference(right, place, row, metric, seeds)
+        right.axvline(0, color=hex_color(MUTED), linewidth=0.9)
+        left.set(yticks=range(len(rows)), yticklabels=[row.variant for row in rows])
+        left.invert_yaxis()
+        left.set(title=f"{column.heading}{unit}: one point a seed, mean")
+        right.set(title=f"minus {results.plan.study.settings.reference}, 95 % interval")
+        if evaluation:
+            figure.suptitle(evaluation, x=0.01, ha="left", fontsize=9)
+    return figure
+
+
+def _points(axes: Axes, place: int, values: Mapping[int, float], seeds: Sequence[int]) -> None:
+    """A point for each seed, of its colour in all rows, a little apart."""
+    for seed, value in values.items():
+        number = seeds.index(seed)
+        shift = 0.22 * (number - (len(seeds) - 1) / 2) / max(len(seeds) - 1, 1)
+        axes.plot(value, place + shift, "o", color=hex_color(categorical(number)), markersize=3.5)
+
+
+def _difference(axes: Axes, place: int, row: Row, metric: str, seeds: Sequence[int]) -> None:
+    apart = row.differences.get(metric)
+    if apart is None:
+        return
+    if apart.low is not None and apart.high is not None:
+        axes.plot([apart.low, apart.high], [place, place], color=hex_color(INK), linewidth=1.2)
+    _points(axes, place, apart.by_seed, seeds)
+    axes.plot(apart.mean, place, "|", color=hex_color(INK), markersize=14)
+
+
+def curves_figure(results: Results) -> Figure | None:
+    """PSNR of the training views by step: mean over seeds, and from the lowest to the highest."""
+    curves = {name: _curves(results, name) for name in results.plan.recipes}
+    known = {name: found for name, found in curves.items() if found}
+    if not known:
+        return None
+    with figure_style():
+        figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+        axes = figure.subplots()
+        for number, (name, found) in enumerate(known.items()):
+            last = min(steps[-1] for steps, _ in found)
+            at = np.linspace(1, last, _POINTS)
+            every = np.array([np.interp(at, steps, values) for steps, values in found])
+            color, style = hex_color(categorical(number)), ("-", "--", ":")[number // 6 % 3]
+            axes.plot(at, every.mean(0), style, color=color, label=name)
+            axes.fill_between(at, every.min(0), every.max(0), color=color, alpha=0.12, linewidth=0)
+        unit = Psnr.column.unit
+        axes.set(title=f"{Psnr.column.heading} of the training views, {unit}", xlabel="steps")
+        figure.legend(loc="outside right center")
+    return figure
+
+
+def _curves(results: Results, variant: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Steps and running means of every run of `variant` that has begun."""
+    found = []
+    for run in results.plan.runs:
+        if run.variant == variant:
+            records = read_records(run.folder / "history.jsonl")
+            pairs = [(r["step"], r["psnr"]) for r in records if "psnr" in r]
+            if len(pairs) > 1:
+                steps, values = np.array(pairs, float).T
+                found.append((steps, running_mean(values)))
+    return found

@@ -1,0 +1,64 @@
+"""study.html: the answer, the verdicts, the tables, the figures, what differs."""
+
+import json
+from typing import Any
+
+from qgs.analysis.report import page_environment
+from qgs.composer.yaml_text import inline
+from qgs.drawing.figures import figure_picture
+from qgs.drawing.images import data_uri
+from qgs_studies.figures import curves_figure, values_figure
+from qgs_studies.output import hypothesis_rows, table_rows
+from qgs_studies.plan import differences
+from qgs_studies.results import Results
+
+_DPI = 150
+
+
+def study_html(results: Results) -> str:
+    """The whole page; it needs no other file and no network."""
+    plan, settings = results.plan, results.plan.study.settings
+    environment = page_environment("qgs_studies", uri=data_uri)
+    sections = []
+    for name in plan.evaluations if results.columns else []:
+        figure = values_figure(results, name)
+        if figure is not None:
+            rows = table_rows(results, name)
+            picture = figure_picture(figure, dpi=_DPI)
+            sections.append({"name": name, "rows": rows, "picture": picture})
+    curves = curves_figure(results)
+    done = len(plan.runs) - len(results.missing)
+    facts = {
+        "runs": f"{done} of {len(plan.runs)}: {len(plan.recipes)} variants x "
+        f"{len(settings.seeds)} seeds ({', '.join(map(str, settings.seeds))})",
+        "budget": inline(settings.budget.model_dump(exclude_none=True)),
+        "reference": settings.reference,
+        "may differ": ", ".join(settings.differs) or "nothing but the model and the optimiser",
+    }
+    return environment.get_template("study.html").render(
+        title=plan.study.title,
+        question=settings.question,
+        answer=results.answer(),
+        verdicts=hypothesis_rows(results) if results.columns and settings.hypotheses else [],
+        sections=sections,
+        curves=None if curves is None else figure_picture(curves, dpi=_DPI),
+        notes=results.notes(),
+        facts=facts,
+        changes=_changes(results),
+    )
+
+
+def _changes(results: Results) -> dict[str, list[tuple[str, str, str]]]:
+    """Of every variant the options that differ from the reference's: path, its, the other's."""
+    recipes = results.plan.recipes
+    reference = recipes[results.plan.study.settings.reference]
+    found = {}
+    for name, recipe in recipes.items():
+        if recipe is not reference:
+            changed = differences(recipe, reference).items()
+            found[name] = [(path, _shown(ours), _shown(theirs)) for path, (ours, theirs) in changed]
+    return found
+
+
+def _shown(value: Any) -> str:
+    return "–" if value is None else json.dumps(value)

@@ -1,0 +1,111 @@
+"""One run in a process of its own: claim it, train, judge; started by the queue.
+
+A killed process takes nothing with it but its own run's last steps since they were saved.
+"""
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from rich.console import Console
+
+from qgs_studies.claims import take
+from qgs_studies.plan import (
+    Run,
+    evaluation_file,
+    judged_by,
+    read_evaluation,
+    recipe_file,
+    run_of,
+)
+
+FAILED, TAKEN = 1, 3
+"""Exit codes: the reason is in the log and beside the run; another process has the run."""
+
+_WATCH_SECONDS = 1.0
+
+
+def main() -> int:
+    """What `python -m qgs_studies.work` does; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("variant")
+    parser.add_argument("seed", type=int)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--parent", type=int, required=True)
+    parser.add_argument("--evaluations", nargs="*", default=[])
+    given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    _end_with(given.parent)
+    run = run_of(given.folder, given.variant, given.seed)
+    claim = take(run, lost=_stop)
+    if claim is None:
+        return TAKEN
+    try:
+        code = _work(given.folder, run, given.evaluations, given.threads, given.device)
+        run.failure.unlink(missing_ok=True)
+        return code
+    except Exception as error:
+        import traceback
+
+        from qgs.io.files import write_text
+
+        traceback.print_exc()
+        write_text(run.failure, f"{type(error).__name__}: {error}\n")
+        return FAILED
+    finally:
+        claim.release()
+
+
+def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: str) -> int:
+    """Train `run` as far as it was not, judge what was not; 0, or 128 + the signal that ended it.
+
+    Raises whatever training and judging raise.
+    """
+    import torch
+
+    from qgs.composer import resolve
+    from qgs.engine.evaluation import evaluate
+    from qgs.engine.training import train
+    from qgs.io.checkpoint import load_domain
+
+    torch.set_num_threads(threads)
+    recipe = resolve(recipe_file(folder, run.variant), [f"seed={run.seed}"])
+    console = Console(file=sys.stdout, width=100)
+    result = train(recipe, run.folder, console=console, device=device, resume=True)
+    if result.stopped_by:
+        return 128 + signal.Signals[result.stopped_by]
+    for name in ("", *evaluations):
+        if run.judged(name):
+            continue
+        judged = (
+            judged_by(recipe, read_evaluation(evaluation_file(folder, name))) if name else recipe
+        )
+        seen = load_domain(result.folder.checkpoint)
+        evaluation = evaluate(result.model, judged, result.steps, trained_on=seen)
+        evaluation.write(run.evaluation(name))
+        console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)
+    return 0
+
+
+def _end_with(parent: int) -> None:
+    """Stop, as SIGTERM does, when the queue that started this process is gone."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            threading.Event().wait(_WATCH_SECONDS)
+        _stop()
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _stop() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

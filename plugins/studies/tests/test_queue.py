@@ -1,0 +1,93 @@
+"""Studies that run: queues on one folder, kills, what is added later. Trainings of seconds."""
+
+import json
+import re
+from pathlib import Path
+
+import kill_study
+import pytest
+from commands import run_qgs
+from qgs_studies.queue import Progress, _cell, last_record
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    text = kill_study.STUDY.format(recipes=RECIPES, steps=12)
+    text = text.replace("seeds: [0, 1, 2]", "seeds: [0, 1]")
+    text = re.sub(r"  (free|tokengs):.*\n", "", text)
+    text = re.sub(r"hypotheses:.*", "hypotheses: [flat < locus]", text)
+    (tmp_path / "study.yaml").write_text(text)
+    return tmp_path / "study.yaml"
+
+
+def begun(out: Path) -> dict[str, int]:
+    """Of each run how often it was trained from the start."""
+    logs = sorted(out.glob("runs/*/*.log"))
+    return {f"{p.parent.name}/{p.stem}": p.read_text().count("step 1 ") for p in logs}
+
+
+@pytest.mark.slow
+def test_two_queues_share_a_folder_and_additions_run_alone(study: Path) -> None:
+    out = study.parent / "out"
+    queues = [kill_study.started(study, out, 1) for _ in range(2)]
+    assert [queue.wait(600) for queue in queues] == [0, 0]
+    runs = {f"{v}/seed-{s}": 1 for v in ("locus", "flat") for s in (0, 1)}
+    assert begun(out) == runs
+    assert "2 seeds x 4 scenes" in (out / "table.md").read_text()
+
+    study.write_text(study.read_text().replace("seeds: [0, 1]", "seeds: [0, 1, 2]"))
+    result = run_qgs("study", study, "--out", out, "--runs", 1, "--device", "cpu")
+    assert result.exit_code == 0, result.output
+    assert "6 runs, 2 of them missing" in result.output
+    assert begun(out) == {**runs, "locus/seed-2": 1}
+
+    changed = study.read_text().replace("qgs/content}", "locus/ray_biased, bandwidth: fixed}")
+    study.write_text(changed)
+    refused = run_qgs("study", study, "--out", out, "--workers", 0)
+    assert "the variant `flat` is not the one that 2 runs in" in str(refused.exception)
+    assert "give the new one another name" in str(refused.exception)
+
+
+@pytest.mark.slow
+def test_a_killed_study_has_the_table_of_a_quiet_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ["kill_study.py", str(tmp_path / "out"), "--kills", "3", "--steps", "20"]
+    monkeypatch.setattr("sys.argv", command)
+    assert kill_study.main() == 0
+
+
+def test_a_study_is_checked_and_given_to_slurm_without_training(study: Path) -> None:
+    out = study.parent / "out"
+    result = run_qgs("study", study, "--out", out, "--slurm")
+    assert result.exit_code == 0, result.output
+    script = (out / "slurm.sh").read_text()
+    assert "#SBATCH --array=1-4" in script
+    assert f"study {study} --out {out} --workers 1 --runs 1 --threads 1" in script
+    assert not (out / "runs").exists()
+    assert sorted(p.name for p in (out / "variants").iterdir()) == ["flat.yaml", "locus.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("progress", "shown"),
+    [
+        (Progress("done", 1.0, 9.0, 20), "done"),
+        (Progress("running", 0.25), "25%"),
+        (Progress("elsewhere", 0.5), "50% elsewhere"),
+        (Progress("waiting", 0.5), "waiting at 50%"),
+        (Progress("waiting"), "waiting"),
+        (Progress("failed", 0.5), "failed"),
+    ],
+)
+def test_cells_of_the_live_table(progress: Progress, shown: str) -> None:
+    assert _cell(progress) == shown
+
+
+def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path: Path) -> None:
+    history = tmp_path / "history.jsonl"
+    assert last_record(history) == (0, 0.0)
+    lines = [json.dumps({"step": n, "seconds": n / 2, "loss": "x" * 100}) for n in range(1, 90)]
+    history.write_text("\n".join(lines) + '\n{"step": 90, "sec')
+    assert last_record(history) == (89, 44.5)

@@ -1,0 +1,157 @@
+"""What a study may say, and what it is told otherwise: file, line, reason, remedy."""
+
+from pathlib import Path
+
+import pytest
+from qgs_studies.hypotheses import parsed
+from qgs_studies.plan import composed
+from qgs_studies.study import Study, read_study
+
+from qgs.composer import RecipeError
+from qgs.contracts import OptionError
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+SOUND = f"""study: 1
+base: {RECIPES}/tiny/locus.yaml
+variants:
+  full:
+  flat: {{model: {{decoder: {{cross_attention: {{type: qgs/content}}}}}}}}
+  tokengs: {RECIPES}/tiny/tokengs.yaml
+reference: full
+budget: {{steps: 200}}
+hypotheses: [flat < full]
+"""
+
+
+def read(folder: Path, text: str) -> Study:
+    (folder / "study.yaml").write_text(text)
+    return read_study(folder / "study.yaml")
+
+
+def test_a_variant_is_the_base_or_its_own_recipe_with_the_budget(tmp_path: Path) -> None:
+    recipes = composed(read(tmp_path, SOUND))
+    types = {n: r.tree["model"]["queries"]["type"] for n, r in recipes.items()}
+    assert types == {"full": "locus/anchored", "flat": "locus/anchored", "tokengs": "qgs/latent"}
+    flat = recipes["flat"].tree["model"]["decoder"]
+    assert flat["cross_attention"]["type"] == "qgs/content"
+    for recipe in recipes.values():
+        assert (recipe.training.steps, recipe.training.seconds) == (200, None)
+        assert recipe.seed == 0
+
+
+@pytest.mark.parametrize(
+    ("budget", "steps", "seconds"),
+    [("seconds: 30", 20_000, 30.0), ("images: 4001", 1001, None)],
+)
+def test_budgets(tmp_path: Path, budget: str, steps: int, seconds: float | None) -> None:
+    recipes = composed(read(tmp_path, SOUND.replace("steps: 200", budget)))
+    training = recipes["full"].training  # batches of 2 with 2 targets
+    assert (training.steps, training.seconds) == (steps, seconds)
+
+
+def test_a_study_extends_another_and_replaces_variants_by_name(tmp_path: Path) -> None:
+    read(tmp_path, SOUND)
+    (tmp_path / "small.yaml").write_text(
+        "study: 1\nextends: study.yaml\nvariants: {tokengs: null, flat: {model: {width: 64}}}\n"
+        "overlay: {training: {batch_size: 1}}\nseeds: [7]\n"
+    )
+    study = read_study(tmp_path / "small.yaml")
+    recipes = composed(study)
+    assert [*recipes] == ["full", "flat"]
+    assert recipes["flat"].dims.width == 64
+    cross = recipes["flat"].tree["model"]["decoder"]["cross_attention"]
+    assert cross["type"] == "locus/ray_biased"
+    assert all(r.training.batch_size == 1 and r.seed == 7 for r in recipes.values())
+
+
+WRONG = {
+    "reference: full": (
+        "reference: ful",
+        ":7: reference",
+        "there is no variant `ful`",
+        "did you mean `full`?",
+    ),
+    "budget: {steps: 200}": (
+        "budget: {steps: 200, seconds: 3}",
+        ":8: budget",
+        "one of steps, seconds and images, got 2",
+        "write `budget:",
+    ),
+    "[flat < full]": (
+        "[flat < fulll]",
+        ":9: hypotheses.0",
+        "there is no variant `fulll`",
+        "did you mean `full`?",
+    ),
+    "study: 1\n": ("study: 1\nsead: [0]\n", ":2: sead", "there is no key `sead`", "`seeds`"),
+    "{cross_attention: {type: qgs/content}}": (
+        "{cross_attention: {type: qgs/contents}}",
+        ":5: variants.flat: model.decoder.cross_attention.type",
+        "qgs/contents",
+        "did you mean `qgs/content`?",
+    ),
+    "  full:\n": ("  full: 3\n", ":4: variants.full", "this is the number 3", "mapping"),
+    "  tokengs:": ("  ../up:", ":6: variants.../up", "the name of a folder", "use letters"),
+    "tiny/tokengs.yaml\n": (
+        "tiny/tokens.yaml\n",
+        ":6: variants.tokengs: extends",
+        "does not exist",
+        "tokengs.yaml",
+    ),
+    "{model: {decoder: {cross_attention: {type: qgs/content}}}}": (
+        "{views: {inputs: 3}}",
+        ":5: variants.flat",
+        "`views.inputs` is 3 in `flat` and 2 in the reference `full`",
+        "or add `differs: [views.inputs]`",
+    ),
+    "hypotheses:": (
+        "differs: [views.inputs]\nhypotheses:",
+        "differs",
+        "`views.inputs` differs in no variant",
+        "remove it",
+    ),
+    "budget:": (
+        "evaluations: {more: {model: {width: 8}}}\nbudget:",
+        ":8: evaluations.more.model",
+        "would change the trained model",
+        "can only set",
+    ),
+}
+
+
+@pytest.mark.parametrize("written", WRONG)
+def test_what_is_wrong_is_told_with_its_line_before_anything_trains(
+    tmp_path: Path, written: str
+) -> None:
+    instead, place, reason, fix = WRONG[written]
+    assert SOUND.count(written) == 1
+    with pytest.raises(RecipeError) as caught:
+        composed(read(tmp_path, SOUND.replace(written, instead)))
+    text = str(caught.value)
+    assert text.startswith("1 problem in the study"), text
+    assert place in text
+    assert reason in text
+    assert fix in text
+
+
+def test_a_budget_that_the_optimiser_cannot_use_names_the_variant(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"warmup is 100") as caught:
+        composed(read(tmp_path, SOUND.replace("200", "50")))
+    assert caught.value.__notes__ == [f"in the variant `full`, {tmp_path / 'study.yaml'}:4"]
+
+
+def test_hypotheses_are_sums_that_weigh_alike() -> None:
+    contrast = parsed("a@noisy - a > b@noisy - b", "ab", ["noisy"])
+    assert contrast.sign == 1
+    assert contrast.terms == {("a", "noisy"): 1, ("a", ""): -1, ("b", "noisy"): -1, ("b", ""): 1}
+    for text, reason in (
+        ("a", "not one `<`"),
+        ("a < b < c", "not one `<`"),
+        ("a - b < c", "weigh unlike"),
+        ("a < a", "are the same"),
+        ("a b < c", "is no sum"),
+        ("a@x < b", "no evaluation `x`"),
+        ("< b", "is no sum"),
+    ):
+        with pytest.raises(OptionError, match=reason):
+            parsed(text, "abc", ["noisy"])
