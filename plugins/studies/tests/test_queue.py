@@ -65,7 +65,7 @@ def test_a_study_is_checked_and_given_to_slurm_without_training(study: Path) -> 
     assert result.exit_code == 0, result.output
     script = (out / "slurm.sh").read_text()
     assert "#SBATCH --array=1-4" in script
-    assert f"study {study} --out {out} --workers 1 --runs 1 --threads 1" in script
+    assert f"bin/qgs study {study} --out {out} --workers 1 --runs 1 --threads 1" in script
     assert not (out / "runs").exists()
     assert sorted(p.name for p in (out / "variants").iterdir()) == ["flat.yaml", "locus.yaml"]
 

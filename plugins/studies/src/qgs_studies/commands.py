@@ -83,7 +83,7 @@ def study(
     if slurm:
         from qgs_studies.slurm import write_script
 
-        script = write_script(plan, file, len(missing), threads or 1)
+        script = write_script(plan, file, len(missing), threads or 1, device)
         console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
         return
     stopped, failed = None, 0
