@@ -16,7 +16,9 @@ HELP = {
     "data": "Check and pack data sets.",
     "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",
-    "study": "Train every variant with every seed, judge them alike, and answer: better, and how sure?",
+    "study": (
+        "Train every variant with every seed, judge them alike, and answer: better, and how sure?"
+    ),
     "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
     "check-plugin": "Hold every component of a plugin to its contract.",
 }

@@ -12,6 +12,8 @@ from torch import Tensor
 from qgs.geometry.precision import full_precision
 from qgs.types import SH_COUNTS, Cameras, Gaussians
 
+SH_C0 = 0.28209479177387814
+"""The harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658)

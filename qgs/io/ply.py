@@ -9,12 +9,10 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseErr
 from torch import Tensor
 
 from qgs.data.scenes import warn_once
+from qgs.geometry.harmonics import SH_C0
 from qgs.io.files import replacing
 from qgs.types import SH_COUNTS, Gaussians, map_tensors, named_tensors
 from qgs.wording import listed
-
-SH_C0 = 0.28209479177387814
-"""The spherical harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
 
 OPACITY_EPS = 1e-6
 """Opacities are kept this far from 0 and 1, where the logit is infinite."""

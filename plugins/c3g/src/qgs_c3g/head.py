@@ -1,6 +1,5 @@
 """`c3g/head`, `c3g/offset`: from a query to its Gaussian, one by default (C3G)."""
 
-import math
 from typing import ClassVar
 
 import torch
@@ -11,14 +10,12 @@ from torch import Tensor, nn
 
 from qgs.components import NORM_EPS
 from qgs.contracts import Centers, ComponentConfig, Head, ModelDims
+from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32
 from qgs.types import GaussianAttributes, QueryState
 
 CHANNELS = (3, 1, 3, 4, 3)
 """Per Gaussian: position, opacity, scale, rotation, harmonic of degree 0 (C3G release)."""
-
-SH_0 = 0.5 / math.sqrt(math.pi)
-"""The spherical harmonic of degree 0."""
 
 
 class C3GHead(Head):
@@ -65,7 +62,7 @@ class C3GHead(Head):
             scales=self.config.scale_unit * F.softplus(scale),
             quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
             opacities=torch.sigmoid(opacity[..., 0]),
-            colors=(0.5 + SH_0 * sh).clamp(0, 1),
+            colors=(0.5 + SH_C0 * sh).clamp(0, 1),
         )
 
 

@@ -20,6 +20,7 @@ from qgs.contracts import (
     Problem,
     RecipeContext,
 )
+from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_globalsplat.merging import growth, merged, rotation_6d, stages
@@ -27,8 +28,6 @@ from qgs_globalsplat.slots import TEXTURE, TEXTURE_FIELD
 
 CHANNELS = (3, 3, 6, 1)
 """Of geometry, per candidate: position, log scale, rotation, opacity; then the gate."""
-C0 = 0.28209479177387814
-"""The spherical harmonic of degree 0."""
 
 
 class MergingHead(Head):
@@ -161,7 +160,7 @@ class MergingHead(Head):
             scales=log_scale.exp(),
             quats=rotation_6d(rotation),
             opacities=-torch.expm1(clear[..., 0]),
-            colors=0.5 + C0 * sh_BNKC3[..., 0, :],
+            colors=0.5 + SH_C0 * sh_BNKC3[..., 0, :],
             sh=sh_BNKC3[..., 1:, :] if self.config.sh_degree else None,
         )
 

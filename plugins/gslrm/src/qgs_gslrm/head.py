@@ -9,11 +9,9 @@ from torch import Tensor, nn
 
 from qgs.components import NORM_EPS
 from qgs.contracts import ComponentConfig, Head, ModelDims
+from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32
 from qgs.types import GaussianAttributes, QueryState
-
-SH_0 = 0.28209479177387814
-"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi))."""
 
 
 class PixelHead(Head):
@@ -72,7 +70,7 @@ class PixelHead(Head):
             scales=scale.exp(),
             quats=_unit(rotation),
             opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
-            colors=(0.5 + SH_0 * rgb).clamp(0, 1),
+            colors=(0.5 + SH_C0 * rgb).clamp(0, 1),
         )
 
 
