@@ -104,6 +104,14 @@ def test_what_cannot_be_is_refused(override: str, seen: str) -> None:
     assert "--set #1" in str(error.value)
 
 
+def test_limits_hold_up_to_the_last_step_before_a_jump() -> None:
+    near = "model.renderer.near={schedule: linear, from: 0.025, to: 10, over: [0, 100]}"
+    far = "model.renderer.far={{schedule: steps, values: [{}, 100], at: [100]}}"
+    with pytest.raises(RecipeError, match=r"near 9\.9\d* and far 5"):
+        tiny(near, far.format(5))
+    assert tiny(near, far.format(9.95)).schedules
+
+
 def test_a_schedule_that_training_does_not_finish_is_told() -> None:
     recipe = tiny(f"{DILATION}={RAMP}", "training.steps=150")
     assert recipe.warnings == [f"{DILATION} changes until step 200, training ends at 150"]
