@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class QueryGaussianModel(nn.Module):
-    """Posed photos in, a fixed budget of Gaussians out.
+    """Photos in, the Gaussians of its queries out, as many as these say.
 
     refinements: one per decoder layer, at `refinement_of`; layers may share a module.
     recipe: the resolved recipe this model was composed from, None for one built by hand.

@@ -454,7 +454,8 @@ class LayerPrediction(TensorContainer):
 class Prediction(TensorContainer):
     """A forward pass: the last layer's Gaussians and state, and those of every decoded layer.
 
-    layers: layer number (1 is the first) to LayerPrediction, ascending.
+    layers: layer number (1 is the first; 0 the start, of a decoder of depth 0) to LayerPrediction,
+        ascending.
     """
 
     gaussians: Gaussians

@@ -7,10 +7,13 @@ LETTER, LINE, PAD, GAP = 6.7, 16, 8, 34
 """Pixels: a letter's width, a line's height, space around text, the length of arrows."""
 
 
-def pipeline_svg(kinds: Mapping[str, str], counts: Mapping[str, int], depth: int) -> str:
+def pipeline_svg(
+    kinds: Mapping[str, str], counts: Mapping[str, int], depth: int, learned: bool
+) -> str:
     """Boxes and arrows in the colour of the text around.
 
     kinds, counts: by slot, those of decoder layers as "decoder.SLOT": components, parameters.
+    learned: whether queries start from parameters alone, and only the decoder reads photos.
     """
 
     def told(*slots: str) -> list[str]:
@@ -25,19 +28,22 @@ def pipeline_svg(kinds: Mapping[str, str], counts: Mapping[str, int], depth: int
         [told("head", "centers")],
         [["Gaussians"]],
     ]
-    high = max(len(box) * LINE + 2 * PAD for box in columns[2])
+    lows = [sum(len(box) * LINE + 6 + PAD for box in column) + PAD for column in columns]
+    high = max(lows)
     left, parts, ends = 1.0, list[str](), list[float]()
-    for column in columns:
+    for column, low in zip(columns, lows, strict=True):
         wide = max(len(line) for box in column for line in box) * LETTER + 2 * PAD
-        middles = [high * (2 * number + 1) / (2 * len(column)) for number in range(len(column))]
-        for box, middle in zip(column, middles, strict=True):
+        gap, end, middles = PAD + (high - low) / (len(column) + 1), 0.0, list[float]()
+        for box in column:
             half = len(box) * LINE / 2 + 3
+            middle, end = end + gap + half, end + gap + 2 * half
+            middles.append(middle)
             size = f'width="{wide:.0f}" height="{2 * half:.0f}" rx="4" fill="none"'
             parts.append(f'<rect x="{left:.0f}" y="{middle - half:.0f}" {size}/>')
             for number, line in enumerate(box):
                 place = f'x="{left + PAD:.0f}" y="{middle - half + LINE * (number + 1) - 1:.0f}"'
                 parts.append(f'<text {place} stroke="none">{escape(line)}</text>')
-            if not box[0].startswith("queries"):  # they read photos in the decoder
+            if not (learned and box[0].startswith("queries")):
                 way = f"{left - GAP / 2:.0f} {middle:.0f} {left - 6:.0f} {middle:.0f}h6l-7-4v8l7-4"
                 parts += [f'<path d="M{left - GAP:.0f} {y:.0f}S{way}" fill="none"/>' for y in ends]
         left, ends = left + wide + GAP, middles

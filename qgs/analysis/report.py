@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs.analysis.reconstruction import orbit_path
 from qgs.analysis.trace import trace
-from qgs.contracts import Column
+from qgs.contracts import Column, LearnedQueries
 from qgs.data.sampling import Sample
 from qgs.data.scenes import warn_once
 from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
@@ -262,7 +262,8 @@ def anchors(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
         chosen = notable_queries(model, prediction.gaussians, camera, ANCHORS)
         colors = {query.index: query.color for query in chosen}
         start = model.queries(model.encoder(sample.inputs), sample.inputs)
-        states = {"learned start": start} | {
+        learned = isinstance(model.queries, LearnedQueries)
+        states = {"learned start" if learned else "start of these photos": start} | {
             f"after layer {number}": layer.state for number, layer in prediction.layers.items()
         }
         for caption, state in states.items():
@@ -275,7 +276,7 @@ def anchors(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
         "Every query’s anchor on the first input view, as a dot; twelve that matter to this view "
         "with their support, the ball or ellipsoid around an anchor that says how far about it a "
         "query looks and places its Gaussians, where all of it lies before the camera. Photos move "
-        "the anchors from their learned start, the same for every scene, layer by layer.",
+        "the anchors from their start layer by layer; a learned start is the same for every scene.",
         figures,
         width=180,
     )

@@ -7,6 +7,7 @@ from torch import nn
 
 from qgs.analysis.pipeline import pipeline_svg
 from qgs.composer.slots import LAYER_SLOTS, SUBLAYER_SLOTS
+from qgs.contracts import LearnedQueries
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Prediction
 
@@ -52,7 +53,8 @@ def model_html(model: QueryGaussianModel) -> str:
     """A picture of the way from views to Gaussians, and the same as a table."""
     rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in _rows(model)]
     kinds = {slot: kind for slot, kind, _ in _rows(model)}
-    picture = pipeline_svg(kinds, parameter_counts(model), model.depth)
+    learned = isinstance(model.queries, LearnedQueries)
+    picture = pipeline_svg(kinds, parameter_counts(model), model.depth, learned)
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     head = "<tr><th>slot</th><th>component</th><th>parameters</th></tr>"
     return f"<p>{escape(_heading(model))}</p>{picture}<table>{head}{body}</table>"

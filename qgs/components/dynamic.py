@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components.blocks import NORM_EPS, SelfAttentionCore
+from qgs.components.decoder import ContentSelfAttention
 from qgs.components.times import TimeEmbedding
 from qgs.contracts import (
     AttentionWeights,
@@ -21,7 +21,6 @@ from qgs.contracts import (
     Problem,
     Queries,
     RecipeContext,
-    SelfAttention,
 )
 from qgs.types import (
     ImageMemory,
@@ -75,8 +74,8 @@ class DynamicQueries(Queries):
             )
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        return _FIELDS
+    def provides(cls, config: Config) -> Fields:
+        return _FIELDS if config.dynamic else {}
 
     @property
     def count(self) -> int:
@@ -84,7 +83,10 @@ class DynamicQueries(Queries):
         return self.config.count
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """The field `dynamic.moves` (B, N). Raises ValueError for views without a target time."""
+        """With dynamic ones, the field `dynamic.moves` (B, N).
+
+        Raises ValueError for views without a target time.
+        """
         config, batch = self.config, len(memory.features)
         parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
         x_BND = torch.cat(parts).expand(batch, -1, -1)
@@ -97,22 +99,13 @@ class DynamicQueries(Queries):
                     "target_time (B, 1), or set model.queries.time_channels to 0"
                 )
             x_BND = x_BND + moves_N[:, None] * self.time_embedding(views.target_time)
-        return QueryState(x_BND, {MOVES: moves_N.expand(batch, -1)})
+        return QueryState(x_BND, {MOVES: moves_N.expand(batch, -1)} if config.dynamic else {})
 
 
-class BlockCausalSelfAttention(SelfAttention):
+class BlockCausalSelfAttention(ContentSelfAttention):
     """Dynamic queries read all queries, static ones the static ones alone."""
 
     name: ClassVar[str] = "block_causal"
-
-    class Config(ComponentConfig):
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
-
-    def __init__(self, config: Config, dims: ModelDims) -> None:
-        super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
-        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
 
     @classmethod
     def requires(cls, config: ComponentConfig) -> Fields:
@@ -151,8 +144,7 @@ class DynamicObjective(Objective):
             last = layers[max(layers)]
             alone = Prediction(last.gaussians, last.state, layers)
             added = self.config.weight * passes.judge(alone, targets, inputs).total
-        terms = {**whole.terms, "dynamic": added.detach()}
-        return Outcome(whole.total + added, terms, whole.signs)
+        return Outcome.mean([whole], dynamic=added)
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:

@@ -169,7 +169,7 @@ def keys_and_values(
     return k_norm(split_heads(k_BMD, heads)).to(v_BhMd.dtype), v_BhMd
 
 
-_PATCH_KERNELS = ("rgb_embedding.proj.weight", "ray_embedding.proj.weight")
+_PATCH_KERNELS = tuple(f"{name}_embedding.proj.weight" for name in ("rgb", "ray", "time"))
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:

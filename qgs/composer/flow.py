@@ -173,7 +173,8 @@ def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     """Fields that queries start with and nothing reads but refinements, which only go on with them.
 
-    One sentence each, with what would do without the field.
+    One sentence each, with what would do without the field. Those that cannot be learnt, such as
+    of bool, are not meant.
     """
     used = {path: part for path, part in parts.items() if path[:-1] != ("model", "decoder")}
     read = set[str]()
@@ -181,8 +182,9 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
         if not issubclass(part.component, Refinement):
             read |= part.component.requires(part.config).keys()
     keepers = [c for c in used.values() if issubclass(c.component, Queries | Refinement)]
-    for name in _offers(parts["model", "queries"].component, parts["model", "queries"].config):
-        if name in read:
+    queries = parts["model", "queries"]
+    for name, spec in _offers(queries.component, queries.config).items():
+        if name in read or not spec.dtype.is_floating_point:
             continue
         changes = [
             f"set `{keeper.path}.{option}: {value}`"
@@ -193,17 +195,22 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
         ]
         advice = f"; to do without it, {' and '.join(changes)}" if changes else ""
         yield (
-            f"nothing reads {name}, which `{parts['model', 'queries'].type}` at model.queries "
+            f"nothing reads {name}, which `{queries.type}` at model.queries "
             f"provides: what is learnt of it has no effect{advice}"
         )
 
 
-def unfinished(parts: Mapping[KeyPath, Chosen], steps: int) -> Iterator[str]:
-    """Schedules that a training of `steps` steps leaves before their end, one sentence each."""
+def unfinished(parts: Mapping[KeyPath, Chosen], steps: int, seconds: float | None) -> Iterator[str]:
+    """Schedules that a training of `steps` steps, or of `seconds`, leaves before their end."""
     for part in {part.path: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():
             if (last := max(schedule.corners, default=0)) > steps:
                 yield f"{part.path}.{option} changes until step {last}, training ends at {steps}"
+            elif last and seconds is not None:
+                yield (
+                    f"{part.path}.{option} changes until step {last}, and training.seconds may end "
+                    f"training before, after {seconds:g} s: schedules count steps"
+                )
 
 
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, int | None]]:

@@ -65,7 +65,8 @@ class Recipe:
     @property
     def warnings(self) -> list[str]:
         """What works and is probably not what was meant, a sentence each."""
-        return [*idle_fields(self.parts), *unfinished(self.parts, self.training.steps)]
+        length = self.training.steps, self.training.seconds
+        return [*idle_fields(self.parts), *unfinished(self.parts, *length)]
 
     @property
     def schedules(self) -> dict[KeyPath, Mapping[str, Schedule]]:

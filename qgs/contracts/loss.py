@@ -42,4 +42,7 @@ class Supervision(Component):
 
     @abstractmethod
     def weights(self) -> Mapping[int, float]:
-        """Layer number (1 is the first, ascending) to weight; the weights sum to 1."""
+        """Layer number to weight, ascending; the weights sum to 1.
+
+        1 is the first layer; 0, the start, is the only one of a decoder of depth 0.
+        """

@@ -74,8 +74,8 @@ class Steps(Schedule):
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """See `Schedule`."""
-        return self.at
+        """See `Schedule`; others go on until the last step before a jump."""
+        return tuple(step for at in self.at for step in (max(at - 1, 0), at))
 
 
 class Linear(Schedule):

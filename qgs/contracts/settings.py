@@ -71,7 +71,7 @@ class TrainingConfig(ComponentConfig):
     render_views: int = Field(default=0, ge=0)
     """Target views rendered at a time, which bounds memory and changes no gradient; 0 for all."""
     judge_inputs: bool = False
-    """Whether the input views are rendered and judged as target views are, behind these."""
+    """Whether the input views are rendered and judged as target views are, after them."""
     ema: float | None = Field(default=None, gt=0, lt=1)
     """Decay of a moving average of the weights, saved and evaluated beside them; null for none."""
     on_nonfinite: Literal["stop", "skip"] = "stop"

@@ -38,17 +38,19 @@ def refuse_too_many(count: int, gaussians: Gaussians | None = None) -> None:
 class Leaves:
     """Gaussians (1, G) as tensors (G, ...) without bounds, and Adam on them.
 
-    values: means, log_scales, quats, opacity_logits, color_logits, and sh and features if there
-    are, by name.
+    values: means, log_scales, quats, opacity_logits, color_logits (beside sh, which allow any
+    colour, colors as they are), and sh and features if there are, by name.
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
+        free = gaussians.sh is not None
         values = {
             "means": gaussians.means,
             "log_scales": gaussians.scales.clamp_min(1e-7).log(),
             "quats": gaussians.quats,
             "opacity_logits": gaussians.opacities.logit(_OPACITY_MARGIN),
-            "color_logits": gaussians.colors.logit(_COLOR_MARGIN),
+            "color_logits": None if free else gaussians.colors.logit(_COLOR_MARGIN),
+            "colors": gaussians.colors if free else None,
             "sh": gaussians.sh,
             "features": gaussians.features,
         }
@@ -68,7 +70,8 @@ class Leaves:
         """Gaussians (1, G) with gradients to `values`."""
         v = {name: value[None] for name, value in self.values.items()}
         shape = v["log_scales"].exp(), F.normalize(v["quats"], dim=-1)
-        look = v["opacity_logits"].sigmoid(), v["color_logits"].sigmoid()
+        colors = v["colors"] if "colors" in v else v["color_logits"].sigmoid()
+        look = v["opacity_logits"].sigmoid(), colors
         return Gaussians(v["means"], *shape, *look, v.get("sh"), v.get("features"))
 
     @torch.no_grad()

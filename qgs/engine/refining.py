@@ -26,7 +26,8 @@ from qgs.types import Cameras, Gaussians, Views, concatenated, map_tensors, name
 
 _RATES = {"means": 3.5e-3, "log_scales": 2e-2, "quats": 5e-3}  # of means: of the scene's size
 _RATES |= {"opacity_logits": 0.05, "color_logits": 2.5e-2}
-_RATES |= {"sh": 1.25e-3, "features": 0.0}  # a twentieth of the colours', as 3DGS; no photo has any
+_RATES |= {"colors": 6e-3}  # beside `sh`: as the logits move a colour of one half
+_RATES |= {"sh": 1.25e-3, "features": 0.0}  # a twentieth of the logits', as 3DGS; no photo has any
 _LAST, _LAST_OF_MEANS = 0.1, 0.01  # of the rates, at the end
 _SSIM = 0.25  # weight beside the mean squared error
 _SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos

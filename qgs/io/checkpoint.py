@@ -116,7 +116,7 @@ def save(
         for name, tensor in (weights or unique_tensors(model)).items()
     }
     step = steps_followed(model.modules())
-    followed = {} if step is None else {"step": str(step)}
+    followed = {} if step in (None, END) else {"step": str(step)}  # END: as without a step
     write_checkpoint(path, tensors, model.recipe, followed | dict(extra or {}))
 
 

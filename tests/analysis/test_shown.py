@@ -2,6 +2,8 @@
 
 import re
 from io import BytesIO
+from itertools import combinations
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,6 +12,7 @@ import torch
 from PIL import Image
 
 import qgs
+from qgs.composer import resolve
 from qgs.types import Cameras, GaussianAttributes, Gaussians, Views
 
 SMALL = {
@@ -27,6 +30,9 @@ SMALL = {
         "supervision": {"layers": [2]},
     },
 }
+
+
+SPACE = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +71,8 @@ def test_a_notebook_shows_the_way_from_views_to_gaussians(model, known):
     shown = model if known else qgs.compose(SMALL)
     shown.recipe = shown.recipe if known else None
     html = shown._repr_html_()
-    svg = ElementTree.fromstring(html[html.index("<svg") : html.index("</svg>") + 6])
-    space = "{http://www.w3.org/2000/svg}"
-    texts = [element.text or "" for element in svg.iter(f"{space}text")]
+    svg = picture_in(html)
+    texts = [element.text or "" for element in svg.iter(f"{SPACE}text")]
     starts = ["views", "encoder: ", "queries: ", "2 decoder layers", "head: ", "Gaussians"]
     found = [text for text in texts if text.startswith(tuple(starts))]
     assert [text.startswith(start) for text, start in zip(found, starts, strict=True)] == [True] * 6
@@ -76,21 +81,40 @@ def test_a_notebook_shows_the_way_from_views_to_gaussians(model, known):
     assert any(text.startswith(f"cross_attention: {read}") for text in texts)
     counts = [int(t.split()[0].replace(",", "")) for t in texts if t.endswith(" parameters")]
     assert sum(counts) == sum(parameter.numel() for parameter in model.parameters())
+    assert_tidy(svg)
+    assert len(list(svg.iter(f"{SPACE}path"))) == 5, "arrows"
+    assert "#" not in html[: html.index("<table>")], "it takes the colours of its page"
+
+
+def test_queries_made_of_photos_without_decoder_layers_are_drawn_so():
+    pytest.importorskip("qgs_gslrm")
+    recipe = resolve(Path(__file__).parents[2] / "recipes" / "tiny" / "gslrm.yaml")
+    svg = picture_in(recipe.build_model("meta")._repr_html_())
+    assert_tidy(svg)
+    assert len(list(svg.iter(f"{SPACE}path"))) == 6, "an arrow to the queries too"
+
+
+def picture_in(html):
+    return ElementTree.fromstring(html[html.index("<svg") : html.index("</svg>") + 6])
+
+
+def assert_tidy(svg):
+    """Boxes lie in the picture and apart, and every line of text in one of them."""
     boxes = [
         [float(element.attrib[name]) for name in ("x", "y", "width", "height")]
-        for element in svg.iter(f"{space}rect")
+        for element in svg.iter(f"{SPACE}rect")
     ]
+    for a, b in combinations(boxes, 2):
+        assert any(a[i] + a[i + 2] < b[i] or b[i] + b[i + 2] < a[i] for i in (0, 1)), (a, b)
     wide, high = (float(end) for end in svg.attrib["viewBox"].split()[2:])
     for x, y, width, height in boxes:
         assert 0 < x < x + width < wide
         assert 0 < y < y + height < high
-    for text in svg.iter(f"{space}text"):
+    for text in svg.iter(f"{SPACE}text"):
         x, y = float(text.attrib["x"]), float(text.attrib["y"])
         end = x + 6.62 * len(text.text or "")  # of 11 pixels, as monospaced letters are
         holding = [b for b in boxes if b[0] < x < end < b[0] + b[2] and b[1] < y < b[1] + b[3]]
         assert len(holding) == 1, text.text
-    assert len(list(svg.iter(f"{space}path"))) == 5, "arrows"
-    assert "#" not in html[: html.index("<table>")], "it takes the colours of its page"
 
 
 def test_a_model_built_by_hand_is_told_by_its_classes(model):

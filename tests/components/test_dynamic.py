@@ -1,6 +1,7 @@
 """Scenes that move: the embedding of times, which queries carry them, who reads whom."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,18 @@ def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all(
     changed = (early.features != late.features).any(-1)
     assert changed[0].int().tolist() == moving
     assert not changed[1].any()
-    assert torch.equal(early[MOVES], torch.tensor([moving] * 2).bool())
+    if dynamic:
+        assert torch.equal(early[MOVES], torch.tensor([moving] * 2).bool())
+    assert early.fields.keys() == DynamicQueries.provides(queries.config).keys()
+
+
+@pytest.mark.parametrize("dynamic", [3, 0])
+def test_that_nothing_reads_which_queries_move_is_no_warning(dynamic: int) -> None:
+    queries = {**RECIPE["model"]["queries"], "dynamic": dynamic}
+    still = {**RECIPE["model"], "queries": queries, "decoder": {"depth": 2}}
+    assert resolve({**RECIPE, "model": still}).warnings == []
+    with nullcontext() if dynamic else pytest.raises(RecipeError, match="which nothing"):
+        resolve({**RECIPE, "model": {**RECIPE["model"], "queries": queries}})
 
 
 def test_static_queries_do_not_see_dynamic_ones() -> None:
@@ -160,6 +172,27 @@ def test_the_objective_judges_dynamic_gaussians_again(weight: float) -> None:
     expected = weight * sum(sum(found.values()) for found in terms)
     torch.testing.assert_close(outcome.terms["dynamic"], torch.as_tensor(expected))
     torch.testing.assert_close(outcome.total.detach(), sum(outcome.terms.values()))
+
+
+def test_no_loss_may_have_the_term_of_the_objective() -> None:
+    recipe = resolve({**RECIPE, "objective": {"type": "qgs/dynamic"}})
+    judging = TrainingPass.of(recipe, model())
+    loss = next(iter(judging.losses.values()))
+    loss.forward = lambda *given: {"dynamic": given[0].gaussians.means.sum()}
+    inputs = views(torch.zeros(2, 2), torch.zeros(2, 1))
+    with pytest.raises(ValueError, match=r"losses have terms \['dynamic'\] already"):
+        judging(inputs, replace(inputs.select([0]), target_time=None))
+
+
+def test_larger_patches_embed_times_as_smaller_ones() -> None:
+    small, large = (
+        MultiViewViT(MultiViewViT.Config(depth=0, patch_size=side, time_channels=2), DIMS)
+        for side in (4, 8)
+    )
+    torch.nn.init.normal_(small.time_embedding.proj.weight)
+    large.load_state_dict(large.adapted(small.state_dict()))
+    times = torch.rand(2, 3)
+    torch.testing.assert_close(large.time_embedding(times), small.time_embedding(times))
 
 
 def test_the_published_weight_of_dynamic_gaussians() -> None:

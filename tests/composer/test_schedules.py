@@ -104,10 +104,27 @@ def test_what_cannot_be_is_refused(override: str, seen: str) -> None:
     assert "--set #1" in str(error.value)
 
 
+def test_limits_hold_up_to_the_last_step_before_a_jump() -> None:
+    near = "model.renderer.near={schedule: linear, from: 0.025, to: 10, over: [0, 100]}"
+    far = "model.renderer.far={{schedule: steps, values: [{}, 100], at: [100]}}"
+    with pytest.raises(RecipeError, match=r"near 9\.9\d* and far 5"):
+        tiny(near, far.format(5))
+    assert tiny(near, far.format(9.95)).schedules
+
+
 def test_a_schedule_that_training_does_not_finish_is_told() -> None:
     recipe = tiny(f"{DILATION}={RAMP}", "training.steps=150")
     assert recipe.warnings == [f"{DILATION} changes until step 200, training ends at 150"]
-    assert tiny(f"{DILATION}={RAMP}", "training.steps=200").warnings == []
+    length = ("training.steps=200", "training.seconds=null")
+    assert tiny(f"{DILATION}={RAMP}", *length).warnings == []
+
+
+def test_a_schedule_counts_steps_whatever_the_time_budget() -> None:
+    (told,) = tiny(f"{DILATION}={RAMP}", "training.steps=200", "training.seconds=90").warnings
+    assert told.startswith(f"{DILATION} changes until step 200, and training.seconds may end")
+    assert "after 90 s" in told
+    still = f"{DILATION}={{schedule: constant, value: 1}}"
+    assert tiny(still, "training.seconds=90").warnings == []
 
 
 class Blend(MlpFeedForward):

@@ -20,7 +20,7 @@ from qgs.types import Cameras, Gaussians, Views, map_tensors
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 RATES: dict[str, float] = dict.fromkeys(
-    ("means", "log_scales", "quats", "opacity_logits", "color_logits"), 1e-2
+    ("means", "log_scales", "quats", "opacity_logits", "color_logits", "colors", "sh"), 1e-2
 )
 
 
@@ -189,6 +189,17 @@ def test_moments_follow_their_gaussians() -> None:
     assert (moments[5:40] != 0).any()
     leaves.gaussians().means.sum().backward()
     leaves.optimizer.step()
+
+
+def test_colors_beside_harmonics_may_have_any_value() -> None:
+    colors, sh = torch.linspace(-0.7, 1.6, 60).reshape(1, 20, 3), torch.zeros(1, 20, 3, 3)
+    leaves = Leaves(replace(cloud(20), colors=colors, sh=sh), RATES)
+    assert torch.equal(leaves.gaussians().colors, colors)
+    leaves.grow(24, torch.Generator().manual_seed(0))
+    assert torch.equal(leaves.gaussians().colors[:, :20], colors)
+    leaves.gaussians().colors.sum().backward()
+    leaves.optimizer.step()
+    assert (leaves.gaussians().colors[:, :20] < colors).all()
 
 
 def test_where_none_is_alive_none_is_moved() -> None:

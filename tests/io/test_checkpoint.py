@@ -19,9 +19,11 @@ from qgs.io.checkpoint import (
     CheckpointError,
     load_extra,
     load_recipe,
+    load_step,
     load_weights,
     save,
     unique_tensors,
+    write_checkpoint,
 )
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
@@ -179,6 +181,20 @@ def test_another_release_of_a_plugin_is_told(old_locus: Path) -> None:
 def test_extra_metadata_comes_back(model: QueryGaussianModel, tmp_path: Path) -> None:
     save(model, tmp_path / "a.safetensors", extra={"step": "7", "note": "ä = b"})
     assert load_extra(tmp_path / "a.safetensors") == {"step": "7", "note": "ä = b"}
+
+
+def test_a_model_without_a_step_is_saved_without_one(tmp_path: Path) -> None:
+    """As an imported one: what follows the training is at its end, in every copy."""
+    ramp = "model.renderer.dilation={schedule: linear, from: 10, to: 0.5, over: [1, 9]}"
+    recipe = resolve(RECIPES / "tokengs.yaml", [*SMALL, ramp])
+    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    tensors = {k: x.detach() for k, x in unique_tensors(recipe.build_model()).items()}
+    write_checkpoint(first, tensors, recipe.tree, {})
+    save(qgs.load(first), second)
+    assert load_step(second) is None
+    assert qgs.load(second).renderer.config.model_dump()["dilation"] == 0.5
+    save(recipe.build_model(), first)
+    assert load_step(first) == 0
 
 
 def test_shared_tensors_are_stored_once_and_stay_shared(tmp_path: Path) -> None:
