@@ -20,7 +20,7 @@ from typing import Any, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
-_C = TypeVar("_C", bound="TensorContainer")
+_C = TypeVar("_C")
 
 
 class TensorContainer:
@@ -63,7 +63,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 def concatenated(parts: Sequence[_C], dim: int) -> _C:
-    """One container with the tensors of all `parts` along `dim`.
+    """One container, or tuple of them, with the tensors of all `parts` along `dim`.
 
     Raises ValueError where one has a tensor that another one lacks.
     """

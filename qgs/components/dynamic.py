@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, SelfAttentionCore
-from qgs.components.times import TimeEmbedding
+from qgs.components.times import TimeEmbedding, without_data
 from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,
@@ -67,6 +67,7 @@ class DynamicQueries(Queries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        yield from without_data(config.time_channels, context)
         if config.dynamic >= config.count:
             yield Problem(
                 "dynamic",

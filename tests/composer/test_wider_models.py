@@ -25,6 +25,7 @@ from qgs.contracts import (
     ModelDims,
     Plugin,
     Queries,
+    Refinement,
 )
 from qgs.types import (
     Cameras,
@@ -356,6 +357,66 @@ def test_a_layer_that_forgets_the_memory_is_reported() -> None:
     model = resolve(wanted, plugins=[plugin]).build_model()
     with pytest.raises(PluginError, match="returns QueryState, not a QueryState and an ImageM"):
         model(views())
+
+
+class Careless(JointLayer):
+    """It makes the memory anew, without what it does not read itself."""
+
+    name: ClassVar[str] = "careless"
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        state, memory = super().forward(state, memory)
+        return state, ImageMemory(memory.features, values=memory.values)
+
+
+class Unmasking(JointLayer):
+    """It makes the state anew, without the mask."""
+
+    name: ClassVar[str] = "unmasking"
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        state, memory = super().forward(state, memory)
+        return QueryState(state.features, state.fields), memory
+
+
+class UnmaskingRefinement(Refinement):
+    """It makes the state anew, without the mask."""
+
+    name: ClassVar[str] = "unmasking"
+
+    def forward(self, state: QueryState) -> QueryState:
+        return QueryState(state.features, state.fields)
+
+
+@pytest.mark.parametrize(
+    ("decoder", "told"),
+    [
+        ({"layer": {"type": "mine/careless"}}, "careless` loses keys, patch_rays, grid of the ima"),
+        ({"layer": {"type": "mine/unmasking"}}, "`mine/unmasking` loses the mask of the state"),
+        ({"refinement": {"type": "mine/unmasking"}}, "`mine/unmasking` loses the mask of the sta"),
+    ],
+)
+def test_a_component_that_loses_what_others_need_is_named(decoder: Any, told: str) -> None:
+    plugin = Plugin("mine", CONTRACT_VERSION, (Careless, Unmasking, UnmaskingRefinement))
+    wanted = recipe(queries={"type": "other/bright"}, decoder={"depth": 2, **decoder})
+    model = resolve({**wanted, "plugins": ["other", "mine"]}, plugins=[PLUGIN, plugin])
+    with pytest.raises(PluginError, match=told):
+        model.build_model()(views())
+
+
+@pytest.mark.parametrize("contract", [JointLayer, TokenQueries, UnmaskingRefinement])
+@pytest.mark.parametrize("field", ["memory.features", "rendering.rgb", "gaussians.color"])
+def test_what_no_state_holds_cannot_be_provided_by_a_state(contract: Any, field: str) -> None:
+    def provides(cls: Any, config: ComponentConfig) -> Fields:
+        return {field: FieldSpec((3,))}
+
+    methods = {"name": "boasting", "provides": classmethod(provides), "__module__": __name__}
+    boasting = type("Boasting", (contract,), methods)
+    place = {boasting.slot: {"type": "mine/boasting"}}
+    wanted = recipe(**(place if contract is TokenQueries else {"decoder": {"depth": 2, **place}}))
+    plugin = Plugin("mine", CONTRACT_VERSION, (boasting,))
+    with pytest.raises(RecipeError, match=f"(?s)provides {field}, which .* has no way to write"):
+        resolve({**wanted, "plugins": ["mine"]}, plugins=[plugin])
 
 
 @pytest.mark.parametrize("component", [FeatureLoss, FeatureHead])
