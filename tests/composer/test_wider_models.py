@@ -27,6 +27,7 @@ from qgs.contracts import (
     Queries,
     Refinement,
 )
+from qgs.losses import Opacity, Visibility
 from qgs.types import (
     Cameras,
     GaussianAttributes,
@@ -36,6 +37,7 @@ from qgs.types import (
     QueryState,
     Rendering,
     Views,
+    map_tensors,
 )
 
 FEATURES = {"memory.features": MEMORY_FIELDS["memory.features"]}
@@ -326,6 +328,10 @@ def test_what_needs_keys_or_rays_is_refused_beside_an_encoder_without() -> None:
     assert wide(views()).gaussians.count == 24
     with pytest.raises(KeyError, match="the image memory has no keys; its encoder does not"):
         wide.encoder(views())["keys"]
+    with pytest.raises(KeyError, match="grid of an image memory is no tensor: read `memory.grid`"):
+        made().encoder(views())["grid"]
+    with pytest.raises(KeyError, match="the image memory has no grid"):
+        wide.encoder(views())["grid"]
 
 
 def test_what_needs_the_grid_is_refused_beside_learned_latents() -> None:
@@ -466,3 +472,43 @@ def test_photos_need_cameras_only_where_they_are_read() -> None:
     case = Case(PictureEncoder.Config(depth=0))
     check = CHECKS["unread_cameras_make_no_difference"]
     assert run_check(check, case).verdict == "passed"
+
+
+@pytest.mark.parametrize(
+    ("loss", "told"),
+    [
+        ({"type": "qgs/lpips"}, "LPIPS needs images of at least 16 pixels a side, the data's are"),
+        ({"padding": "valid"}, "SSIM of whole windows needs images of at least 11 pixels a side"),
+    ],
+)
+def test_losses_that_images_are_too_small_for_are_refused(loss: Any, told: str) -> None:
+    data = {"type": "qgs/chunks", "path": "x", "image_size": [8, 16]}
+    losses = {"mine": {"type": "qgs/photometric", **loss}}
+    wanted = {**recipe(), "losses": losses, "data": data}
+    with pytest.raises(RecipeError, match=told):
+        resolve(wanted, plugins=[PLUGIN])
+    assert resolve({**wanted, "data": {**data, "image_size": [16, 16]}}, plugins=[PLUGIN])
+    idle = {"mine": {"type": "qgs/photometric", "padding": "valid", "ssim_weight": 0.0}}
+    assert resolve({**wanted, "losses": idle}, plugins=[PLUGIN])
+
+
+@pytest.mark.parametrize("loss", [Opacity(Opacity.Config()), Visibility(Visibility.Config())])
+def test_losses_leave_out_gaussians_of_places_without_a_query(loss: Loss) -> None:
+    """The mean over scenes of what each gives without these places."""
+    model, given = made(queries={"type": "other/bright"}), views()
+    prediction = model(given).layers[2]
+    state, means = prediction.state, torch.randn(prediction.gaussians.means.shape)
+    gaussians = replace(prediction.gaussians, means=means + torch.tensor([0.0, 0.0, 5.0]))
+    nothing: Any = None
+    (found,) = loss(LayerPrediction(gaussians, state), nothing, given, given).values()
+    each = []
+    for scene, mask in enumerate(state.mask):
+        kept = map_tensors(
+            lambda x, scene=scene, mask=mask.repeat_interleave(2): x[scene : scene + 1, mask],
+            gaussians,
+        )
+        alone = LayerPrediction(kept, QueryState(state.features[scene : scene + 1, mask]))
+        each += loss(alone, nothing, map_scene(given, scene), given).values()
+    torch.testing.assert_close(found, torch.stack(each).mean())
+    whole = LayerPrediction(gaussians, replace(state, mask=None))
+    assert found != next(iter(loss(whole, nothing, given, given).values()))
