@@ -131,6 +131,7 @@ class DynamicObjective(Objective):
 
     name: ClassVar[str] = "dynamic"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    judges_inputs = False  # photos of other moments than the one that is reconstructed
 
     class Config(ComponentConfig):
         weight: float = Field(default=0.3, ge=0)

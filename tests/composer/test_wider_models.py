@@ -328,7 +328,7 @@ def test_what_needs_keys_or_rays_is_refused_beside_an_encoder_without() -> None:
     assert wide(views()).gaussians.count == 24
     with pytest.raises(KeyError, match="the image memory has no keys; its encoder does not"):
         wide.encoder(views())["keys"]
-    with pytest.raises(KeyError, match="grid of an image memory is no tensor: read `memory.grid`"):
+    with pytest.raises(KeyError, match="the grid of an image memory is no tensor"):
         made().encoder(views())["grid"]
     with pytest.raises(KeyError, match="the image memory has no grid"):
         wide.encoder(views())["grid"]
@@ -503,12 +503,54 @@ def test_losses_leave_out_gaussians_of_places_without_a_query(loss: Loss) -> Non
     (found,) = loss(LayerPrediction(gaussians, state), nothing, given, given).values()
     each = []
     for scene, mask in enumerate(state.mask):
-        kept = map_tensors(
-            lambda x, scene=scene, mask=mask.repeat_interleave(2): x[scene : scene + 1, mask],
-            gaussians,
-        )
+        there = mask.repeat_interleave(2)
+        kept = map_tensors(lambda x, i=scene, m=there: x[i : i + 1, m], gaussians)
         alone = LayerPrediction(kept, QueryState(state.features[scene : scene + 1, mask]))
         each += loss(alone, nothing, map_scene(given, scene), given).values()
     torch.testing.assert_close(found, torch.stack(each).mean())
     whole = LayerPrediction(gaussians, replace(state, mask=None))
     assert found != next(iter(loss(whole, nothing, given, given).values()))
+
+
+def test_a_layer_scale_that_no_layer_reads_is_refused() -> None:
+    class Plain(JointLayer):
+        name: ClassVar[str] = "plain"
+        reads_layer_scale = False
+
+    plugin = Plugin("mine", CONTRACT_VERSION, (Plain,))
+
+    def told(**decoder: Any) -> list[str]:
+        wanted = recipe(decoder=decoder, supervision={"layers": [decoder["depth"]]})
+        try:
+            resolve({**wanted, "plugins": ["mine"]}, plugins=[plugin])
+        except RecipeError as error:
+            return [f"{p.option}: {p.reason}; {p.fix}" for p in error.problems]
+        return []
+
+    plain = {"layer": {"type": "mine/plain"}}
+    (reason,) = told(depth=2, layer_scale=0.5, **plain)
+    assert "layer_scale: `layer_scale` has no effect: `mine/plain` does not read it; remo" in reason
+    assert "the default, `layer_scale: 5.0e-05`, drops one that is inherited" in reason
+    (reason,) = told(depth=0, layer_scale=0.5)
+    assert "has no effect: a decoder of depth 0 does not read it" in reason
+    assert not told(depth=2, layer_scale=5e-5, **plain)
+    assert not told(depth=2, layer_scale=0.5, layers={"1": plain})
+
+
+def test_input_views_are_judged_only_where_they_are_the_truth() -> None:
+    judged = {**recipe(), "training": {"judge_inputs": True}}
+    assert resolve(judged, plugins=[PLUGIN])
+    moving = {"queries": {"type": "qgs/dynamic", "count": 8, "dynamic": 2}}
+    cases = {
+        "views.pose_noise moves the cameras of input views": {"views": {"pose_noise": 1.0}},
+        "`qgs/dynamic` reconstructs one moment, input views": {
+            "model": {**judged["model"], **moving},
+            "objective": {"type": "qgs/dynamic"},
+        },
+    }
+    for reason, changed in cases.items():
+        with pytest.raises(RecipeError, match=reason) as caught:
+            resolve({**judged, **changed}, plugins=[PLUGIN])
+        (problem,) = caught.value.problems
+        assert problem.option == "training.judge_inputs"
+        assert resolve({**recipe(), **changed}, plugins=[PLUGIN])
