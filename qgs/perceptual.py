@@ -22,7 +22,7 @@ _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPS = 1e-10
-_SMALLEST = 2 ** (len(_BLOCKS) - 1)
+SMALLEST_SIDE = 2 ** (len(_BLOCKS) - 1)
 
 
 class PerceptualDistance(nn.Module):
@@ -43,9 +43,9 @@ class PerceptualDistance(nn.Module):
 
         Raises ValueError when a side is shorter than 16 pixels.
         """
-        if min(images.shape[-2:]) < _SMALLEST:
+        if min(images.shape[-2:]) < SMALLEST_SIDE:
             raise ValueError(
-                f"LPIPS needs images of at least {_SMALLEST} pixels a side, got "
+                f"LPIPS needs images of at least {SMALLEST_SIDE} pixels a side, got "
                 f"{images.shape[-2]}x{images.shape[-1]}"
             )
         with torch.no_grad():

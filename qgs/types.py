@@ -20,7 +20,7 @@ from typing import Any, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
-_C = TypeVar("_C", bound="TensorContainer")
+_C = TypeVar("_C")
 
 
 class TensorContainer:
@@ -63,7 +63,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 def concatenated(parts: Sequence[_C], dim: int) -> _C:
-    """One container with the tensors of all `parts` along `dim`.
+    """One container, or tuple of them, with the tensors of all `parts` along `dim`.
 
     Raises ValueError where one has a tensor that another one lacks.
     """
@@ -268,8 +268,10 @@ class ImageMemory(TensorContainer):
             raise ValueError(f"ImageMemory.grid {self.grid} must hold the {tokens} tokens")
 
     def __getitem__(self, name: str) -> Tensor:
-        """A part that a component `requires`, such as "keys"; KeyError where there is none."""
+        """A tensor that a component `requires`, such as "keys"; KeyError where there is none."""
         part = getattr(self, name, None)
+        if name == "grid" and part is not None:
+            raise KeyError("the grid of an image memory is no tensor: read `memory.grid`")
         if not isinstance(part, Tensor):
             raise KeyError(f"the image memory has no {name}; its encoder does not provide it")
         return part

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.decoder import ContentSelfAttention
-from qgs.components.times import TimeEmbedding
+from qgs.components.times import TimeEmbedding, without_data
 from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,
@@ -66,6 +66,7 @@ class DynamicQueries(Queries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        yield from without_data(config.time_channels, context)
         if config.dynamic >= config.count:
             yield Problem(
                 "dynamic",
@@ -123,6 +124,7 @@ class DynamicObjective(Objective):
 
     name: ClassVar[str] = "dynamic"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    judges_inputs = False  # photos of other moments than the one that is reconstructed
 
     class Config(ComponentConfig):
         weight: float = Field(default=0.3, ge=0)

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
-from qgs.components.times import TimeEmbedding
+from qgs.components.times import TimeEmbedding, without_data
 from qgs.contracts import ComponentConfig, Encoder, ModelDims, Problem, RecipeContext
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
@@ -89,6 +89,7 @@ class PatchViT(Encoder):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        yield from without_data(config.time_channels, context)
         size, patch = context.image_size, config.patch_size
         if size and any(side % patch for side in size):
             nearest = [max(round(side / patch), 1) * patch for side in size]

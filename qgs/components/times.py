@@ -1,10 +1,12 @@
 """Times: numbers that a network reads of them (TokenGS 2026.6). Axes: T numbers of a time."""
 
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
 
+from qgs.contracts import Problem, RecipeContext
 from qgs.geometry.precision import full_precision
 
 
@@ -15,6 +17,16 @@ def time_features(times: Tensor, channels: int) -> Tensor:
     rates = torch.exp(-math.log(10_000) / half * torch.arange(half).to(times))
     angles = times[..., None] * rates
     return torch.cat([angles.cos(), angles.sin()], -1)
+
+
+def without_data(channels: int, context: RecipeContext) -> Iterator[Problem]:
+    """The option `time_channels` where times would have to come from the recipe's data."""
+    if channels and context.image_size is not None:
+        yield Problem(
+            "time_channels",
+            f"no source of data tells times yet: `time_channels: {channels}` reads them",
+            "set time_channels to 0, or take the data out of the recipe and give views with times",
+        )
 
 
 class TimeEmbedding(nn.Module):

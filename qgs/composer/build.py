@@ -16,6 +16,7 @@ from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
 from qgs.composer.slots import SUBLAYER_SLOTS
 from qgs.contracts import (
+    MEMORY_FIELDS,
     DecoderLayer,
     ModelComponent,
     ModelDims,
@@ -171,8 +172,9 @@ def _too_large(error: Exception) -> bool:
 def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:
     """What is wrong with a state that a component returned; "" if nothing is.
 
-    A layer returns it with the memory.
+    A layer returns it with the memory. Neither loses what it was given.
     """
+    memory = None
     if issubclass(chosen.component, DecoderLayer):
         pair = state if isinstance(state, tuple) and len(state) == 2 else (state, None)
         state, memory = pair
@@ -190,6 +192,13 @@ def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:
         if not fits(shape, spec.shape):
             return f"{says} it returns one of trailing shape {shape}"
     given = {name for argument in arguments for name in getattr(argument, "fields", ())}
-    lost = ", ".join(sorted(given - state.fields.keys()))
     advice = "`state.replace(...)` keeps what it does not change"
-    return f"loses {lost}: the state that it returns has {found}; {advice}" if lost else ""
+    if lost := ", ".join(sorted(given - state.fields.keys())):
+        return f"loses {lost}: the state that it returns has {found}; {advice}"
+    if state.mask is None and any(getattr(x, "mask", None) is not None for x in arguments):
+        return f"loses the mask of the state, so that places without a query count; {advice}"
+    parts = [name.removeprefix("memory.") for name in MEMORY_FIELDS]
+    before = next((x for x in arguments if memory and isinstance(x, ImageMemory)), None)
+    gone = [n for n in parts if getattr(before, n, None) is not None and getattr(memory, n) is None]
+    advice = "`dataclasses.replace(memory, features=...)` keeps what it does not change"
+    return f"loses {', '.join(gone)} of the image memory; {advice}" if gone else ""

@@ -77,8 +77,9 @@ def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) ->
 
 def _writable(component: type[Component], provided: Fields) -> Collection[str]:
     """Names of the fields among `provided` that a component of this slot can write."""
-    if issubclass(component, Queries | DecoderLayer | Refinement):
-        return provided
+    if issubclass(component, Queries | DecoderLayer | Refinement):  # fields of a state
+        others = "memory.", "gaussians.", "rendering."
+        return [name for name in provided if not name.startswith(others)]
     if issubclass(component, Encoder | Head):
         return MEMORY_FIELDS if issubclass(component, Encoder) else GAUSSIAN_FIELDS
     return Renderer.provides(Renderer.Config()) if issubclass(component, Renderer) else ()

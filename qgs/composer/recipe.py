@@ -10,10 +10,11 @@ from torch import nn
 
 from qgs import contracts
 from qgs.composer.build import build, build_model
-from qgs.composer.decode import Chosen, check_tree, decode_place, decode_settings
+from qgs.composer.decode import Chosen, DecoderSettings, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
 from qgs.composer.files import MAX_BYTES, apply_overrides, merge, read_recipe, refuse_beyond_reading
 from qgs.composer.flow import (
+    Parts,
     check_flow,
     check_options,
     idle_fields,
@@ -148,6 +149,8 @@ def resolve(
         }
         check_flow(sound, dims.depth, registry, problems)
     _check_tuning(tree, settings["evaluation",], parts["model", "encoder"], registry, problems)
+    _check_layer_scale(tree, decoder, parts, problems)
+    _check_judged_inputs(tree, settings, parts["objective",], problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     out = _spell_out(tree, settings, registry, chosen)
@@ -188,6 +191,47 @@ def _check_tuning(
             f"`{encoder.type}` at model.encoder has no latents to tune",
             f"write `queries`, or use {others} in the slot `encoder`",
         )
+
+
+def _check_layer_scale(
+    tree: MapNode, decoder: DecoderSettings, parts: Parts, problems: Problems
+) -> None:
+    """Report a LayerScale that no layer of the decoder reads."""
+    layers = [parts["model", "decoder", "layers", str(i), "layer"] for i in range(decoder.depth)]
+    known: list[Any] = [layer.component if layer else contracts.DecoderLayer for layer in layers]
+    node, default = tree.child("model", "decoder"), DecoderSettings().layer_scale
+    if decoder.layer_scale != default and not any(layer.reads_layer_scale for layer in known):
+        kinds = " and ".join(sorted({f"`{layer.type}`" for layer in layers if layer}))
+        problems.add(
+            node.origins.get("layer_scale", node.origin),
+            "model.decoder.layer_scale",
+            f"`layer_scale` has no effect: {kinds or 'a decoder of depth 0'} does not read it",
+            f"remove it; the default, `layer_scale: {inline(default)}`, drops one that is inherited",
+        )
+
+
+def _check_judged_inputs(
+    tree: MapNode,
+    settings: Mapping[KeyPath, Any],
+    objective: Chosen | None,
+    problems: Problems,
+) -> None:
+    """Report input views that are to be judged and are no truth: other moments, noisy poses."""
+    if not settings["training",].judge_inputs:
+        return
+    node, kind = tree.child("training"), objective and objective.component
+    reasons = {
+        "views.pose_noise moves the cameras of input views, which must be exact to be judged": (
+            settings["views",].pose_noise
+        ),
+        f"`{objective and objective.type}` reconstructs one moment, input views show others": (
+            kind and issubclass(kind, contracts.Objective) and not kind.judges_inputs
+        ),
+    }
+    for reason in (reason for reason, holds in reasons.items() if holds):
+        fix = "set training.judge_inputs to false; evaluations do not read it"
+        origin = node.origins.get("judge_inputs", node.origin)
+        problems.add(origin, "training.judge_inputs", reason, fix)
 
 
 def _with_defaults(tree: MapNode) -> MapNode:

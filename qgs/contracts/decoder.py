@@ -49,10 +49,13 @@ class DecoderLayer(ModelComponent):
 
     sublayers: the slots inside this layer, of `cross_attention`, `self_attention` and
         `feed_forward`; a recipe that fills another one is refused.
+    reads_layer_scale: whether `decoder.layer_scale` has an effect; a recipe that sets it for layers
+        none of which reads it is refused.
     """
 
     slot: ClassVar[str] = "layer"
     sublayers: ClassVar[tuple[str, ...]] = ()
+    reads_layer_scale: ClassVar[bool] = True
 
     def __init__(
         self,

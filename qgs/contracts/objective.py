@@ -72,9 +72,12 @@ class Objective(Component):
 
     It has no parameters and keeps no state. Each pass of the model that it asks for costs as much
     as another step. Names of its own terms differ from those of the recipe's losses.
+
+    judges_inputs: whether input views may be targets too, see `training.judge_inputs`.
     """
 
     slot: ClassVar[str] = "objective"
+    judges_inputs: ClassVar[bool] = True
 
     @abstractmethod
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:

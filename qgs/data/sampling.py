@@ -8,7 +8,7 @@ Images are moved by NumPy, on one thread: torch's would wait for cores that trai
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from qgs.geometry.poses import (
     scaled,
 )
 from qgs.memory import refuse_beyond_memory
-from qgs.types import Cameras, Views, map_tensors
+from qgs.types import Cameras, Views, concatenated, map_tensors
 from qgs.wording import numbered
 
 Frames: TypeAlias = tuple[int, ...]
@@ -240,7 +240,8 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    return Views(_flipped(views.images), flipped, map_tensors(_flipped, views.masks))
+    masks = map_tensors(_flipped, views.masks)
+    return replace(views, images=_flipped(views.images), cameras=flipped, masks=masks)
 
 
 def _flipped(images: Tensor) -> Tensor:
@@ -257,13 +258,16 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Views (B, V) of several (b, V), on the CPU; masks of 1 where only others have some."""
-    c2w = torch.cat([v.cameras.c2w for v in views])
-    intrinsics = torch.cat([v.cameras.intrinsics for v in views])
-    cameras = Cameras(c2w, intrinsics, views[0].cameras.size)
+    """Views (B, V) of several (b, V), on the CPU; masks of 1 where only others have some.
+
+    Raises ValueError where only some have times.
+    """
+    others: list[dict[str, Any]] = [
+        {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views
+    ]
     images = np.concatenate([v.images.numpy() for v in views])
     masks = None
     if any(v.masks is not None for v in views):
         whole = [torch.ones_like(v.images[:, :, :1]) if v.masks is None else v.masks for v in views]
         masks = torch.from_numpy(np.concatenate([mask.numpy() for mask in whole]))
-    return Views(torch.from_numpy(images), cameras, masks)
+    return Views(torch.from_numpy(images), masks=masks, **concatenated(others, 0))

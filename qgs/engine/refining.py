@@ -208,10 +208,13 @@ def resized(views: Views, part: int) -> Views:
         return views
     height, width = views.cameras.size
     size = height // part, width // part
-    images = F.interpolate(views.images[0], size=size, mode="area")[None]
+    images, masks = map_tensors(
+        lambda x: F.interpolate(x[0], size=size, mode="area")[None], (views.images, views.masks)
+    )
     factors = [size[1] / width, size[0] / height]
     intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
-    return Views(images, Cameras(views.cameras.c2w, intrinsics, size))
+    cameras = Cameras(views.cameras.c2w, intrinsics, size)
+    return replace(views, images=images, cameras=cameras, masks=masks)
 
 
 @torch.no_grad()

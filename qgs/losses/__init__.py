@@ -1,6 +1,7 @@
 """What training minimises."""
 
 from qgs.losses.lpips import LpipsLoss
+from qgs.losses.means import mean_of_gaussians
 from qgs.losses.opacity import Mask, Opacity
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import Visibility, VisibilityOptions, view_visibility
@@ -15,5 +16,6 @@ __all__ = [
     "Photometric",
     "Visibility",
     "VisibilityOptions",
+    "mean_of_gaussians",
     "view_visibility",
 ]

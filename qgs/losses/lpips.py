@@ -1,12 +1,14 @@
 """`qgs/lpips`: how different rendered and true images look to VGG-16, see `qgs.perceptual`."""
 
+from collections.abc import Iterable
 from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss, MissingExtraError
-from qgs.perceptual import PerceptualDistance
+from qgs.contracts import ComponentConfig, Loss, MissingExtraError, Problem, RecipeContext
+from qgs.losses.photometric import too_small
+from qgs.perceptual import SMALLEST_SIDE, PerceptualDistance
 from qgs.types import LayerPrediction, Rendering, Views
 
 
@@ -29,6 +31,10 @@ class LpipsLoss(Loss):
     def __init__(self, config: Config) -> None:
         super().__init__(config)
         self.network = PerceptualDistance(config.weights)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        yield from too_small(context, SMALLEST_SIDE, "", "LPIPS")
 
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views

@@ -7,12 +7,13 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss
 from qgs.geometry.precision import at_least_float32
+from qgs.losses.means import mean_of_gaussians
 from qgs.losses.photometric import mean_squared_error
 from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Opacity(Loss):
-    """Mean of -ln(opacity + eps) over all Gaussians (TokenGS release, weight 0 in its recipes)."""
+    """Mean over Gaussians of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
 
     name: ClassVar[str] = "opacity"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
@@ -30,7 +31,8 @@ class Opacity(Loss):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         opacities = at_least_float32(prediction.gaussians.opacities)
-        return {"opacity": self.config.weight * -(opacities + self.config.eps).log().mean()}
+        mean = mean_of_gaussians((opacities + self.config.eps).log(), prediction)
+        return {"opacity": self.config.weight * -mean}
 
 
 class Mask(Loss):

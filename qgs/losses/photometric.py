@@ -1,5 +1,6 @@
 """`qgs/photometric`: MSE, L1 and SSIM of rendered against true images (TokenGS, LocusGS)."""
 
+from collections.abc import Iterable, Iterator
 from typing import ClassVar, Literal
 
 import torch
@@ -7,7 +8,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss
+from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext
 from qgs.geometry.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
 
@@ -71,6 +72,11 @@ class Photometric(Loss):
 
     config: Config
 
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if config.ssim_weight and config.padding == "valid":
+            yield from too_small(context, WINDOW, "padding", "SSIM of whole windows")
+
     def weights(self) -> tuple[float, float, float]:
         """Of MSE, L1 and SSIM."""
         return self.config.mse_weight, self.config.l1_weight, self.config.ssim_weight
@@ -88,6 +94,14 @@ class Photometric(Loss):
             similarity = mean_ssim(rendering.rgb, target.images, self.config.padding)
             terms["ssim"] = self.config.ssim_weight * (1 - similarity) / 2
         return terms
+
+
+def too_small(context: RecipeContext, side: int, option: str, measure: str) -> Iterator[Problem]:
+    """A problem of `option` where the data's images have a side below `side` pixels."""
+    if context.image_size and min(context.image_size) < side:
+        given = "{} x {} (H x W)".format(*context.image_size)
+        reason = f"{measure} needs images of at least {side} pixels a side, the data's are {given}"
+        yield Problem(option, reason, "raise data.image_size, or do without it")
 
 
 @full_precision

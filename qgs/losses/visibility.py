@@ -9,6 +9,7 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.precision import full_precision
+from qgs.losses.means import mean_of_gaussians
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 
 _TINY_Z = 1e-8
@@ -82,7 +83,7 @@ class Visibility(Loss):
             behind=self.config.behind,
             infinite_pixel=self.config.infinite_pixel,
         )
-        return {"visibility": self.config.weight * per_point.mean()}
+        return {"visibility": self.config.weight * mean_of_gaussians(per_point, prediction)}
 
 
 @full_precision

@@ -134,6 +134,18 @@ def test_views_without_times_are_refused() -> None:
         reconstruct(views(times))
 
 
+def test_data_tell_no_times_so_what_reads_them_is_refused_beside_data() -> None:
+    assert resolve(RECIPE)
+    with pytest.raises(RecipeError) as caught:
+        resolve({**RECIPE, "data": {"type": "qgs/chunks", "path": "x"}})
+    told = {problem.option: problem.reason for problem in caught.value.problems}
+    reason = "no source of data tells times yet: `time_channels: {}` reads them"
+    assert told == {
+        "model.encoder.time_channels": reason.format(4),
+        "model.queries.time_channels": reason.format(2),
+    }
+
+
 def test_views_keep_the_time_that_is_asked_for() -> None:
     both = views(torch.tensor([[0.1, 0.9]] * 2), torch.zeros(2, 1))
     chosen = both.select([1])

@@ -25,7 +25,9 @@ from qgs.contracts import (
     ModelDims,
     Plugin,
     Queries,
+    Refinement,
 )
+from qgs.losses import Opacity, Visibility
 from qgs.types import (
     Cameras,
     GaussianAttributes,
@@ -35,6 +37,7 @@ from qgs.types import (
     QueryState,
     Rendering,
     Views,
+    map_tensors,
 )
 
 FEATURES = {"memory.features": MEMORY_FIELDS["memory.features"]}
@@ -325,6 +328,10 @@ def test_what_needs_keys_or_rays_is_refused_beside_an_encoder_without() -> None:
     assert wide(views()).gaussians.count == 24
     with pytest.raises(KeyError, match="the image memory has no keys; its encoder does not"):
         wide.encoder(views())["keys"]
+    with pytest.raises(KeyError, match="the grid of an image memory is no tensor"):
+        made().encoder(views())["grid"]
+    with pytest.raises(KeyError, match="the image memory has no grid"):
+        wide.encoder(views())["grid"]
 
 
 def test_what_needs_the_grid_is_refused_beside_learned_latents() -> None:
@@ -356,6 +363,66 @@ def test_a_layer_that_forgets_the_memory_is_reported() -> None:
     model = resolve(wanted, plugins=[plugin]).build_model()
     with pytest.raises(PluginError, match="returns QueryState, not a QueryState and an ImageM"):
         model(views())
+
+
+class Careless(JointLayer):
+    """It makes the memory anew, without what it does not read itself."""
+
+    name: ClassVar[str] = "careless"
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        state, memory = super().forward(state, memory)
+        return state, ImageMemory(memory.features, values=memory.values)
+
+
+class Unmasking(JointLayer):
+    """It makes the state anew, without the mask."""
+
+    name: ClassVar[str] = "unmasking"
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        state, memory = super().forward(state, memory)
+        return QueryState(state.features, state.fields), memory
+
+
+class UnmaskingRefinement(Refinement):
+    """It makes the state anew, without the mask."""
+
+    name: ClassVar[str] = "unmasking"
+
+    def forward(self, state: QueryState) -> QueryState:
+        return QueryState(state.features, state.fields)
+
+
+@pytest.mark.parametrize(
+    ("decoder", "told"),
+    [
+        ({"layer": {"type": "mine/careless"}}, "careless` loses keys, patch_rays, grid of the ima"),
+        ({"layer": {"type": "mine/unmasking"}}, "`mine/unmasking` loses the mask of the state"),
+        ({"refinement": {"type": "mine/unmasking"}}, "`mine/unmasking` loses the mask of the sta"),
+    ],
+)
+def test_a_component_that_loses_what_others_need_is_named(decoder: Any, told: str) -> None:
+    plugin = Plugin("mine", CONTRACT_VERSION, (Careless, Unmasking, UnmaskingRefinement))
+    wanted = recipe(queries={"type": "other/bright"}, decoder={"depth": 2, **decoder})
+    model = resolve({**wanted, "plugins": ["other", "mine"]}, plugins=[PLUGIN, plugin])
+    with pytest.raises(PluginError, match=told):
+        model.build_model()(views())
+
+
+@pytest.mark.parametrize("contract", [JointLayer, TokenQueries, UnmaskingRefinement])
+@pytest.mark.parametrize("field", ["memory.features", "rendering.rgb", "gaussians.color"])
+def test_what_no_state_holds_cannot_be_provided_by_a_state(contract: Any, field: str) -> None:
+    def provides(cls: Any, config: ComponentConfig) -> Fields:
+        return {field: FieldSpec((3,))}
+
+    methods = {"name": "boasting", "provides": classmethod(provides), "__module__": __name__}
+    boasting = type("Boasting", (contract,), methods)
+    place = {boasting.slot: {"type": "mine/boasting"}}
+    wanted = recipe(**(place if contract is TokenQueries else {"decoder": {"depth": 2, **place}}))
+    plugin = Plugin("mine", CONTRACT_VERSION, (boasting,))
+    with pytest.raises(RecipeError, match=f"(?s)provides {field}, which .* has no way to write"):
+        resolve({**wanted, "plugins": ["mine"]}, plugins=[plugin])
 
 
 @pytest.mark.parametrize("component", [FeatureLoss, FeatureHead])
@@ -405,3 +472,85 @@ def test_photos_need_cameras_only_where_they_are_read() -> None:
     case = Case(PictureEncoder.Config(depth=0))
     check = CHECKS["unread_cameras_make_no_difference"]
     assert run_check(check, case).verdict == "passed"
+
+
+@pytest.mark.parametrize(
+    ("loss", "told"),
+    [
+        ({"type": "qgs/lpips"}, "LPIPS needs images of at least 16 pixels a side, the data's are"),
+        ({"padding": "valid"}, "SSIM of whole windows needs images of at least 11 pixels a side"),
+    ],
+)
+def test_losses_that_images_are_too_small_for_are_refused(loss: Any, told: str) -> None:
+    data = {"type": "qgs/chunks", "path": "x", "image_size": [8, 16]}
+    losses = {"mine": {"type": "qgs/photometric", **loss}}
+    wanted = {**recipe(), "losses": losses, "data": data}
+    with pytest.raises(RecipeError, match=told):
+        resolve(wanted, plugins=[PLUGIN])
+    assert resolve({**wanted, "data": {**data, "image_size": [16, 16]}}, plugins=[PLUGIN])
+    idle = {"mine": {"type": "qgs/photometric", "padding": "valid", "ssim_weight": 0.0}}
+    assert resolve({**wanted, "losses": idle}, plugins=[PLUGIN])
+
+
+@pytest.mark.parametrize("loss", [Opacity(Opacity.Config()), Visibility(Visibility.Config())])
+def test_losses_leave_out_gaussians_of_places_without_a_query(loss: Loss) -> None:
+    """The mean over scenes of what each gives without these places."""
+    model, given = made(queries={"type": "other/bright"}), views()
+    prediction = model(given).layers[2]
+    state, means = prediction.state, torch.randn(prediction.gaussians.means.shape)
+    gaussians = replace(prediction.gaussians, means=means + torch.tensor([0.0, 0.0, 5.0]))
+    nothing: Any = None
+    (found,) = loss(LayerPrediction(gaussians, state), nothing, given, given).values()
+    each = []
+    for scene, mask in enumerate(state.mask):
+        there = mask.repeat_interleave(2)
+        kept = map_tensors(lambda x, i=scene, m=there: x[i : i + 1, m], gaussians)
+        alone = LayerPrediction(kept, QueryState(state.features[scene : scene + 1, mask]))
+        each += loss(alone, nothing, map_scene(given, scene), given).values()
+    torch.testing.assert_close(found, torch.stack(each).mean())
+    whole = LayerPrediction(gaussians, replace(state, mask=None))
+    assert found != next(iter(loss(whole, nothing, given, given).values()))
+
+
+def test_a_layer_scale_that_no_layer_reads_is_refused() -> None:
+    class Plain(JointLayer):
+        name: ClassVar[str] = "plain"
+        reads_layer_scale = False
+
+    plugin = Plugin("mine", CONTRACT_VERSION, (Plain,))
+
+    def told(**decoder: Any) -> list[str]:
+        wanted = recipe(decoder=decoder, supervision={"layers": [decoder["depth"]]})
+        try:
+            resolve({**wanted, "plugins": ["mine"]}, plugins=[plugin])
+        except RecipeError as error:
+            return [f"{p.option}: {p.reason}; {p.fix}" for p in error.problems]
+        return []
+
+    plain = {"layer": {"type": "mine/plain"}}
+    (reason,) = told(depth=2, layer_scale=0.5, **plain)
+    assert "layer_scale: `layer_scale` has no effect: `mine/plain` does not read it; remo" in reason
+    assert "the default, `layer_scale: 5.0e-05`, drops one that is inherited" in reason
+    (reason,) = told(depth=0, layer_scale=0.5)
+    assert "has no effect: a decoder of depth 0 does not read it" in reason
+    assert not told(depth=2, layer_scale=5e-5, **plain)
+    assert not told(depth=2, layer_scale=0.5, layers={"1": plain})
+
+
+def test_input_views_are_judged_only_where_they_are_the_truth() -> None:
+    judged = {**recipe(), "training": {"judge_inputs": True}}
+    assert resolve(judged, plugins=[PLUGIN])
+    moving = {"queries": {"type": "qgs/dynamic", "count": 8, "dynamic": 2}}
+    cases = {
+        "views.pose_noise moves the cameras of input views": {"views": {"pose_noise": 1.0}},
+        "`qgs/dynamic` reconstructs one moment, input views": {
+            "model": {**judged["model"], **moving},
+            "objective": {"type": "qgs/dynamic"},
+        },
+    }
+    for reason, changed in cases.items():
+        with pytest.raises(RecipeError, match=reason) as caught:
+            resolve({**judged, **changed}, plugins=[PLUGIN])
+        (problem,) = caught.value.problems
+        assert problem.option == "training.judge_inputs"
+        assert resolve({**recipe(), **changed}, plugins=[PLUGIN])

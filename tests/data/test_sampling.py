@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -8,7 +9,7 @@ from line_scenes import Line, Lines
 from qgs.composer import resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
-from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views
+from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views, stack_views
 from qgs.data.stream import training_batches
 from qgs.engine.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth
@@ -266,3 +267,15 @@ def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol()
     assert not torch.equal(first[0], clean[0].inputs.cameras.c2w)
     assert protocol_of(recipe).content["poses"]["noise"] == [3.0, 0]
     assert "noise" not in protocol_of(exact).content["poses"]
+
+
+def test_times_of_photos_are_kept() -> None:
+    plain = make_sample(Line(9), (1, 4, 7), (2,), ViewsConfig(inputs=3), False).inputs
+    timed = replace(plain, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
+    both = stack_views([mirrored_views(timed), timed])
+    for name in ("times", "target_time"):
+        assert torch.equal(getattr(both, name), getattr(timed, name).repeat(2, 1))
+    with pytest.raises(
+        ValueError, match="some of what is put together have target_time, times, others"
+    ):
+        stack_views([timed, plain])

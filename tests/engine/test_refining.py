@@ -133,8 +133,13 @@ def test_an_interrupt_keeps_what_there_is(
 def test_a_coarser_level_shows_the_same_scene() -> None:
     cameras = ring(3, side=64)
     fine = RENDERER(cloud(20), cameras).rgb
-    coarse = resized(Views(fine, cameras), 2)
+    given = Views(fine, cameras, fine[:, :, :1], torch.rand(1, 3), torch.rand(1, 1))
+    coarse = resized(given, 2)
     assert coarse.images.shape == (1, 3, 3, 32, 32)
+    assert coarse.masks is not None
+    assert torch.equal(coarse.masks, coarse.images[:, :, :1])
+    assert coarse.times is given.times
+    assert coarse.target_time is given.target_time
     assert mean_psnr(cloud(20), coarse, RENDERER) > 32
 
 

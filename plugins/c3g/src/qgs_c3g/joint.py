@@ -28,11 +28,12 @@ from qgs.types import ImageMemory, QueryState
 class JointLayer(DecoderLayer):
     """Self-attention over [image tokens; queries], then an MLP; both change (C3G).
 
-    x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)). There is no LayerScale:
-    `decoder.layer_scale` has no effect on this layer. Keys, values and rays of the memory stay.
+    x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)). There is no LayerScale.
+    Keys, values and rays of the memory stay.
     """
 
     name: ClassVar[str] = "joint"
+    reads_layer_scale = False
 
     class Config(ComponentConfig):
         mlp_ratio: float = Field(default=2.0, ge=1)

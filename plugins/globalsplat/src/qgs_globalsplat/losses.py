@@ -9,8 +9,9 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Loss
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera
+from qgs.losses import mean_of_gaussians
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 
 
@@ -39,7 +40,7 @@ class Frustum(Loss):
         """One term, `frustum`."""
         options = self.config.softness, self.config.near
         per_point = beyond_frusta(prediction.gaussians.means, inputs.cameras, *options)
-        return {"frustum": self.config.weight * mean_of_shown(per_point, prediction)}
+        return {"frustum": self.config.weight * mean_of_gaussians(per_point, prediction)}
 
 
 class Regularisers(Loss):
@@ -64,21 +65,12 @@ class Regularisers(Loss):
     ) -> dict[str, Tensor]:
         """Terms `mean_opacity`, `mean_scale`."""
         gaussians = prediction.gaussians
-        opacity = mean_of_shown(gaussians.opacities, prediction)
-        scale = mean_of_shown(gaussians.scales.mean(-1), prediction)
+        opacity = mean_of_gaussians(gaussians.opacities, prediction)
+        scale = mean_of_gaussians(gaussians.scales.mean(-1), prediction)
         return {
             "mean_opacity": self.config.opacity_weight * opacity,
             "mean_scale": self.config.scale_weight * scale,
         }
-
-
-def mean_of_shown(per_gaussian: Tensor, prediction: LayerPrediction) -> Tensor:
-    """The mean over scenes of the mean (B, G) over Gaussians of queries that decode any; 0-d."""
-    values, mask = at_least_float32(per_gaussian), prediction.state.mask
-    if mask is None:
-        return values.mean()
-    shown = mask.repeat_interleave(values.shape[1] // mask.shape[1], 1).to(values)
-    return ((values * shown).sum(1) / shown.sum(1).clamp_min(1)).mean()
 
 
 @full_precision
