@@ -1,6 +1,6 @@
 """ViTs over the patches of all views together; `qgs/multiview_vit` (TokenGS release)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import ClassVar
 
 import torch
@@ -52,6 +52,18 @@ class EncoderBlock(nn.Module):
         return x_BMD + self.scale2(self.mlp(self.norm2(x_BMD)))
 
 
+def undivided(patch: int, context: RecipeContext) -> Iterator[Problem]:
+    """The option `patch_size` where squares of `patch` pixels do not divide the data's images."""
+    size = context.image_size
+    if size and any(side % patch for side in size):
+        nearest = [max(round(side / patch), 1) * patch for side in size]
+        yield Problem(
+            "patch_size",
+            f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
+            f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
+        )
+
+
 class PatchViT(Encoder):
     """RGB and Plücker embeddings added, then ViT blocks over the tokens of all views together.
 
@@ -90,14 +102,7 @@ class PatchViT(Encoder):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         yield from without_data(config.time_channels, context)
-        size, patch = context.image_size, config.patch_size
-        if size and any(side % patch for side in size):
-            nearest = [max(round(side / patch), 1) * patch for side in size]
-            yield Problem(
-                "patch_size",
-                f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
-                f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
-            )
+        yield from undivided(config.patch_size, context)
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Weights of smaller patches serve larger ones, if their side is a multiple.

@@ -206,7 +206,7 @@ def _check_layer_scale(
             node.origins.get("layer_scale", node.origin),
             "model.decoder.layer_scale",
             f"`layer_scale` has no effect: {kinds or 'a decoder of depth 0'} does not read it",
-            f"remove it; the default, `layer_scale: {inline(default)}`, drops one that is inherited",
+            f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one",
         )
 
 

@@ -530,7 +530,7 @@ def test_a_layer_scale_that_no_layer_reads_is_refused() -> None:
     plain = {"layer": {"type": "mine/plain"}}
     (reason,) = told(depth=2, layer_scale=0.5, **plain)
     assert "layer_scale: `layer_scale` has no effect: `mine/plain` does not read it; remo" in reason
-    assert "the default, `layer_scale: 5.0e-05`, drops one that is inherited" in reason
+    assert "the default, `layer_scale: 5.0e-05`, drops an inherited one" in reason
     (reason,) = told(depth=0, layer_scale=0.5)
     assert "has no effect: a decoder of depth 0 does not read it" in reason
     assert not told(depth=2, layer_scale=5e-5, **plain)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import torch
 from einops import rearrange
@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import Mlp
-from qgs.components.encoder import PatchViT
+from qgs.components.encoder import undivided
 from qgs.contracts import (
     ComponentConfig,
     Encoder,
@@ -74,7 +74,7 @@ class PatchEncoder(Encoder):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """Patches that do not divide the images."""
-        return PatchViT.problems(cast(Any, config), context)
+        return undivided(config.patch_size, context)
 
     def forward(self, views: Views) -> ImageMemory:
         """The memory, with a grid where there are no registers.
