@@ -137,6 +137,8 @@ def test_containers_tell_shapes_and_no_numbers(model):
         "  images: (1, 2, 3, 32, 32)",
         f"  cameras: {views().cameras!r}",
         "  masks: None",
+        "  times: None",
+        "  target_time: None",
         ")",
     ]
     assert "c2w: (1, 2, 4, 4) float64" in repr(views().cameras.to(torch.float64))
