@@ -64,7 +64,7 @@ def evaluate(
         first = f"{missing[0].scene}: {missing[0].reason}"
         raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
     evaluation = Evaluation(
-        protocol=protocol_of(recipe, index, plan.wanted),
+        protocol=protocol_of(recipe, index, plan.wanted, model.renderer.followed),
         columns=measures.columns,
         scores=scores,
         wanted=plan.wanted,

@@ -8,6 +8,7 @@ from typing import Any
 
 from qgs.composer import Recipe
 from qgs.contracts import Metric, SceneSource, SceneSourceConfig
+from qgs.contracts.schedule import END, at_step
 from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.engine.tuning import tuning_loss
 
@@ -50,14 +51,19 @@ def index_of(recipe: Recipe) -> EvaluationIndex | None:
 
 
 def protocol_of(
-    recipe: Recipe, index: EvaluationIndex | None = None, scenes: Sequence[str] = ()
+    recipe: Recipe,
+    index: EvaluationIndex | None = None,
+    scenes: Sequence[str] = (),
+    step: int = END,
 ) -> Protocol:
     """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
 
     With an index the kind of data, how it is split, and options at their defaults are left out, so
-    that one data set in two formats has one protocol.
+    that one data set in two formats has one protocol. Options of the renderer that follow the
+    training are those after `step` steps.
     """
     evaluation, part = recipe.evaluation, recipe.parts["data",]
+    renderer = recipe.parts["model", "renderer"]
     config, source = part.config, part.component
     assert isinstance(config, SceneSourceConfig)
     assert issubclass(source, SceneSource)
@@ -96,7 +102,7 @@ def protocol_of(
         "data": data,
         "poses": recipe.views.model_dump(include={"frame", "scale", *factor}) | noise,
         "views": judged,
-        "renderer": recipe.parts["model", "renderer"].config.model_dump(mode="json"),
+        "renderer": at_step(renderer.config, renderer.schedules, step).model_dump(mode="json"),
         "metrics": metrics,
         "tuning": tuning,
     }

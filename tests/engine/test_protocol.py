@@ -140,3 +140,10 @@ def test_splits_count_only_where_no_index_names_the_frames(
     index = read_index(str(file))
     assert protocol_of(split, index).sha256 == protocol_of(plain, index).sha256
     assert protocol_of(split, None, ["x"]).sha256 != protocol_of(plain, None, ["x"]).sha256
+
+
+def test_a_renderer_that_follows_the_training_has_its_numbers_of_then(tiny: Tiny) -> None:
+    dilation = "{schedule: steps, values: [10, 0.3], at: [50]}"
+    plain, falling = tiny("tokengs"), tiny("tokengs", f"model.renderer.dilation={dilation}")
+    assert protocol_of(falling).sha256 == protocol_of(plain).sha256
+    assert protocol_of(falling, step=0).content["renderer"]["dilation"] == 10
