@@ -21,7 +21,7 @@ def time_features(times: Tensor, channels: int) -> Tensor:
 
 def without_data(channels: int, context: RecipeContext) -> Iterator[Problem]:
     """The option `time_channels` where times would have to come from the recipe's data."""
-    if channels and context.image_size is not None:
+    if channels and context.inputs is not None:
         yield Problem(
             "time_channels",
             f"no source of data tells times yet: `time_channels: {channels}` reads them",

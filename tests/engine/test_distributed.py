@@ -68,7 +68,7 @@ def test_two_processes_have_the_loss_curve_of_one(
 
 NO_LAYERS = (
     "model.decoder={depth: 0, cross_attention: null, self_attention: null, feed_forward: null, "
-    "refinement: null}",
+    "refinement: null, layer_scale: 5.0e-5}",
     "model.supervision.layers=[0]",
 )
 

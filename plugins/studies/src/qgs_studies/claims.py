@@ -103,7 +103,7 @@ def host() -> str:
 
 def _age(path: Path) -> float:
     """Seconds since the file was touched, by the clock of its file system."""
-    probe = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    probe = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
     try:
         probe.touch()
         return probe.stat().st_mtime - path.stat().st_mtime
