@@ -14,9 +14,10 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from qgs_ellipsoid.fields import anchor_rotation
-from qgs_ellipsoid.ray_bias import ellipsoid_bias, ellipsoid_bias_direct
-from qgs_ellipsoid.ray_bias import ray_features as ellipsoid_features
-from qgs_locus.ray_bias import ray_bias, ray_features
+from qgs_ellipsoid.ray_bias import EllipsoidBias
+from qgs_ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
+from qgs_locus.ray_bias import RayBias
+from qgs_locus.ray_bias import ray_tokens as locus_tokens
 from torch import Tensor
 
 
@@ -28,13 +29,13 @@ def biases(anchors: int, rays: int) -> dict[str, Callable[[], Tensor]]:
     origins = 0.3 * torch.randn(1, rays, 3)
     directions = F.normalize(torch.randn(1, rays, 3), dim=-1)
     plucker = torch.cat([torch.linalg.cross(origins, directions), directions], -1)
-    isotropic, shaped = ray_features(plucker), ellipsoid_features(plucker)
-    gamma = torch.tensor(0.1)
-    place = (center, rotation, sigma_sq)
+    last = -20.0, torch.tensor(0.1)
+    locus = RayBias.of(center, sigma_sq[..., :1], locus_tokens(plucker), *last)
+    shaped = EllipsoidBias.of(center, rotation, sigma_sq, ellipsoid_tokens(plucker), *last)
     return {
-        "locus": lambda: ray_bias(center, sigma_sq[..., :1], isotropic, -20.0, gamma),
-        "ellipsoid": lambda: ellipsoid_bias(*place, shaped, -20.0, gamma),
-        "ellipsoid, direct": lambda: ellipsoid_bias_direct(*place, plucker, -20.0, gamma),
+        "locus": locus.dense,
+        "ellipsoid": shaped.dense,
+        "ellipsoid, torch": lambda: shaped.value(shaped.queries[0], shaped.tokens[0]),
     }
 
 
@@ -70,7 +71,10 @@ def main() -> None:
     with torch.no_grad():
         compare(dict(runs), options.rounds)
     print("forward and backward")
-    compare({n: lambda run=run: run().sum().backward() for n, run in runs.items()}, options.rounds)
+    compare(
+        {n: lambda run=run: run().sum().backward(retain_graph=True) for n, run in runs.items()},
+        options.rounds,
+    )
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The default components: TokenGS, one file per slot."""
 
+from qgs.components.attention_bias import AttentionBias, Kernel
 from qgs.components.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.components.centers import FreeCenters, posact
 from qgs.components.decoder import (
@@ -45,6 +46,7 @@ __all__ = [
     "COMPONENTS",
     "NORM_EPS",
     "TOKENGS",
+    "AttentionBias",
     "BlockCausalSelfAttention",
     "ContentCrossAttention",
     "ContentSelfAttention",
@@ -54,6 +56,7 @@ __all__ = [
     "DynamicQueries",
     "FreeCenters",
     "GaussianHead",
+    "Kernel",
     "LatentBottleneck",
     "LatentQueries",
     "LayerScale",

@@ -1,8 +1,5 @@
 """`qgs/cpu`: projection and blending by tiles of 16 x 16 pixels, in numba."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import MissingExtraError, Renderer, RendererConfig
+from qgs.kernels import can_compile, in_threads
 from qgs.renderers.inputs import background_of, check_inputs, colors_of, raise_precision
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering
@@ -34,7 +32,7 @@ class CpuRenderer(Renderer):
 
     def __init__(self, config: RendererConfig) -> None:
         super().__init__(config)
-        if find_spec("numba") is None:
+        if not can_compile():
             raise MissingExtraError(
                 "the renderer qgs/cpu needs numba, which is not installed: run "
                 '`pip install "query-gaussians[cpu]"`, or choose `renderer: {type: qgs/torch}` '
@@ -109,7 +107,8 @@ class _Splat(torch.autograd.Function):
             kernels.forward_unit(rows[image], *scene, stripe, blending, out[image])
 
         stripes = _image_units(batch, views, size[0])
-        _in_threads((project, _scene_units(batch, count)), (blend, stripes))
+        in_threads(project, _scene_units(batch, count))
+        in_threads(blend, stripes)
         ctx.save_for_backward(*tensors, splats, sums)
         ctx.config = config
         return sums
@@ -148,7 +147,8 @@ class _Splat(torch.autograd.Function):
                 of_colors[scene], camera_parts[scene, part],
             )  # fmt: skip
 
-        _in_threads((blend, stripes), (project, units))
+        in_threads(blend, stripes)
+        in_threads(project, units)
         if colors.ndim == 4:  # not to be added up over the views
             of_inputs[4] = torch.from_numpy(grads[..., -3:].sum(2))
         if not wants_cameras:
@@ -195,13 +195,3 @@ def _image_units(
         for v in range(views)
         for part, stripe in enumerate(pairwise(edges))
     ]
-
-
-def _in_threads(*stages: tuple[Callable[..., None], Sequence[tuple[Any, ...]]]) -> None:
-    """Stage by stage, call `unit(*item)` for every item, on as many threads as torch uses.
-
-    Every unit of work writes to its own memory, so the order within a stage does not matter.
-    """
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for unit, work in stages:
-            list(pool.map(lambda item, unit=unit: unit(*item), work))

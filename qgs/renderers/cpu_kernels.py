@@ -15,27 +15,9 @@ The backward pass repeats the forward one, so both skip and stop alike. With v_i
 transmittance T_i and the rest S_i = sum_{j>i} w_j v_j, dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numba import njit
 
-
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` on first use, kept on disk where there is a place that can be written."""
-    options = {
-        "nogil": True,
-        "error_model": "numpy",  # no branch on a division by zero
-        "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-        # kernels from the cache share what they call, and may run another's build of it
-        "forceinline": True,
-    }
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError:  # numba found no such place
-        return njit(**options)(function)
-
+from qgs.kernels import kernel
 
 TILE = 16
 SPLAT_FIELDS = 9

@@ -10,7 +10,7 @@ the camera sees C^T (m - p) and the factor C^T F.
 
 import numpy as np
 
-from qgs.renderers.cpu_kernels import kernel
+from qgs.kernels import kernel
 
 CAMERA_GRADIENTS = 16  # of C by rows, p, fx, fy, cx, cy
 

@@ -145,7 +145,7 @@ def test_every_second_head_reads_close_rays_alone_and_says_so(
     inputs, attention = inputs_of(case), case.build()
     with torch.no_grad():
         explained = attention.explain(*inputs.values(), torch.arange(6))
-        shared = RayBiasedCrossAttention.bias(attention, *inputs.values())
+        shared = RayBiasedCrossAttention.bias(attention, *inputs.values()).dense()
     assert torch.equal(explained.geometry[:, 0], shared)
     hidden = explained.geometry[:, 1].isinf()
     kept = shared >= -0.5 * attention.gamma * 0.25

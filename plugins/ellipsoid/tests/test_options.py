@@ -7,7 +7,7 @@ from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
 from qgs_ellipsoid.head import EllipsoidHead, radii_along
-from qgs_ellipsoid.ray_bias import ellipsoid_bias_direct
+from qgs_ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.cross_attention import RayBiasedCrossAttention
@@ -52,7 +52,7 @@ def test_attention_pictures_and_decoding_speak_of_one_ellipsoid() -> None:
     state, cameras = _state(), _cameras()
     memory = _memory(patch_rays(plucker_rays(cameras), 1), (2, 12, 16))
     attention = EllipsoidCrossAttention(EllipsoidCrossAttention.Config(**CHOSEN, **OFFSET), DIMS)
-    bias = attention.bias(state, memory)
+    bias = attention.bias(state, memory).dense()
     axes = EllipsoidQueries(EllipsoidQueries.Config(**OFFSET), DIMS).support(state).axes
     origins, directions = (x.flatten(1, 3) for x in camera_rays(cameras))
     along = torch.linspace(0, 6, 20_001)[:, None]
@@ -73,15 +73,14 @@ def test_the_floor_of_a_direction_is_an_option(eps: float) -> None:
     rays = rays * torch.linspace(0.1, 1.0, rays.shape[1])[:, None]
     memory = _memory(rays, (2, 3, 4))
     config = EllipsoidCrossAttention.Config(**CHOSEN, **OFFSET, direction_eps=0.9)
-    EllipsoidCrossAttention(config, DIMS).bias(state, memory)
+    EllipsoidCrossAttention(config, DIMS).bias(state, memory).dense()
     config = EllipsoidCrossAttention.Config(**CHOSEN, **OFFSET, direction_eps=eps)
     attention = EllipsoidCrossAttention(config, DIMS)
     sigma_sq = (0.3 * _radii(state[RAW_RADII])).square()
     rotation = anchor_rotation(state[ROTATION])
-    expected = ellipsoid_bias_direct(
-        state[CENTER], rotation, sigma_sq, rays, -7.0, attention.gamma, eps
-    )
-    seen = attention.bias(state, memory)
+    place = state[CENTER], rotation, sigma_sq, ray_tokens(rays, eps)
+    expected = EllipsoidBias.of(*place, -7.0, attention.gamma).dense()
+    seen = attention.bias(state, memory).dense()
     torch.testing.assert_close(seen, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -90,7 +89,7 @@ def test_a_fixed_bandwidth_is_that_of_locusgs() -> None:
     options = {"bandwidth": "fixed", "sigma0": 0.3, "bias_min": -7.0}
     ours = EllipsoidCrossAttention(EllipsoidCrossAttention.Config(**options), DIMS)
     theirs = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(**options), DIMS)
-    assert torch.equal(ours.bias(state, memory), theirs.bias(state, memory))
+    assert torch.equal(ours.bias(state, memory).dense(), theirs.bias(state, memory).dense())
     assert set(EllipsoidCrossAttention.requires(ours.config)) == set(
         RayBiasedCrossAttention.requires(theirs.config)
     )

@@ -1,10 +1,11 @@
-"""The factored bias against the formula of the paper, and its invariances."""
+"""The bias and its kernels against the formula of the paper, and its invariances."""
 
 import pytest
 import torch
-from qgs_locus.ray_bias import BLOCK, ray_bias, ray_bias_direct, ray_features
+from qgs_locus.ray_bias import RayBias, ray_tokens
 from torch import Tensor
 
+from qgs.components.attention_bias import BLOCK
 from qgs.geometry.rays import normalised_rays
 
 
@@ -15,11 +16,22 @@ def _rays(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.cat([torch.linalg.cross(origins, directions), directions], -1) * 0.97
 
 
+def ray_bias_direct(
+    center: Tensor, sigma_sq: Tensor | float, rays: Tensor, bias_min: float, gamma: Tensor
+) -> Tensor:
+    """The formula as the paper writes it."""
+    length = rays[..., 3:].norm(dim=-1, keepdim=True)
+    moments, directions = (rays / length).split(3, -1)
+    crossed = torch.linalg.cross(center[:, :, None], directions[:, None], dim=-1)
+    distance = (crossed - moments[:, None]).norm(dim=-1)
+    return gamma * (-0.5 * (distance.square() / sigma_sq)).clamp(bias_min, 0)
+
+
 @pytest.mark.parametrize("bandwidth", ["radius", "fixed"])
-def test_factored_equals_direct(bandwidth: str) -> None:
+def test_kernel_equals_the_formula(bandwidth: str) -> None:
     center, rays, gamma = torch.randn(2, 50, 3), _rays(200), torch.tensor(0.1)
     sigma_sq = 0.01 if bandwidth == "fixed" else torch.rand(2, 50, 1) * 0.05 + 1e-3
-    fast = ray_bias(center, sigma_sq, ray_features(rays), -20.0, gamma)
+    fast = RayBias.of(center, sigma_sq, ray_tokens(rays), -20.0, gamma).dense()
     direct = ray_bias_direct(center, sigma_sq, rays, -20.0, gamma)
     assert fast.shape == (2, 50, 200)
     torch.testing.assert_close(fast, direct, rtol=0, atol=1e-4 * float(gamma))
@@ -28,7 +40,7 @@ def test_factored_equals_direct(bandwidth: str) -> None:
 
 
 @pytest.mark.parametrize("distance", [1.0, 10.0, 50.0])
-def test_factored_is_as_exact_as_direct_far_from_the_cameras(distance: float) -> None:
+def test_kernel_is_as_exact_as_the_formula_far_from_the_cameras(distance: float) -> None:
     depth = distance * torch.rand(2, 50, 1) + 0.1
     center = torch.cat([depth * (torch.rand(2, 50, 2) - 0.5), depth], -1)
     on_center = torch.nn.functional.normalize(center + 0.01 * torch.randn(2, 50, 3), dim=-1)
@@ -37,19 +49,34 @@ def test_factored_is_as_exact_as_direct_far_from_the_cameras(distance: float) ->
     one, smallest = torch.ones(()), 1e-3
     exact = ray_bias_direct(center.double(), smallest, rays.double(), -20.0, one.double())
     direct = ray_bias_direct(center, smallest, rays, -20.0, one)
-    fast = ray_bias(center, smallest, ray_features(rays), -20.0, one)
+    fast = RayBias.of(center, smallest, ray_tokens(rays), -20.0, one).dense()
     assert ((exact > -20) & (exact < -0.01)).any()
     assert (fast - exact).abs().max() <= 1.5 * (direct - exact).abs().max()
 
 
 def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    inputs = torch.randn(2, 50, 3), torch.rand(2, 50, 1), ray_features(_rays(20)), -20.0
-    whole = ray_bias(*inputs, torch.tensor(0.1))
+    inputs = torch.randn(2, 50, 3), torch.rand(2, 50, 1), ray_tokens(_rays(20)), -20.0
+    whole = RayBias.of(*inputs, torch.tensor(0.1)).dense()
     monkeypatch.setitem(BLOCK, "cpu", 2 * 20 * 7)
-    assert torch.equal(ray_bias(*inputs, torch.tensor(0.1)), whole)
+    assert torch.equal(RayBias.of(*inputs, torch.tensor(0.1)).dense(), whole)
 
 
-def test_gradients_of_factored_equal_those_of_direct() -> None:
+@pytest.mark.parametrize("tokens", [1, 17, 4100])
+def test_kernels_differ_from_float64_by_rounding_alone(tokens: int) -> None:
+    center, rays = torch.randn(2, 30, 3) + torch.tensor([0.0, 0.0, 1.5]), _rays(tokens)
+    inputs = [center, 1e-3 + 0.3 * torch.rand(2, 30, 1), torch.tensor(0.4)]
+    weight = torch.rand(2, 30, tokens)
+
+    def found(dtype: torch.dtype) -> tuple[Tensor, ...]:
+        center, sigma_sq, gamma = leaves = [x.to(dtype).requires_grad_() for x in inputs]
+        bias = RayBias.of(center, sigma_sq, ray_tokens(rays.to(dtype)), -20.0, gamma).dense()
+        return bias, *torch.autograd.grad(bias, leaves, weight.to(dtype))
+
+    for seen, exact in zip(found(torch.float32), found(torch.float64), strict=True):
+        assert (seen - exact).norm() <= 2e-6 * exact.norm()
+
+
+def test_gradients_equal_those_of_the_formula() -> None:
     inputs = [
         torch.randn(2, 6, 3, dtype=torch.float64),
         torch.rand(2, 6, 1, dtype=torch.float64) + 0.05,
@@ -58,8 +85,8 @@ def test_gradients_of_factored_equal_those_of_direct() -> None:
     ]
     weight = torch.randn(2, 6, 9, dtype=torch.float64)
 
-    def factored(center, sigma_sq, rays, bias_min, gamma) -> Tensor:
-        return ray_bias(center, sigma_sq, ray_features(rays), bias_min, gamma)
+    def ours(center, sigma_sq, rays, bias_min, gamma) -> Tensor:
+        return RayBias.of(center, sigma_sq, ray_tokens(rays), bias_min, gamma).dense()
 
     def gradients(function) -> tuple[Tensor, ...]:
         leaves = [x.clone().requires_grad_() for x in inputs]
@@ -67,7 +94,7 @@ def test_gradients_of_factored_equal_those_of_direct() -> None:
         (function(center, sigma_sq, rays, -2.0, gamma) * weight).sum().backward()
         return tuple(leaf.grad for leaf in leaves)
 
-    for fast, direct in zip(gradients(factored), gradients(ray_bias_direct), strict=True):
+    for fast, direct in zip(gradients(ours), gradients(ray_bias_direct), strict=True):
         torch.testing.assert_close(fast, direct)
 
 
@@ -75,15 +102,17 @@ def test_a_point_on_the_ray_has_no_penalty() -> None:
     rays = _rays(5, torch.float64)
     moments, directions = normalised_rays(rays)
     on_ray = torch.linalg.cross(directions, moments) + 1.7 * directions
-    bias = ray_bias(on_ray, 1e-3, ray_features(rays), -20.0, torch.ones((), dtype=torch.float64))
+    bias = RayBias.of(
+        on_ray, 1e-3, ray_tokens(rays), -20.0, torch.ones((), dtype=torch.float64)
+    ).dense()
     torch.testing.assert_close(bias.diagonal(dim1=1, dim2=2), torch.zeros(2, 5).double())
 
 
 def test_autocast_leaves_the_bias_in_float32() -> None:
     center, rays = torch.randn(2, 8, 3), _rays(16)
-    features = ray_features(rays)
-    plain = ray_bias(center, 0.01, features, -20.0, torch.tensor(0.1))
+    features = ray_tokens(rays)
+    plain = RayBias.of(center, 0.01, features, -20.0, torch.tensor(0.1)).dense()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        mixed = ray_bias(center, 0.01, ray_features(rays), -20.0, torch.tensor(0.1))
+        mixed = RayBias.of(center, 0.01, ray_tokens(rays), -20.0, torch.tensor(0.1)).dense()
     assert mixed.dtype == torch.float32
     torch.testing.assert_close(mixed, plain, rtol=0, atol=0)

@@ -6,10 +6,11 @@ from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER, RAW_RADIUS
 from torch import Tensor
 
+from qgs.components import AttentionBias
 from qgs.contracts import Fields
 from qgs.types import ImageMemory, QueryState
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation, shape_fields
-from qgs_ellipsoid.ray_bias import ellipsoid_bias, ray_features
+from qgs_ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 
 
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
@@ -28,14 +29,14 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         shape = shape_fields(config) if config.bandwidth == "radius" else {}
         return {n: f for n, f in super().requires(config).items() if n != RAW_RADIUS} | dict(shape)
 
-    def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        """gamma b (B, N, M), float32, of the state before this layer."""
+    def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias | Tensor:
+        """gamma b, of the state before this layer."""
         config, sigma_sq_BN3 = self.config, self.sigma_sq(state)
         if not isinstance(sigma_sq_BN3, Tensor):
             return super().bias(state, memory)
-        features = memory.once(
-            f"ellipsoid.ray_features.{config.direction_eps:g}",
-            lambda: ray_features(memory["patch_rays"], config.direction_eps),
+        tokens_B9M = memory.once(
+            f"ellipsoid.ray_tokens.{config.direction_eps:g}",
+            lambda: ray_tokens(memory["patch_rays"], config.direction_eps),
         )
         place = state[CENTER], anchor_rotation(state[ROTATION]), sigma_sq_BN3
-        return ellipsoid_bias(*place, features, config.bias_min, self.gamma)
+        return EllipsoidBias.of(*place, tokens_B9M, config.bias_min, self.gamma)

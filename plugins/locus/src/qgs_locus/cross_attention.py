@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components import NORM_EPS, CrossAttentionCore
+from qgs.components import NORM_EPS, AttentionBias, CrossAttentionCore
 from qgs.contracts import (
     MEMORY_FIELDS,
     AttentionWeights,
@@ -28,7 +28,7 @@ from qgs_locus.fields import (
     radius_field,
     support_radius,
 )
-from qgs_locus.ray_bias import ray_bias, ray_features
+from qgs_locus.ray_bias import RayBias, ray_tokens
 
 
 class RayBiasedCrossAttention(CrossAttention):
@@ -90,21 +90,21 @@ class RayBiasedCrossAttention(CrossAttention):
         r_BN1 = support_radius(state[self.raw_radius], self.config)
         return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
-    def bias(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        """gamma b (B, N, M), float32, of the state before this layer."""
+    def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias | Tensor:
+        """gamma b, of the state before this layer."""
         config, eps = self.config, self.config.direction_eps
-        rays_BFM = memory.once(
-            f"locus.ray_features.{eps:g}", lambda: ray_features(memory["patch_rays"], eps)
+        rays_B6M = memory.once(
+            f"locus.ray_tokens.{eps:g}", lambda: ray_tokens(memory["patch_rays"], eps)
         )
         sigma_sq = self.sigma_sq(state)
-        return ray_bias(state[CENTER], sigma_sq, rays_BFM, config.bias_min, self.gamma)
+        return RayBias.of(state[CENTER], sigma_sq, rays_B6M, config.bias_min, self.gamma)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
         """The update (B, N, D)."""
-        bias_BNM = self.bias(state, memory)
-        return self.core(state.features, memory["keys"], memory["values"], bias_BNM)
+        bias = self.bias(state, memory)
+        return self.core(state.features, memory["keys"], memory["values"], bias)
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
         """Attention over image tokens, with the bias apart."""
-        bias_BNM = self.bias(state, memory)
-        return self.core.explain(state.features, memory["keys"], queries, bias_BNM)
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory["keys"], queries, bias)

@@ -1,0 +1,114 @@
+"""Numba kernels of `EllipsoidBias`: one pass over the rays of each query, in registers.
+
+Queries are rows: mu, cof(W) and W by rows, gamma / 2, gamma * bias_min. Tokens have nine rows: m,
+d, d / |d|. A matrix is the tuple of its nine entries.
+"""
+
+import numpy as np
+
+from qgs.kernels import kernel
+
+_ZERO, _TWO = np.float32(0), np.float32(2)
+
+
+@kernel
+def _times(a, x, y, z):
+    """a (x, y, z)."""
+    return (
+        a[0] * x + a[1] * y + a[2] * z,
+        a[3] * x + a[4] * y + a[5] * z,
+        a[6] * x + a[7] * y + a[8] * z,
+    )
+
+
+@kernel
+def _nine(row, first):
+    return (
+        row[first], row[first + 1], row[first + 2], row[first + 3], row[first + 4],
+        row[first + 5], row[first + 6], row[first + 7], row[first + 8],
+    )  # fmt: skip
+
+
+@kernel
+def _moment(mu, t, j):
+    """m - mu x d of token j."""
+    return (
+        t[0, j] - mu[1] * t[5, j] + mu[2] * t[4, j],
+        t[1, j] - mu[2] * t[3, j] + mu[0] * t[5, j],
+        t[2, j] - mu[0] * t[4, j] + mu[1] * t[3, j],
+    )
+
+
+@kernel
+def write(queries, tokens, out):
+    """max(-factor |cof(W) (m - mu x d)|^2 / |W d|^2, lower), with d of unit length below."""
+    for n in range(queries.shape[0]):
+        q, row = queries[n], out[n]
+        mu, c, w = (q[0], q[1], q[2]), _nine(q, 3), _nine(q, 12)
+        factor, lower = q[21], q[22]
+        for j in range(row.shape[0]):
+            e = _moment(mu, tokens, j)
+            a = _times(c, e[0], e[1], e[2])
+            b = _times(w, tokens[6, j], tokens[7, j], tokens[8, j])
+            above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+            below = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+            bias = -factor * above / below
+            row[j] = lower if bias <= lower else bias
+
+
+@kernel
+def gradients(queries, tokens, gradient, out):
+    """Gradients of the queries. A gradient g of e = m - mu x d is g x d of mu."""
+    for n in range(queries.shape[0]):
+        q, row, of = queries[n], gradient[n], out[n]
+        mu, c, w = (q[0], q[1], q[2]), _nine(q, 3), _nine(q, 12)
+        factor, lower = q[21], q[22]
+        of_x = of_y = of_z = of_factor = of_lower = _ZERO
+        c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = _ZERO
+        w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = w8 = _ZERO
+        for j in range(row.shape[0]):
+            e = _moment(mu, tokens, j)
+            u, v, t = tokens[6, j], tokens[7, j], tokens[8, j]
+            a, b = _times(c, e[0], e[1], e[2]), _times(w, u, v, t)
+            above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+            below = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+            ratio = above / below
+            inside = _ZERO if -factor * ratio <= lower else row[j]
+            of_lower += row[j] - inside
+            of_factor -= inside * ratio
+            up = -_TWO * factor * inside / below
+            a0, a1, a2 = up * a[0], up * a[1], up * a[2]
+            c0 += a0 * e[0]
+            c1 += a0 * e[1]
+            c2 += a0 * e[2]
+            c3 += a1 * e[0]
+            c4 += a1 * e[1]
+            c5 += a1 * e[2]
+            c6 += a2 * e[0]
+            c7 += a2 * e[1]
+            c8 += a2 * e[2]
+            e0 = a0 * c[0] + a1 * c[3] + a2 * c[6]
+            e1 = a0 * c[1] + a1 * c[4] + a2 * c[7]
+            e2 = a0 * c[2] + a1 * c[5] + a2 * c[8]
+            of_x += e1 * tokens[5, j] - e2 * tokens[4, j]
+            of_y += e2 * tokens[3, j] - e0 * tokens[5, j]
+            of_z += e0 * tokens[4, j] - e1 * tokens[3, j]
+            down = -up * ratio
+            b0, b1, b2 = down * b[0], down * b[1], down * b[2]
+            w0 += b0 * u
+            w1 += b0 * v
+            w2 += b0 * t
+            w3 += b1 * u
+            w4 += b1 * v
+            w5 += b1 * t
+            w6 += b2 * u
+            w7 += b2 * v
+            w8 += b2 * t
+        of[0], of[1], of[2] = of_x, of_y, of_z
+        of[3], of[4], of[5], of[6], of[7], of[8], of[9], of[10], of[11] = (
+            c0, c1, c2, c3, c4, c5, c6, c7, c8,
+        )  # fmt: skip
+        of[12], of[13], of[14], of[15], of[16], of[17], of[18], of[19], of[20] = (
+            w0, w1, w2, w3, w4, w5, w6, w7, w8,
+        )  # fmt: skip
+        of[21], of[22] = of_factor, of_lower

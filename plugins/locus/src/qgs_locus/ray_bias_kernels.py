@@ -1,0 +1,55 @@
+"""Numba kernels of `RayBias`: one pass over the rays of each query, in registers.
+
+Queries are rows (x, y, z, gamma / (2 sigma^2), gamma * bias_min); tokens have six rows, m and d.
+"""
+
+import numpy as np
+
+from qgs.kernels import kernel
+
+_ZERO, _TWO = np.float32(0), np.float32(2)
+
+
+@kernel
+def write(queries, tokens, out):
+    """max(-factor |mu x d - m|^2, lower)."""
+    m0, m1, m2 = tokens[0], tokens[1], tokens[2]
+    d0, d1, d2 = tokens[3], tokens[4], tokens[5]
+    for n in range(queries.shape[0]):
+        x, y, z = queries[n, 0], queries[n, 1], queries[n, 2]
+        factor, lower = queries[n, 3], queries[n, 4]
+        row = out[n]
+        for j in range(row.shape[0]):
+            e0 = y * d2[j] - z * d1[j] - m0[j]
+            e1 = z * d0[j] - x * d2[j] - m1[j]
+            e2 = x * d1[j] - y * d0[j] - m2[j]
+            bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
+            row[j] = lower if bias <= lower else bias
+
+
+@kernel
+def gradients(queries, tokens, gradient, out):
+    """Gradients of the queries: with e = mu x d - m, that of |e|^2 to mu is 2 d x e."""
+    m0, m1, m2 = tokens[0], tokens[1], tokens[2]
+    d0, d1, d2 = tokens[3], tokens[4], tokens[5]
+    for n in range(queries.shape[0]):
+        x, y, z = queries[n, 0], queries[n, 1], queries[n, 2]
+        factor, lower = queries[n, 3], queries[n, 4]
+        row = gradient[n]
+        of_x = of_y = of_z = of_factor = of_lower = _ZERO
+        for j in range(row.shape[0]):
+            e0 = y * d2[j] - z * d1[j] - m0[j]
+            e1 = z * d0[j] - x * d2[j] - m1[j]
+            e2 = x * d1[j] - y * d0[j] - m2[j]
+            distance_sq = e0 * e0 + e1 * e1 + e2 * e2
+            inside = _ZERO if -factor * distance_sq <= lower else row[j]
+            of_x += inside * (d1[j] * e2 - d2[j] * e1)
+            of_y += inside * (d2[j] * e0 - d0[j] * e2)
+            of_z += inside * (d0[j] * e1 - d1[j] * e0)
+            of_factor += inside * distance_sq
+            of_lower += row[j] - inside
+        out[n, 0] = -_TWO * factor * of_x
+        out[n, 1] = -_TWO * factor * of_y
+        out[n, 2] = -_TWO * factor * of_z
+        out[n, 3] = -of_factor
+        out[n, 4] = of_lower

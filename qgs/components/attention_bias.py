@@ -1,0 +1,264 @@
+"""Attention with a bias that is a function of query and token, computed block by block.
+
+The logits are q k / sqrt(d) + b. Neither they, nor b, nor their gradients ever exist for all N x M
+pairs, only for some queries and all tokens at a time: a block of `BLOCK` pairs. The backward pass
+makes b and the weights p = exp(logits - lse) again from the log-sum-exp of each query
+(FlashAttention, arXiv 2205.14135, section 3.1, whose blocks are of tokens too).
+
+Axes: F numbers of a query, G numbers of a token, n queries of a block.
+"""
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.kernels import can_compile, in_threads
+
+Kernel: TypeAlias = Callable[..., None]
+Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
+"""A scene, some of its queries, and buffers (n, M) for them."""
+
+BLOCK = {"cpu": 2**22, "cuda": 2**25}
+"""Numbers that all blocks of a pass may hold at a time, each (n, M)."""
+
+_kept = threading.local()
+
+_UNIT = 2**16  # pairs that are worth a thread
+
+
+class AttentionBias(ABC):
+    """A bias of attention logits, the same for all heads: a function of query and token.
+
+    queries: (B, N, F), what it reads of queries. tokens: (B, G, M), what it reads of tokens.
+    Gradients flow into both. All geometry, float32 or float64.
+    """
+
+    def __init__(self, queries: Tensor, tokens: Tensor) -> None:
+        self.queries, self.tokens = queries, tokens
+
+    @abstractmethod
+    def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
+        """The bias (n, M) of some queries of a scene and all its tokens, differentiable."""
+
+    def compiled(self) -> tuple[Kernel, Kernel] | None:
+        """Two kernels (`qgs.kernels.kernel`) that are faster on a CPU in float32; None for none.
+
+        The first one is called with arrays (queries, tokens, out) and does as `value`; the second
+        with (queries, tokens, gradient, out) and writes the gradient (n, F) of the queries, given
+        that of the bias. They may share rows among threads.
+        """
+        return None
+
+    @full_precision
+    def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
+        """Write `value` into `out_nM`."""
+        kernels = self._kernels(queries_nF)
+        if kernels is None:
+            out_nM.copy_(self.value(queries_nF, tokens_GM))
+        else:
+            _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
+
+    @full_precision
+    def gradients(
+        self, queries_nF: Tensor, tokens_GM: Tensor, gradient_nM: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Gradients (n, F) of the queries and (G, M) of the tokens, given that of the bias.
+
+        The second is None where `self.tokens` requires none.
+        """
+        wanted = self.tokens.requires_grad
+        kernels = None if wanted else self._kernels(queries_nF)
+        if kernels is not None:
+            out_nF = torch.empty_like(queries_nF)
+            _in_rows(kernels[1], tokens_GM, queries_nF, gradient_nM, out_nF)
+            return out_nF, None
+        with torch.enable_grad():
+            leaves = queries_nF.detach().requires_grad_(), tokens_GM.detach()
+            leaves[1].requires_grad_(wanted)
+            value_nM = self.value(*leaves)
+            found = torch.autograd.grad(value_nM, leaves[: 1 + wanted], gradient_nM.to(value_nM))
+        return found[0], found[1] if wanted else None
+
+    def _kernels(self, queries: Tensor) -> tuple[Kernel, Kernel] | None:
+        usable = queries.device.type == "cpu" and queries.dtype == torch.float32
+        return self.compiled() if usable and can_compile() else None
+
+    def dense(self) -> Tensor:
+        """The bias of all pairs, (B, N, M)."""
+        return _outside_graphs(_Dense.apply)(self.queries, self.tokens, self)
+
+    def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
+        """All queries, block by block, with memory for `buffers` tensors of a block's shape."""
+        scenes, count, _ = self.queries.shape
+        tokens, device = self.tokens.shape[2], self.queries.device
+        numbers = BLOCK.get(device.type, BLOCK["cuda"])
+        rows = min(max(numbers // max(buffers * tokens, tokens, 1), 1), count)
+        memory = _scratch(buffers * rows * tokens, device, dtype).view(buffers, rows, tokens)
+        for scene in range(scenes):
+            for first in range(0, count, rows):
+                of_block = slice(first, min(first + rows, count))
+                yield scene, of_block, memory[:, : of_block.stop - first].unbind()
+
+
+def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
+    """Call a kernel for some rows at a time of all but the tokens, on several threads."""
+    tokens, (queries, *others) = tokens_GM.numpy(), [x.numpy() for x in of_rows]
+    pairs = len(queries) * tokens.shape[1]
+    threads = min(torch.get_num_threads(), -(-pairs // _UNIT)) or 1
+    step = -(-len(queries) // threads)
+    parts = [slice(n, n + step) for n in range(0, len(queries), step)]
+    in_threads(kernel, ((queries[n], tokens, *(x[n] for x in others)) for n in parts))
+
+
+def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Memory for `size` numbers. On a CPU it is kept: touching new memory would take as long as
+    computing the bias."""
+    if device.type != "cpu":
+        return torch.empty(size, device=device, dtype=dtype)
+    memory = getattr(_kept, "memory", None)
+    if memory is None or memory.dtype != dtype or len(memory) < size:
+        with torch.inference_mode(False):
+            memory = _kept.memory = torch.empty(size, dtype=dtype)
+    return memory[:size]
+
+
+def biased_attention(q_BhNd: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: AttentionBias) -> Tensor:
+    """softmax(q k / sqrt(d) + b) v, (B, h, N, d), in memory linear in N and in M."""
+    of_bias = bias.queries, bias.tokens, bias
+    return _outside_graphs(_BiasedAttention.apply)(q_BhNd, k_BhMd, v_BhMd, *of_bias)
+
+
+def _outside_graphs(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """`function`, left out of compiled graphs, where its loop would be unrolled for every size.
+
+    Outside them `torch.compiler.disable` would import the compiler (0.8 s).
+    """
+    outside: Any = torch.compiler.disable if torch.compiler.is_compiling() else lambda f: f
+    return outside(function)
+
+
+class _Dense(torch.autograd.Function):
+    """The bias of all pairs, of which nothing is kept for the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> Tensor:
+        out_BNM = queries.new_empty(*queries.shape[:2], tokens.shape[2])
+        for scene, rows, _ in bias.blocks(0, out_BNM.dtype):
+            bias.write(queries[scene, rows], tokens[scene], out_BNM[scene, rows])
+        ctx.save_for_backward(queries, tokens)
+        ctx.bias = bias
+        return out_BNM
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        queries, tokens = ctx.saved_tensors
+        sums = _BiasGradients(queries, tokens, ctx.bias)
+        for scene, rows, _ in ctx.bias.blocks(0, gradients[0].dtype):
+            sums.add(scene, rows, gradients[0][scene, rows])
+        return sums.queries, sums.tokens, None
+
+
+class _BiasGradients:
+    """Gradients of what a bias reads, summed over blocks. queries, tokens: as `AttentionBias`'s."""
+
+    def __init__(self, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> None:
+        self._read, self._bias = (queries, tokens), bias
+        self.queries = torch.empty_like(queries)
+        self.tokens = torch.zeros_like(tokens) if bias.tokens.requires_grad else None
+
+    def add(self, scene: int, rows: slice, gradient_nM: Tensor) -> None:
+        """Add those of a block, given the gradient of its values."""
+        read = self._read[0][scene, rows], self._read[1][scene]
+        self.queries[scene, rows], of_tokens = self._bias.gradients(*read, gradient_nM)
+        if self.tokens is not None and of_tokens is not None:
+            self.tokens[scene] += of_tokens
+
+
+class _BiasedAttention(torch.autograd.Function):
+    """See `biased_attention`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, bias: Any
+    ) -> Tensor:
+        out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=at_least_float32(q).dtype)
+        for scene, rows, (bias_nM,) in bias.blocks(1, lse.dtype):
+            bias.write(queries[scene, rows], tokens[scene], bias_nM)
+            out[scene, :, rows], lse[scene, :, rows] = _attend(
+                q[scene, :, rows], k[scene], v[scene], bias_nM
+            )
+        ctx.save_for_backward(q, k, v, queries, tokens, out, lse)
+        ctx.bias = bias
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        q, k, v, queries, tokens, out, lse = ctx.saved_tensors
+        saved = queries, tokens, out, lse, gradients[0], ctx.bias
+        dq, dk, dv, *of_bias = _attention_gradients(q, k, v, *saved)
+        return dq.to(q), dk.to(k), dv.to(v), *of_bias, None
+
+
+def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted values (h, n, d) and log-sum-exp (h, n) of some queries of a scene."""
+    if q_hnd.device.type != "cpu":
+        return _attend_anywhere(q_hnd, k_hMd, v_hMd, bias_nM)
+    flash = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu  # what SDPA calls
+    out, lse = flash(q_hnd[None], k_hMd[None], v_hMd[None], attn_mask=bias_nM[None, None])
+    return out[0], lse[0]
+
+
+@full_precision
+def _attend_anywhere(
+    q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As `_attend`, in float32, on any device."""
+    logits_hnM = torch.baddbmm(bias_nM, q_hnd, k_hMd.mT, alpha=q_hnd.shape[-1] ** -0.5)
+    lse_hn = logits_hnM.logsumexp(-1)
+    return logits_hnM.sub_(lse_hn[..., None]).exp_() @ v_hMd, lse_hn
+
+
+@full_precision
+def _attention_gradients(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    queries: Tensor,
+    tokens: Tensor,
+    out: Tensor,
+    lse: Tensor,
+    gradient: Tensor,
+    bias: AttentionBias,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    """Gradients of q, k, v (all (B, h, ., d)), and of what the bias reads.
+
+    With P the weights of a head and dO the gradient of its output: dV = P' dO,
+    dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d), and the gradient
+    of the bias is dS, summed over heads.
+    """
+    scale = q.shape[-1] ** -0.5
+    dq, dk, dv = torch.empty_like(q), torch.zeros_like(k), torch.zeros_like(v)
+    of_bias = _BiasGradients(queries, tokens, bias)
+    q, rowsum = q * scale, (gradient * out).sum(-1)
+    for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
+        bias.write(queries[scene, rows], tokens[scene], b)
+        for head in range(q.shape[1]):
+            of_queries, of_tokens = (scene, head, rows), (scene, head)
+            torch.sub(b, lse[of_queries][:, None], out=p)
+            p.addmm_(q[of_queries], k[of_tokens].mT).exp_()
+            dv[of_tokens].addmm_(p.mT, gradient[of_queries])
+            torch.mm(gradient[of_queries], v[of_tokens].mT, out=ds)
+            ds.sub_(rowsum[of_queries][:, None]).mul_(p)
+            dq[of_queries] = ds @ k[of_tokens]
+            dk[of_tokens].addmm_(ds.mT, q[of_queries])
+            total.copy_(ds) if head == 0 else total.add_(ds)
+        of_bias.add(scene, rows, total)
+    return dq.mul_(scale), dk, dv, of_bias.queries, of_bias.tokens

@@ -1,0 +1,95 @@
+"""LocusGS and ellipsoid against TokenGS, in turn, in one run: forward, and forward and backward.
+
+    python tools/bench_models.py [--size first|small] [--rounds 9] [--threads 2]
+
+Two sizes: "first" has width 384, 6 heads, 3 + 12 layers, 1,024 queries and 4 photos of 256 x 256;
+"small" has width 256, 8 heads, 3 + 6 layers, 512 queries and 4 photos of 128 x 128. Gradients go to
+all parameters from the Gaussians of the supervised layers, without renderer or losses: of the last
+layer, or with --layers 2 of the half and the last, as the recipes of LocusGS have it.
+Prints medians, and medians of the ratios to TokenGS round by round.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from qgs.composer import resolve
+from qgs.engine.bench.work import posed_photos
+from qgs.model import QueryGaussianModel
+from qgs.types import Views
+
+SIZES = {
+    "first": ({"width": 384, "heads": 6, "queries": 1024, "depth": 12}, (256, 256)),
+    "small": ({"width": 256, "heads": 8, "queries": 512, "depth": 6}, (128, 128)),
+}
+MODELS = ("tokengs", "locus", "ellipsoid")
+
+
+def build(name: str, size: str, layers: int) -> QueryGaussianModel:
+    """The model of a published recipe, made smaller."""
+    options, _ = SIZES[size]
+    depth = options["depth"]
+    supervised = [depth // 2, depth] if layers == 2 else [depth]
+    changes = [
+        f"model.width={options['width']}",
+        f"model.heads={options['heads']}",
+        f"model.queries.count={options['queries']}",
+        f"model.decoder.depth={depth}",
+        f"model.supervision.layers={supervised}",
+    ]
+    return resolve(f"{name}/dl3dv_4096_4views.yaml", changes).build_model()
+
+
+def backward(model: QueryGaussianModel, photos: Views) -> None:
+    """Forward, and gradients of all parameters."""
+    model.zero_grad(set_to_none=True)
+    total = torch.zeros(())
+    for layer in model(photos).layers.values():
+        gaussians = layer.gaussians
+        parts: list[Tensor] = [gaussians.means, gaussians.scales, gaussians.quats]
+        total = total + sum(x.square().mean() for x in [*parts, gaussians.opacities])
+    total.backward()
+
+
+def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
+    """Time every run in turn, once a round, and print what came out."""
+    for run in runs.values():
+        run()
+    rows = []
+    for _ in range(rounds):
+        rows.append({})
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            rows[-1][name] = time.perf_counter() - start
+    for name in runs:
+        median = statistics.median(row[name] for row in rows)
+        ratio = statistics.median(row[name] / row[MODELS[0]] for row in rows)
+        print(f"  {name:10} {1e3 * median:8.1f} ms   {ratio:.3f}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="LocusGS and ellipsoid against TokenGS.")
+    parser.add_argument("--size", choices=[*SIZES], action="append")
+    parser.add_argument("--layers", type=int, choices=[1, 2], default=1, help="supervised")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    for size in options.size or SIZES:
+        photos = posed_photos(1, 4, SIZES[size][1], 0)
+        models = {name: build(name, size, options.layers) for name in MODELS}
+        print(f"{size}, {options.threads} threads; forward", flush=True)
+        with torch.inference_mode():
+            compare({n: partial(m, photos) for n, m in models.items()}, options.rounds)
+        print(f"forward and backward, supervised layers: {options.layers}", flush=True)
+        compare({n: partial(backward, m, photos) for n, m in models.items()}, options.rounds)
+
+
+if __name__ == "__main__":
+    main()
