@@ -96,33 +96,35 @@ def without_idle_sublayers(parts: Parts, depth: int, problems: Problems) -> Part
     places = [(*decoder, "layers", str(index)) for index in range(depth)]
     classes: list[Any] = [part.component for place in places if (part := parts[(*place, "layer")])]
     read = {(*decoder, name) for component in classes for name in component.sublayers}
-    for place in places:
-        layer = parts[(*place, "layer")]
+    for place, layer in [(place, parts[(*place, "layer")]) for place in places]:
         if layer is None:
             continue
-        has: Any = layer.component
-        for name in SUBLAYER_SLOTS:
-            if name not in has.sublayers:
-                idle = kept.pop((*place, name))
-                if (
-                    idle
-                    and idle.place.node is not None
-                    and idle.place.source not in read
-                    and idle.path not in told
-                ):
-                    told.add(idle.path)
-                    reason = f"`{layer.type}` ({layer.chosen_at}) has no slot `{name}`"
-                    fix = f"remove it; `{name}: null` drops one that is inherited"
-                    problems.add(idle.place.origin, idle.path, reason, fix)
+        for name in _absent_sublayers(layer):
+            idle = kept.pop((*place, name))
+            if idle and idle.place.source not in read and idle.path not in told:
+                told.add(idle.path)
+                reason = f"`{layer.type}` ({layer.chosen_at}) has no slot `{name}`"
+                _report_idle(idle, name, reason, problems)
     for name in LAYER_SLOTS:
-        template = parts[(*decoder, name)]
         if not any((*place, name) in kept for place in places):
-            del kept[(*decoder, name)]
-            if not depth and template and template.place.node is not None:
+            template = kept.pop((*decoder, name))
+            if template and not depth:
                 reason = "a decoder of depth 0 has no layers, so nothing reads it"
-                fix = f"remove it; `{name}: null` drops one that is inherited"
-                problems.add(template.place.origin, template.path, reason, fix)
+                _report_idle(template, name, reason, problems)
     return kept
+
+
+def _absent_sublayers(layer: Chosen) -> list[str]:
+    """Slots of other decoder layers that this one has not."""
+    component: Any = layer.component
+    return [name for name in SUBLAYER_SLOTS if name not in component.sublayers]
+
+
+def _report_idle(idle: Chosen, name: str, reason: str, problems: Problems) -> None:
+    """Report what a recipe writes into the slot `name`, where nothing reads it."""
+    if idle.place.node is not None:
+        fix = f"remove it; `{name}: null` drops one that is inherited"
+        problems.add(idle.place.origin, idle.path, reason, fix)
 
 
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
