@@ -208,18 +208,30 @@ def _strided(*tensors: Tensor) -> tuple[Any, ...]:
 
 def _launch(kernel: Any, saved: Sequence[Tensor], *others: Any, **functions: Any) -> None:
     """Run a kernel with a program for each head and block of its queries (of its tokens)."""
-    (q, k, v, queries, tokens), width = saved, saved[0].shape[-1]
-    heads, count, columns = q.shape[1], q.shape[2], k.shape[2]
-    sizes = _blocks(q)
+    q, k, v, queries, tokens = saved
+    (scenes, heads, count, width), columns = q.shape, k.shape[2]
+    sizes = _blocks(kernel, q, queries.shape[2])
     over = (columns, "BLOCK_M") if kernel is _backward_tokens else (count, "BLOCK_N")
-    grid = -(-over[0] // sizes[over[1]]), len(q) * heads
+    grid = -(-over[0] // sizes[over[1]]), scenes * heads
     arguments = *_strided(q, k, v), queries, tokens, *others, heads, count, columns, width
-    numbers = {"F": queries.shape[2], "G": tokens.shape[1], **sizes, **functions}
     with torch.cuda.device_of(q):
+        numbers = {"F": queries.shape[2], "G": tokens.shape[1], **sizes, **functions}
         kernel[grid](*arguments, width**-0.5, **numbers)
 
 
-def _blocks(q: Tensor) -> dict[str, int]:
-    """Queries and tokens of a block, and the threads for it."""
+def _blocks(kernel: Any, q: Tensor, numbers: int) -> dict[str, int]:
+    """Queries and tokens of a block, and its threads: what nearly fits into 255 registers each.
+
+    Products in float32 run outside the matrix units, where loading ahead takes registers.
+    """
     width = max(triton.next_power_of_2(q.shape[-1]), 16)  # the least that `tl.dot` takes
-    return {"BLOCK_N": 64, "BLOCK_M": 64, "WIDTH": width, "num_warps": 4, "num_stages": 2}
+    exact, wide = q.dtype == torch.float32, width > 128
+    rows = 16 if exact and wide else 32 if exact or width > 64 else 64
+    sizes = {"BLOCK_N": rows, "BLOCK_M": min(rows, 32), "WIDTH": width}
+    if kernel is _backward_queries and numbers > 8:
+        sizes["BLOCK_N"] = 16  # sums of all numbers of each query stay in registers
+    return {
+        **sizes,
+        "num_warps": 8 if exact or wide else 4,
+        "num_stages": 1 if exact or wide else 2,
+    }
