@@ -59,10 +59,7 @@ class AttentionBias(ABC):
         return None
 
     def triton_functions(self) -> tuple[Any, Any] | None:
-        """`value` and `gradients` for `qgs.components.attention_triton`; None for none.
-
-        Asked for where triton is installed; it is imported by nothing else.
-        """
+        """`value` and `gradients` for `qgs.components.attention_triton`; None for none."""
         return None
 
     @full_precision
@@ -145,12 +142,9 @@ def biased_attention(
     bias: AttentionBias,
     kernel: AttentionKernel = "auto",
 ) -> Tensor:
-    """softmax(q k / sqrt(d) + b) v, (B, h, N, d), in memory linear in N and in M.
-
-    kernel: ValueError for one that cannot compute this.
-    """
+    """softmax(q k / sqrt(d) + b) v, (B, h, N, d). ValueError where `kernel` cannot compute it."""
     qkv, of_bias = (q_BhNd, k_BhMd, v_BhMd), (bias.queries, bias.tokens)
-    chosen = _outside_graphs(chosen_kernel)(*qkv, bias, kernel)
+    chosen = _outside_graphs(chosen_kernel)(q_BhNd, bias, kernel)
     if chosen == "plain":
         mask_B1NM = bias.dense()[:, None].to(q_BhNd.dtype)
         return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)

@@ -2,8 +2,9 @@
 
 They run on a GPU, or on a CPU under Triton's interpreter, for which TRITON_INTERPRET=1 must be set
 before triton is imported: without a GPU, the first test runs this file again in a process with it.
-The interpreter computes bfloat16 wrongly (it rounds towards zero and multiplies as integers), so
-that type is compiled here, and its results are for a GPU to test.
+The interpreter computes bfloat16 wrongly, so that half precision is compiled here, and its results
+are for a GPU to test. (triton 3.9.0's interpreter was tried; that of 3.5 cannot run loops beside
+NumPy 2.4, though these kernels compile with it.)
 """
 
 import os

@@ -64,7 +64,8 @@ def gradients(queries, tokens, step, gradient, sums):
 @jit
 def _parts(queries, tokens, step):
     """a = cof(W) e and b = W u, with e = m - mu x d and u = d / |d|; and e and u."""
-    (x, y, z), (m0, m1, m2) = _three(queries, 1), _three(tokens, step)
+    x, y, z = _three(queries, 1)
+    m0, m1, m2 = _three(tokens, step)
     d0, d1, d2 = _three(tokens + 3 * step, step)
     e = m0 - y * d2 + z * d1, m1 - z * d0 + x * d2, m2 - x * d1 + y * d0
     u = _three(tokens + 6 * step, step)
