@@ -11,15 +11,18 @@ Axes: F numbers of a query, G numbers of a token, n queries of a block.
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from qgs.components.attention_choice import AttentionKernel, chosen_kernel
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.threads import can_compile, in_threads
 
+T = TypeVar("T")
 Kernel: TypeAlias = Callable[..., None]
 Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
 """A scene, some of its queries, and buffers (n, M) for them."""
@@ -53,6 +56,10 @@ class AttentionBias(ABC):
         with (queries, tokens, gradient, out) and writes the gradient (n, F) of the queries, given
         that of the bias. They may share rows among threads.
         """
+        return None
+
+    def triton_functions(self) -> tuple[Any, Any] | None:
+        """`value` and `gradients` for `qgs.components.attention_triton`; None for none."""
         return None
 
     @full_precision
@@ -128,13 +135,28 @@ def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     return memory[:size]
 
 
-def biased_attention(q_BhNd: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: AttentionBias) -> Tensor:
-    """softmax(q k / sqrt(d) + b) v, (B, h, N, d), in memory linear in N and in M."""
-    of_bias = bias.queries, bias.tokens, bias
-    return _outside_graphs(_BiasedAttention.apply)(q_BhNd, k_BhMd, v_BhMd, *of_bias)
+def biased_attention(
+    q_BhNd: Tensor,
+    k_BhMd: Tensor,
+    v_BhMd: Tensor,
+    bias: AttentionBias,
+    kernel: AttentionKernel = "auto",
+) -> Tensor:
+    """softmax(q k / sqrt(d) + b) v, (B, h, N, d). ValueError where `kernel` cannot compute it."""
+    qkv, of_bias = (q_BhNd, k_BhMd, v_BhMd), (bias.queries, bias.tokens)
+    chosen = _outside_graphs(chosen_kernel)(q_BhNd, bias, kernel)
+    if chosen == "plain":
+        mask_B1NM = bias.dense()[:, None].to(q_BhNd.dtype)
+        return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
+    if chosen == "triton":
+        from qgs.components.attention_triton import TritonAttention  # needs triton
+
+        functions = bias.triton_functions()
+        return _outside_graphs(TritonAttention.apply)(*qkv, *of_bias, functions)
+    return _outside_graphs(_BiasedAttention.apply)(*qkv, *of_bias, bias)
 
 
-def _outside_graphs(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:
     """`function`, left out of compiled graphs, where its loop would be unrolled for every size.
 
     Outside them `torch.compiler.disable` would import the compiler (0.8 s).

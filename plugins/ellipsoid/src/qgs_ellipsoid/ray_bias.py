@@ -7,7 +7,7 @@ centre cof(W) (m - mu x d), as W a x W b = cof(W) (a x b). The minimum is
 |cof(W) (m - mu x d)|^2 / |W d|^2.
 """
 
-from typing import Self
+from typing import Any, Self
 
 import torch
 from qgs_locus.ray_bias import clamped
@@ -78,6 +78,12 @@ class EllipsoidBias(AttentionBias):
         from qgs_ellipsoid import ray_bias_kernels as kernels  # needs numba
 
         return kernels.write, kernels.gradients
+
+    def triton_functions(self) -> tuple[Any, Any]:
+        """Of `ray_bias_triton`."""
+        from qgs_ellipsoid import ray_bias_triton as functions  # needs triton
+
+        return functions.value, functions.gradients
 
 
 def _times(matrix_n33: Tensor, vectors: Tensor) -> Tensor:

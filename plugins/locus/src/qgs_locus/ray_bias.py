@@ -5,7 +5,7 @@ computed as written, in float32: as a product of features of mu and of the ray i
 difference of numbers that grow with |mu|^2, off by several logits far from the cameras.
 """
 
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -60,6 +60,12 @@ class RayBias(AttentionBias):
         from qgs_locus import ray_bias_kernels as kernels  # needs numba
 
         return kernels.write, kernels.gradients
+
+    def triton_functions(self) -> tuple[Any, Any]:
+        """Of `ray_bias_triton`."""
+        from qgs_locus import ray_bias_triton as functions  # needs triton
+
+        return functions.value, functions.gradients
 
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:

@@ -1,0 +1,42 @@
+"""`RayBias` in Triton, for the kernels of `qgs.components.attention_triton`.
+
+Queries are rows (x, y, z, gamma / (2 sigma^2), gamma * bias_min); tokens have six numbers, m and d.
+"""
+
+from qgs.components.attention_triton import jit, tl
+
+
+@jit
+def value(queries, tokens, step):
+    """max(-factor |mu x d - m|^2, lower)."""
+    e0, e1, e2 = _moment(queries, tokens, step)
+    bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
+    lower = tl.load(queries + 4)
+    return tl.where(bias > lower, bias, lower)
+
+
+@jit
+def gradients(queries, tokens, step, gradient, sums):
+    """With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e."""
+    e0, e1, e2 = _moment(queries, tokens, step)
+    d0, d1, d2 = tl.load(tokens + 3 * step), tl.load(tokens + 4 * step), tl.load(tokens + 5 * step)
+    factor, lower = tl.load(queries + 3), tl.load(queries + 4)
+    distance_sq = e0 * e0 + e1 * e1 + e2 * e2
+    inside = tl.where(-factor * distance_sq > lower, gradient, 0.0)
+    to_center = -2 * factor * inside
+    return (
+        sums[0] + tl.sum(to_center * (d1 * e2 - d2 * e1), 1),
+        sums[1] + tl.sum(to_center * (d2 * e0 - d0 * e2), 1),
+        sums[2] + tl.sum(to_center * (d0 * e1 - d1 * e0), 1),
+        sums[3] - tl.sum(inside * distance_sq, 1),
+        sums[4] + tl.sum(gradient - inside, 1),
+    )
+
+
+@jit
+def _moment(queries, tokens, step):
+    """mu x d - m, (n, m) each."""
+    x, y, z = tl.load(queries), tl.load(queries + 1), tl.load(queries + 2)
+    m0, m1, m2 = tl.load(tokens), tl.load(tokens + step), tl.load(tokens + 2 * step)
+    d0, d1, d2 = tl.load(tokens + 3 * step), tl.load(tokens + 4 * step), tl.load(tokens + 5 * step)
+    return y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2

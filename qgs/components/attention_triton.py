@@ -1,0 +1,210 @@
+"""Attention with a bias that is a function, in Triton: what is of a pair stays in registers.
+
+As FlashAttention-2 (arXiv 2307.08691): a kernel goes through the tokens of a block of queries for
+the result, one for the gradients of the queries, and one through the queries of a block of tokens
+for those of keys and values. The bias and all sums are in float32, and each number is summed by one
+program in one order: the same bits each time.
+
+A bias brings two `jit` functions (`AttentionBias.triton_functions`), for a block of n queries and m
+tokens, of which it gets pointers (n, 1) and (1, m). The F numbers of a query are at `queries + f`,
+the G numbers of a token at `tokens + g * step`:
+
+- `value(queries, tokens, step)`: the bias (n, m);
+- `gradients(queries, tokens, step, gradient, sums)`: the F tensors (n,) of the tuple `sums`, with
+  the gradients of the queries' numbers added, given that of the bias (n, m).
+
+Axes: as `qgs.components.attention_bias`; W: the least power of two from d on.
+"""
+
+from typing import Any
+
+import torch
+import triton  # pyright: ignore[reportMissingImports]
+import triton.language as tl  # pyright: ignore[reportMissingImports]
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+jit: Any = triton.jit
+
+
+@jit
+def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
+    """Rows of a head of x (B, h, count, width), a tensor and its strides: (rows, W), 0 outside."""
+    at, inside = _at(x, scene, head, rows, count, width, WIDTH)
+    return tl.load(at, mask=inside, other=0.0)
+
+
+@jit
+def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
+    """Write what `_load` would read."""
+    at, inside = _at(x, scene, head, rows, count, width, WIDTH)
+    tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
+
+
+@jit
+def _at(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
+    tensor, strides = x
+    columns = tl.arange(0, WIDTH)[None, :]
+    at = scene * strides[0] + head * strides[1] + columns * strides[3]
+    at += rows.to(tl.int64)[:, None] * strides[2]
+    return tensor + at, (rows[:, None] < count) & (columns < width)
+
+
+@jit
+def _logits(q, k, queries, tokens, m, M, scale, VALUE: tl.constexpr):
+    """q k / sqrt(d) + b, (n, m); -inf outside."""
+    products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
+    return tl.where((m < M)[None, :], products + VALUE(queries, tokens, M), float("-inf"))
+
+
+@jit
+def _forward(
+    q, k, v, read_q, read_k, out, lse, heads, N, M, width, scale, VALUE: tl.constexpr,
+    F: tl.constexpr, G: tl.constexpr, BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr,
+    WIDTH: tl.constexpr,
+):  # fmt: skip
+    """The result, and the log-sum-exp of each query (B, h, N)."""
+    each = tl.program_id(1).to(tl.int64)
+    scene, head = each // heads, each % heads
+    n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
+    of_q = _load(q, scene, head, n, N, width, WIDTH)
+    queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
+    greatest = tl.full((BLOCK_N,), float("-inf"), tl.float32)
+    total = tl.zeros((BLOCK_N,), tl.float32)
+    sums = tl.zeros((BLOCK_N, WIDTH), tl.float32)
+    for first in range(0, M, BLOCK_M):
+        m = first + tl.arange(0, BLOCK_M)
+        of_k = _load(k, scene, head, m, M, width, WIDTH)
+        of_v = _load(v, scene, head, m, M, width, WIDTH)
+        tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
+        logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        above = tl.maximum(greatest, tl.max(logits, 1))
+        p = tl.exp(logits - above[:, None])
+        shrunk = tl.exp(greatest - above)
+        total = total * shrunk + tl.sum(p, 1)
+        sums = sums * shrunk[:, None] + tl.dot(p.to(of_v.dtype), of_v, input_precision="ieee")
+        greatest = above
+    _store(out, scene, head, n, N, width, sums / total[:, None], WIDTH)
+    tl.store(lse + each * N + n, greatest + tl.log(total), mask=n < N)
+
+
+@jit
+def _backward_queries(
+    q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
+    VALUE: tl.constexpr, GRADIENTS: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
+    BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
+):  # fmt: skip
+    """Gradients of q, and of what the bias reads of queries, of each head: (B, h, N, F)."""
+    each = tl.program_id(1).to(tl.int64)
+    scene, head = each // heads, each % heads
+    n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
+    of_q = _load(q, scene, head, n, N, width, WIDTH)
+    of_g = _load(g, scene, head, n, N, width, WIDTH)
+    of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
+    of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
+    queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
+    sums = tl.zeros((BLOCK_N, WIDTH), tl.float32)
+    bias_sums = (tl.zeros((BLOCK_N,), tl.float32),) * F
+    for first in range(0, M, BLOCK_M):
+        m = first + tl.arange(0, BLOCK_M)
+        of_k = _load(k, scene, head, m, M, width, WIDTH)
+        of_v = _load(v, scene, head, m, M, width, WIDTH)
+        tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
+        logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        of_p = tl.dot(of_g, tl.trans(of_v), input_precision="ieee")
+        ds = tl.exp(logits - of_lse[:, None]) * (of_p - of_rowsum[:, None])
+        sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
+        bias_sums = GRADIENTS(queries, tokens, M, ds, bias_sums)
+    _store(dq, scene, head, n, N, width, sums * scale, WIDTH)
+    for f in tl.static_range(F):
+        tl.store(of_bias + (each * N + n) * F + f, bias_sums[f], mask=n < N)
+
+
+@jit
+def _backward_tokens(
+    q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
+    VALUE: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
+    BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
+):  # fmt: skip
+    """Gradients of k and v. A query outside has the log-sum-exp inf, so its weights are 0."""
+    each = tl.program_id(1).to(tl.int64)
+    scene, head = each // heads, each % heads
+    m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
+    of_k = _load(k, scene, head, m, M, width, WIDTH)
+    of_v = _load(v, scene, head, m, M, width, WIDTH)
+    tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
+    k_sums = tl.zeros((BLOCK_M, WIDTH), tl.float32)
+    v_sums = tl.zeros((BLOCK_M, WIDTH), tl.float32)
+    for first in range(0, N, BLOCK_N):
+        n = first + tl.arange(0, BLOCK_N)
+        of_q = _load(q, scene, head, n, N, width, WIDTH)
+        of_g = _load(g, scene, head, n, N, width, WIDTH)
+        of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
+        of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
+        queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
+        logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        p = tl.exp(logits - of_lse[:, None])
+        v_sums += tl.dot(tl.trans(p.to(of_g.dtype)), of_g, input_precision="ieee")
+        ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum[:, None])
+        k_sums += tl.dot(tl.trans(ds.to(of_q.dtype)), of_q, input_precision="ieee")
+    _store(dk, scene, head, m, M, width, k_sums * scale, WIDTH)
+    _store(dv, scene, head, m, M, width, v_sums, WIDTH)
+
+
+class TritonAttention(torch.autograd.Function):
+    """See `biased_attention`. queries (B, N, F) and tokens (B, G, M): what the bias reads, float32;
+    tokens get no gradient. functions: the bias's `triton_functions`.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, functions: Any
+    ) -> Tensor:
+        out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=torch.float32)
+        saved = q, k, v, queries.contiguous(), tokens.contiguous()
+        _launch(_forward, *saved, out, lse, VALUE=functions[0])
+        ctx.save_for_backward(*saved, out, lse)
+        ctx.functions = functions
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *saved, out, lse = ctx.saved_tensors
+        (q, k, v, queries, _), (value, of_bias) = saved, ctx.functions
+        dq, dk, dv = torch.empty_like(q), torch.empty_like(k), torch.empty_like(v)
+        by_head = queries.new_empty(q.shape[0] * q.shape[1], *queries.shape[1:])
+        given = *saved, gradients[0], lse, (gradients[0].float() * out.float()).sum(-1)
+        _launch(_backward_queries, *given, dq, by_head, VALUE=value, GRADIENTS=of_bias)
+        _launch(_backward_tokens, *given, dk, dv, VALUE=value)
+        return dq, dk, dv, by_head.unflatten(0, q.shape[:2]).sum(1), None, None
+
+
+def _launch(kernel: Any, *tensors: Tensor, **functions: Any) -> None:
+    """Run a kernel for each head and block; tensors (B, h, ., d) go with their strides."""
+    q, k, _, queries, tokens = tensors[:5]
+    (scenes, heads, N, width), M = q.shape, k.shape[2]
+    sizes = {"F": queries.shape[2], "G": tokens.shape[1], **_blocks(kernel, q, queries.shape[2])}
+    over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
+    grid = -(-over[0] // sizes[over[1]]), scenes * heads
+    arguments = [(x, x.stride()) if x.ndim == 4 else x for x in tensors]
+    with torch.cuda.device_of(q):
+        kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes, **functions)
+
+
+def _blocks(kernel: Any, q: Tensor, numbers: int) -> dict[str, int]:
+    """Queries and tokens of a block, and its threads: what nearly fits into 255 registers each.
+
+    Products in float32 run outside the matrix units, where loading ahead takes registers.
+    """
+    width = max(triton.next_power_of_2(q.shape[-1]), 16)  # the least that `tl.dot` takes
+    exact, wide = q.dtype == torch.float32, width > 128
+    rows = 16 if exact and wide else 32 if exact or width > 64 else 64
+    sizes = {"BLOCK_N": rows, "BLOCK_M": min(rows, 32), "WIDTH": width}
+    if kernel is _backward_queries and numbers > 8:
+        sizes["BLOCK_N"] = 16  # sums of all numbers of each query stay in registers
+    return {
+        **sizes,
+        "num_warps": 8 if exact or wide else 4,
+        "num_stages": 1 if exact or wide else 2,
+    }
