@@ -9,7 +9,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -21,12 +21,10 @@ from upath import UPath
 from qgs.memory import in_words
 
 PAUSES = (1.0, 4.0, 15.0, 60.0)
-"""Seconds before a remote store that failed is asked again: a run of days outlasts a minute's
-fault."""
+"""Seconds before a remote store that failed is asked again."""
 
 PATIENCE = 300.0
-"""Seconds after which a remote store that has not answered has failed. It may list a million files
-in that time, and send PART bytes at 0.1 MB/s."""
+"""Seconds in which a remote store must answer: it may list a million files, or send a PART."""
 
 PART = 32_000_000
 """Bytes that a remote store is asked for at a time."""
@@ -118,12 +116,9 @@ def _in_time(action: Callable[[], Answer]) -> Answer:
             answer.set_exception(error)
 
     Thread(target=ask, name="qgs-store", daemon=True).start()
-    try:
-        return answer.result(PATIENCE)
-    except TimeoutError:
-        if answer.done():  # the store's own
-            raise
-        raise TimeoutError(f"no answer in {PATIENCE:g} s") from None
+    if not wait([answer], PATIENCE).done:
+        raise TimeoutError(f"no answer in {PATIENCE:g} s")
+    return answer.result()
 
 
 def listing(folder: UPath) -> list[UPath]:
@@ -154,9 +149,9 @@ def _fetched(path: UPath, most: int) -> bytes:
     content: bytes = asked_again(path, lambda: store.cat_file(path.path, 0, min(PART, most)))
     size: int | None = asked_again(path, lambda: store.info(path.path).get("size"))
     if size is None:  # some servers do not tell; one that stops early is then not noticed
-        if len(content) < min(PART, most):
-            return content
-        return content + asked_again(path, lambda: store.cat_file(path.path, PART, most))
+        if len(content) == PART:
+            content += asked_again(path, lambda: store.cat_file(path.path, PART, most))
+        return content
     while (first := len(content)) < (end := min(size, most)):
         content += asked_again(path, lambda a=first, b=end: _some(store, path, a, min(a + PART, b)))
     return content
@@ -164,8 +159,8 @@ def _fetched(path: UPath, most: int) -> bytes:
 
 def _some(store: Any, path: UPath, first: int, end: int) -> bytes:
     part: bytes = store.cat_file(path.path, first, end)
-    if not part:
-        raise OSError(f"nothing came from byte {first:,} on, of {end:,}")
+    if not 0 < len(part) <= end - first:
+        raise OSError(f"{len(part):,} bytes came of those from {first:,} to {end:,}")
     return part
 
 

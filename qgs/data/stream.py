@@ -270,8 +270,7 @@ def _prepare_worker(number: int) -> None:
     """Leave stopping to the training process, though signals go to all processes of a job."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    # Opening the data has been reported before; that a store is asked again has not.
-    logging.getLogger("qgs.data.scenes").setLevel(logging.ERROR)
+    logging.getLogger("qgs.data.scenes").setLevel(logging.ERROR)  # reported when data was opened
     # Python's own end aborts where the thread that sends batches is inside torch at that moment.
     atexit.register(os._exit, 0)
 

@@ -222,9 +222,9 @@ def test_answers_that_stop_early_are_completed(answers, pauses, caplog):
         most[:] = cuts
         assert read_file(file) == CONTENT
     assert pauses == [1.0, 4.0]
-    assert "nothing came from byte 700 on, of 1,024" in caplog.text
+    assert "0 bytes came of those from 700 to 1,024" in caplog.text
     most[:] = [700] + [0] * 9
-    with pytest.raises(StoreError, match="failed 5 times in a row, at last with: nothing came"):
+    with pytest.raises(StoreError, match="failed 5 times in a row, at last with: 0 bytes"):
         read_file(file)
 
 

@@ -42,9 +42,6 @@ from qgs.data.scenes import (
 from qgs.types import Cameras
 from qgs.wording import listed
 
-AT_ONCE = 8
-"""Photos that a process asks a remote store for at a time."""
-
 
 class PhotosConfig(SceneSource.Config):
     """Options of `qgs/photos`."""
@@ -147,14 +144,10 @@ class PhotoScene(EncodedScene):
     def _stacked(
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
-        """(F, H, W, ...) of what `read` makes of the frames, or made before.
-
-        Remote photos are asked for at once: each takes longer to come than to decode.
-        """
+        """(F, H, W, ...) of what `read` makes of the frames, or made before."""
         remote = not isinstance(self._frames[frames[0]].path, Path | ArchivePath)
-        with ThreadPoolExecutor(AT_ONCE if remote else 1) as pool:
-            made = (pool.map if remote else map)(partial(self._made, read), frames)
-            return np.stack(list(made))
+        with ThreadPoolExecutor(8 if remote else 1) as pool:  # photos that a store sends at a time
+            return np.stack(list(pool.map(partial(self._made, read), frames)))
 
     def _made(self, read: Callable[[PhotoFrame], np.ndarray], frame: int) -> np.ndarray:
         key = self.name, read.__name__, frame
