@@ -79,7 +79,7 @@ def chunks_at(path: str | None) -> Iterator[str]:
     if path is not None:
         yield path
         return
-    photos = [_photo(seed) for seed in range(32)]
+    photos = [synthetic_photo(seed) for seed in range(32)]
     index: dict[str, str] = {}
     with TemporaryDirectory() as name:
         folder = UPath(name) / "train"
@@ -96,7 +96,7 @@ def chunks_at(path: str | None) -> Iterator[str]:
         yield name
 
 
-def _photo(seed: int) -> bytes:
+def synthetic_photo(seed: int) -> bytes:
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(0, 256, (18, 32, 3), dtype=np.uint8))
     smooth = np.asarray(coarse.resize((PHOTO[1], PHOTO[0]), Image.Resampling.BICUBIC), np.float32)

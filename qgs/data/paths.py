@@ -9,17 +9,25 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from threading import Thread
 from typing import IO, Any, Literal, TypeVar
 
 from upath import UPath
 
 from qgs.memory import in_words
 
-PAUSES = (1.0, 4.0)
+PAUSES = (1.0, 4.0, 15.0, 60.0)
 """Seconds before a remote store that failed is asked again."""
+
+PATIENCE = 300.0
+"""Seconds in which a remote store must answer: it may list a million files, or send a PART."""
+
+PART = 32_000_000
+"""Bytes that a remote store is asked for at a time."""
 
 LARGEST = 500_000_000
 """Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels; a
@@ -75,14 +83,14 @@ class StoreError(OSError):
 def asked_again(path: Path | UPath, action: Callable[[], Answer]) -> Answer:
     """What `action` gives, which reads `path`; of a remote store, asked again after PAUSES.
 
-    Raises as `action`, what is absent, forbidden or damaged at once; StoreError after the last
-    pause.
+    An `action` that takes longer than PATIENCE has failed. Raises as `action`, what is absent,
+    forbidden or damaged at once; StoreError after the last pause.
     """
     if is_local(path) or isinstance(path, ArchivePath):
         return action()
     for pause in (*PAUSES, None):
         try:
-            return action()
+            return _in_time(action)
         except _NO_FAULT_OF_A_STORE:
             raise
         except Exception as error:  # each file system raises its own
@@ -95,6 +103,22 @@ def asked_again(path: Path | UPath, action: Callable[[], Answer]) -> Answer:
             _log.warning("%s: %s; the store is asked again in %g s", path, said, pause)
             time.sleep(pause)
     raise AssertionError
+
+
+def _in_time(action: Callable[[], Answer]) -> Answer:
+    """What `action` gives, in a thread that is left alone after PATIENCE. Raises TimeoutError."""
+    answer: Future[Answer] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(action())
+        except BaseException as error:  # raised by `result`
+            answer.set_exception(error)
+
+    Thread(target=ask, name="qgs-store", daemon=True).start()
+    if not wait([answer], PATIENCE).done:
+        raise TimeoutError(f"no answer in {PATIENCE:g} s")
+    return answer.result()
 
 
 def listing(folder: UPath) -> list[UPath]:
@@ -113,12 +137,31 @@ def open_file(path: Path | UPath, most: int = LARGEST) -> IO[bytes]:
     if isinstance(path, ArchivePath):
         return io.BytesIO(open_archive(path.archive).read(path.member, most))
     if not isinstance(path, Path):
-        store: Any = path.fs
-        content: bytes = asked_again(path, lambda: store.cat_file(path.path, 0, most + 1))
-        return io.BytesIO(_no_more(content, path, most))
+        return io.BytesIO(_no_more(_fetched(path, most + 1), path, most))
     if path.exists() and not path.is_file():
         raise OSError("it is no regular file, but a folder, a pipe or a device")
     return path.open("rb")
+
+
+def _fetched(path: UPath, most: int) -> bytes:
+    """The first `most` bytes of a remote file. What of it did not come is asked for again."""
+    store: Any = path.fs
+    content: bytes = asked_again(path, lambda: store.cat_file(path.path, 0, min(PART, most)))
+    size: int | None = asked_again(path, lambda: store.info(path.path).get("size"))
+    if size is None:  # some servers do not tell; one that stops early is then not noticed
+        if len(content) == PART:
+            content += asked_again(path, lambda: store.cat_file(path.path, PART, most))
+        return content
+    while (first := len(content)) < (end := min(size, most)):
+        content += asked_again(path, lambda a=first, b=end: _some(store, path, a, min(a + PART, b)))
+    return content
+
+
+def _some(store: Any, path: UPath, first: int, end: int) -> bytes:
+    part: bytes = store.cat_file(path.path, first, end)
+    if not 0 < len(part) <= end - first:
+        raise OSError(f"{len(part):,} bytes came of those from {first:,} to {end:,}")
+    return part
 
 
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:

@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import Scene, SceneSource, ViewsConfig
 from qgs.data.evaluation import one_line
+from qgs.data.paths import StoreError
 from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
 from qgs.memory import is_out_of_memory
 from qgs.wording import listed
@@ -109,7 +110,7 @@ class SampleStream:
     """Samples by number, each of (seed, number) alone. Raises ValueError without scenes.
 
     skips: a sample that cannot be made gives way to one of the next scene, the first of
-    MAX_REPLACED that can be made.
+    MAX_REPLACED that can be made; not where a remote store failed, which says nothing of a sample.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class SampleStream:
             try:
                 return self._made(number, attempt)
             except Exception as error:
-                if not self._skips or is_out_of_memory(error):
+                if not self._skips or is_out_of_memory(error) or _is_of_store(error):
                     raise
                 left_out.append(one_line(error))
         raise SampleError(
@@ -155,6 +156,8 @@ def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
     """The first of `frames` that fails by itself, and why; else all. No memory is raised."""
     if is_out_of_memory(error):
         raise error
+    if _is_of_store(error):
+        return f"scene {scene.name!r}: {error}"
     for frame in frames:
         try:
             scene.images([frame])
@@ -165,6 +168,11 @@ def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
             return f"scene {scene.name!r}, frame {scene.label(frame)}: {one_line(own)}"
     told = listed(map(scene.label, sorted({*frames})))
     return f"scene {scene.name!r}, frames {told}: {one_line(error)}"
+
+
+def _is_of_store(error: Exception) -> bool:
+    """Whether a store failed: no sample is bad, and another would not be better."""
+    return isinstance(error, StoreError) or isinstance(error.__cause__, StoreError)
 
 
 @dataclass(frozen=True)
@@ -262,7 +270,7 @@ def _prepare_worker(number: int) -> None:
     """Leave stopping to the training process, though signals go to all processes of a job."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    logging.getLogger("qgs").setLevel(logging.ERROR)  # opening the data has been reported before
+    logging.getLogger("qgs.data.scenes").setLevel(logging.ERROR)  # reported when data was opened
     # Python's own end aborts where the thread that sends batches is inside torch at that moment.
     atexit.register(os._exit, 0)
 

@@ -1,4 +1,6 @@
+import logging
 import sys
+import threading
 import zipfile
 import zlib
 from functools import partialmethod
@@ -12,6 +14,7 @@ from upath import UPath
 from qgs.contracts import ViewsConfig
 from qgs.data.chunk_files import load_chunk
 from qgs.data.paths import (
+    PAUSES,
     Archive,
     StoreError,
     is_local,
@@ -21,7 +24,8 @@ from qgs.data.paths import (
     stays_inside,
 )
 from qgs.data.photos.reader import existing
-from qgs.data.stream import SampleError, SampleStream
+from qgs.data.scenes import warn_once
+from qgs.data.stream import SampleError, SampleStream, _prepare_worker
 
 
 def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
@@ -114,6 +118,18 @@ def test_a_store_that_fails_is_asked_again(flaky, tmp_path, pauses, caplog):
     assert len(pauses) == 5
 
 
+def test_remote_photos_are_asked_for_at_once(flaky, tmp_path, monkeypatch):
+    expected, together = scene(tmp_path / "scene").images([0, 2, 1]), threading.Barrier(3)
+    photos, whole = scene(flaky), MemoryFileSystem.cat_file
+
+    def waiting(store, path, *given, **options):
+        together.wait(30)
+        return whole(store, path, *given, **options)
+
+    monkeypatch.setattr(MemoryFileSystem, "cat_file", waiting)
+    assert torch.equal(photos.images([0, 2, 1]), expected)
+
+
 def test_a_store_that_fails_for_good_is_one_error_with_the_url(flaky, pauses):
     photos, source = scene(flaky), opened(flaky, holdout=0)
     Store.left = 99
@@ -123,14 +139,15 @@ def test_a_store_that_fails_for_good_is_one_error_with_the_url(flaky, pauses):
         lambda: read_file(UPath(flaky) / "transforms.json"),
     ):
         with pytest.raises(
-            StoreError, match=r"failed 3 times in a row, at last with: the peer"
+            StoreError, match=r"failed 5 times in a row, at last with: the peer"
         ) as e:
             action()
         assert str(e.value).startswith(flaky)
-    assert pauses == [1.0, 4.0] * 3
+    assert pauses == [*PAUSES] * 3
     views = ViewsConfig(inputs=2, targets=1, gap=(1, 3))
-    with pytest.raises(SampleError, match=f"{flaky}/images/view_.*failed 3 times in a row"):
-        SampleStream(source, views, 0).batch([0])
+    for skips in (False, True):  # a fault of the store is none of the sample
+        with pytest.raises(SampleError, match=f"{flaky}/images/view_.*failed 5 times in a row"):
+            SampleStream(source, views, 0, skips).batch([0])
 
 
 def test_a_listing_that_fails_hides_no_photos(flaky, pauses, monkeypatch):
@@ -148,7 +165,7 @@ def test_a_listing_that_fails_hides_no_photos(flaky, pauses, monkeypatch):
     assert existing(names) == set(names[:1])
     assert pauses == [1.0, 4.0]
     assert existing([UPath(flaky) / "no" / "folder.png"]) == set()
-    Store.left = 3
+    Store.left = 5
     with pytest.raises(StoreError, match="no answer"):
         existing(names)
 
@@ -174,10 +191,88 @@ def test_a_remote_archive_and_a_remote_chunk_are_asked_again(flaky, tmp_path, pa
     assert Archive(archive).read("a.txt") == b"x" * 100
     Store.left = 2
     assert load_chunk(chunk) == []
-    Store.left = 3
+    Store.left = 5
     with pytest.raises(StoreError, match=f"^{flaky}/0.torch"):
         load_chunk(chunk)
-    assert pauses == [1.0, 4.0] * 3
+    assert pauses == [1.0, 4.0] * 2 + [*PAUSES]
+
+
+CONTENT = bytes(range(256)) * 4
+
+
+@pytest.fixture
+def answers(tmp_path, monkeypatch) -> tuple[UPath, list[int]]:
+    """A file in a store, and how many bytes each of its next answers has at most."""
+    file, most = UPath(f"memory://{tmp_path.name}/file"), list[int]()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(CONTENT)
+    whole = MemoryFileSystem.cat_file
+
+    def cut(store, path, start=None, end=None, **options):
+        content = whole(store, path, start, end, **options)
+        return content[: most.pop(0)] if most else content
+
+    monkeypatch.setattr(MemoryFileSystem, "cat_file", cut)
+    return file, most
+
+
+def test_answers_that_stop_early_are_completed(answers, pauses, caplog):
+    file, most = answers
+    for cuts in ([1000], [1, 2, 3], [0, 5], [700, 0, 0, 20]):
+        most[:] = cuts
+        assert read_file(file) == CONTENT
+    assert pauses == [1.0, 4.0]
+    assert "0 bytes came of those from 700 to 1,024" in caplog.text
+    most[:] = [700] + [0] * 9
+    with pytest.raises(StoreError, match="failed 5 times in a row, at last with: 0 bytes"):
+        read_file(file)
+
+
+@pytest.mark.parametrize("part", [100, 512, 1024, 5000])
+def test_large_files_come_in_parts(answers, monkeypatch, part):
+    monkeypatch.setattr("qgs.data.paths.PART", part)
+    assert read_file(answers[0]) == CONTENT
+    with pytest.raises(OSError, match="is larger than 600 bytes"):
+        read_file(answers[0], 600)
+
+
+@pytest.mark.parametrize("part", [100, 1024, 5000])
+def test_a_store_that_does_not_tell_sizes(answers, monkeypatch, part):
+    monkeypatch.setattr("qgs.data.paths.PART", part)
+    monkeypatch.setattr(MemoryFileSystem, "info", lambda *_, **__: {"size": None})
+    assert read_file(answers[0]) == CONTENT
+
+
+def test_a_read_that_never_ends_is_asked_again(answers, monkeypatch, pauses, caplog):
+    whole, ended, asked = MemoryFileSystem.cat_file, threading.Event(), []
+
+    def hanging(store, path, *given, **options):
+        asked.append(path)
+        if len(asked) == 1:
+            ended.wait(60)
+        return whole(store, path, *given, **options)
+
+    monkeypatch.setattr(MemoryFileSystem, "cat_file", hanging)
+    monkeypatch.setattr("qgs.data.paths.PATIENCE", 0.05)
+    assert read_file(answers[0]) == CONTENT
+    assert pauses == [1.0]
+    assert "no answer in 0.05 s; the store is asked again in 1 s" in caplog.text
+    ended.set()
+
+
+def test_workers_tell_that_a_store_is_asked_again(answers, pauses, caplog, monkeypatch):
+    monkeypatch.setattr("qgs.data.stream.atexit.register", lambda *_: None)
+    monkeypatch.setattr("qgs.data.stream.signal.signal", lambda *_: None)
+    logger = logging.getLogger("qgs.data.scenes")
+    level = logger.level
+    try:
+        _prepare_worker(0)
+        warn_once("opened")
+        answers[1][:] = [0, 0]
+        read_file(answers[0])
+    finally:
+        logger.setLevel(level)
+    assert [record.name for record in caplog.records] == ["qgs.data.paths"]
 
 
 def test_a_file_that_is_read_whole_has_a_limit(tmp_path):

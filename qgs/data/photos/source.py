@@ -2,9 +2,11 @@
 
 import io
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
 from operator import attrgetter
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -25,7 +27,7 @@ from qgs.data.images import (
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted
-from qgs.data.paths import opened_path, read_file
+from qgs.data.paths import ArchivePath, opened_path, read_file
 from qgs.data.photos import Format, formats_of, read_listing
 from qgs.data.photos.checks import require_sound, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
@@ -143,8 +145,13 @@ class PhotoScene(EncodedScene):
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
         """(F, H, W, ...) of what `read` makes of the frames, or made before."""
-        keys = ((self.name, read.__name__, i) for i in frames)
-        return np.stack([self._cache.get(k, lambda k=k: read(self._frames[k[2]])) for k in keys])
+        remote = not isinstance(self._frames[frames[0]].path, Path | ArchivePath)
+        with ThreadPoolExecutor(8 if remote else 1) as pool:  # photos that a store sends at a time
+            return np.stack(list(pool.map(partial(self._made, read), frames)))
+
+    def _made(self, read: Callable[[PhotoFrame], np.ndarray], frame: int) -> np.ndarray:
+        key = self.name, read.__name__, frame
+        return self._cache.get(key, lambda: read(self._frames[frame]))
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
         image = open_rgb(frame.path, self._config.background)
