@@ -33,6 +33,7 @@ BLOCK = {"cpu": 2**22, "cuda": 2**25}
 _kept = threading.local()
 
 _UNIT = 2**16  # pairs that are worth a thread
+_PART = 2**21  # pairs whose `value` is computed at a time, as it may take ten times the memory
 
 
 class AttentionBias(ABC):
@@ -66,10 +67,10 @@ class AttentionBias(ABC):
     def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
         """Write `value` into `out_nM`."""
         kernels = self._kernels(queries_nF)
-        if kernels is None:
-            out_nM.copy_(self.value(queries_nF, tokens_GM))
-        else:
-            _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
+        if kernels is not None:
+            return _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
+        for part_nF, out in zip(*_parts(queries_nF, out_nM), strict=True):
+            out.copy_(self.value(part_nF, tokens_GM))
 
     @full_precision
     def gradients(
@@ -85,12 +86,15 @@ class AttentionBias(ABC):
             out_nF = torch.empty_like(queries_nF)
             _in_rows(kernels[1], tokens_GM, queries_nF, gradient_nM, out_nF)
             return out_nF, None
-        with torch.enable_grad():
-            leaves = queries_nF.detach().requires_grad_(), tokens_GM.detach()
-            leaves[1].requires_grad_(wanted)
-            value_nM = self.value(*leaves)
-            found = torch.autograd.grad(value_nM, leaves[: 1 + wanted], gradient_nM.to(value_nM))
-        return found[0], found[1] if wanted else None
+        found: list[tuple[Tensor, ...]] = []
+        for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
+            with torch.enable_grad():
+                leaves = part_nF.detach().requires_grad_(), tokens_GM.detach()
+                leaves[1].requires_grad_(wanted)
+                value_nM = self.value(*leaves)
+            found.append(torch.autograd.grad(value_nM, leaves[: 1 + wanted], part_nM.to(value_nM)))
+        of_queries, *of_tokens = zip(*found, strict=True)
+        return torch.cat(of_queries), torch.stack(of_tokens[0]).sum(0) if wanted else None
 
     def _kernels(self, queries: Tensor) -> tuple[Kernel, Kernel] | None:
         usable = queries.device.type == "cpu" and queries.dtype == torch.float32
@@ -111,6 +115,12 @@ class AttentionBias(ABC):
             for first in range(0, count, rows):
                 of_block = slice(first, min(first + rows, count))
                 yield scene, of_block, memory[:, : of_block.stop - first].unbind()
+
+
+def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...], ...]:
+    """Both in parts of some `_PART` pairs."""
+    rows = max(_PART // max(of_pairs_nM.shape[1], 1), 1)
+    return queries_nF.split(rows), of_pairs_nM.split(rows)
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
