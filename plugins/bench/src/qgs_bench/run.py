@@ -15,8 +15,8 @@ from torch.utils.benchmark import timer
 
 import qgs
 from qgs.composer import Recipe
-from qgs.engine.bench.memory import Peak, peak_memory
-from qgs.engine.bench.work import Operation, Task, Workload, make_task
+from qgs_bench.memory import Peak, peak_memory
+from qgs_bench.work import Operation, Task, Workload, make_task
 
 KIND = "qgs bench"
 

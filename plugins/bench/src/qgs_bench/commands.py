@@ -11,6 +11,8 @@ from rich.markup import escape
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
 from qgs.wording import counted, short_names
 
+app = typer.Typer(help="How fast and how large models are.")
+
 MEBIBYTE = 2**20
 TITLES = {
     "forward": "photos to Gaussians",
@@ -19,6 +21,7 @@ TITLES = {
 }
 
 
+@app.command()
 def bench(
     recipes: Annotated[
         list[Path], typer.Argument(help="Recipe files; the first is what others are compared with.")
@@ -43,19 +46,20 @@ def bench(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Size and latency of models, any number of recipes in turn, as ratios to the first.
+    """Size, latency and memory of models: any number of recipes in turn.
 
-    Models have their initial weights, photos and poses are random: no data is needed. Latency is
-    from photos to Gaussians, batch by batch. With --memory: on a CPU the peak resident set of a
-    process, on a GPU what torch allocated at most.
+    Ratios are to the first. Models have their initial weights, photos and poses
+    are random: no data is needed. Latency is from photos to Gaussians, batch by
+    batch. With --memory: on a CPU the peak resident set of a process, on a GPU
+    what torch allocated at most.
     """
     from qgs.composer import resolve
-    from qgs.engine.bench.run import Subject, refuse_other_file
-    from qgs.engine.bench.run import bench as measure
-    from qgs.engine.bench.work import workload_of
     from qgs.engine.distributed import choose_device
     from qgs.engine.results import as_json
     from qgs.io.files import write_text
+    from qgs_bench.run import Subject, refuse_other_file
+    from qgs_bench.run import bench as measure
+    from qgs_bench.work import workload_of
 
     if json is not None:
         refuse_other_file(json)
