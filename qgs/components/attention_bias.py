@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.geometry.precision import at_least_float32, full_precision
-from qgs.kernels import can_compile, in_threads
+from qgs.threads import can_compile, in_threads
 
 Kernel: TypeAlias = Callable[..., None]
 Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]

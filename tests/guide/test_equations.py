@@ -29,7 +29,7 @@ Decoder layer (TokenGS): queries | cross-attention | self-attention | MLP | resi
     a time | self-attention, dynamic
 Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-attention |
     self-attention | PE | refinement | means | means, ablation
-Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in features |
+Ellipsoidal anchors (in neither paper): anchor | metric | bias | the same, in coordinates of the ball |
     refinement | means | Gaussians in the anchor's frame
 Joint attention (C3G): joint layer | Gaussian of a query | mean of it | image tokens
 GS-LRM: token of a patch | block of GS-LRM | ray of a Gaussian | distance | means of pixels |

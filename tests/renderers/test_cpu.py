@@ -116,7 +116,7 @@ def test_depths_sort_by_value_over_many_magnitudes(make_scene, differentiate):
 
 
 def test_missing_numba_says_what_to_do(monkeypatch):
-    monkeypatch.setattr(qgs.renderers.cpu, "find_spec", lambda name: None)
+    monkeypatch.setattr(qgs.renderers.cpu, "can_compile", lambda: False)
     message = r'pip install "query-gaussians\[cpu\]".*qgs/torch'
     with pytest.raises(RuntimeError, match=message):
         CpuRenderer(RendererConfig())

@@ -1,0 +1,36 @@
+"""Kernels on as many threads as torch uses."""
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+
+
+def can_compile() -> bool:
+    """Whether numba is installed, which `qgs.kernels` needs."""
+    return find_spec("numba") is not None
+
+
+def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:
+    """Call `unit(*item)` for every item of `work`, and wait.
+
+    Every unit of work writes to its own memory, so their order does not matter.
+    """
+    items = list(work)
+    if len(items) == 1:
+        unit(*items[0])
+    else:
+        list(_threads(torch.get_num_threads()).map(lambda item: unit(*item), items))
+
+
+@lru_cache(maxsize=1)
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="qgs-kernel")
+
+
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork
+    os.register_at_fork(after_in_child=_threads.cache_clear)
