@@ -1,24 +1,16 @@
 """`qgs bench`: size, latency and memory of models, as tables and as a JSON report."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
-from qgs.wording import counted, short_names
 
 app = typer.Typer(help="How fast and how large models are.")
-
-MEBIBYTE = 2**20
-TITLES = {
-    "forward": "photos to Gaussians",
-    "render": "rendering the target views",
-    "step": "training step",
-}
 
 
 @app.command()
@@ -31,8 +23,13 @@ def bench(
         int | None, typer.Option(min=1, help="Input views; as the recipe says if not given.")
     ] = None,
     size: Size = None,
-    batch: Annotated[int, typer.Option(min=1, help="Scenes at once.")] = 1,
-    precision: Annotated[str, typer.Option(help="float32 or bf16 (autocast).")] = "float32",
+    batch: Annotated[
+        int | None, typer.Option(min=1, help="Scenes at once; 1, of --predict the recipe's.")
+    ] = None,
+    precision: Annotated[
+        str | None,
+        typer.Option(help="float32 or bf16 (autocast); float32, of --predict the recipe's."),
+    ] = None,
     step: Annotated[bool, typer.Option("--step", help="Training steps too.")] = False,
     memory: Annotated[
         bool, typer.Option("--memory", help="Peak memory too, of a fresh process each.")
@@ -40,6 +37,20 @@ def bench(
     renderer: Annotated[bool, typer.Option("--renderer", help="The renderer too.")] = False,
     rounds: Annotated[int, typer.Option(min=1, help="Samples of each latency.")] = 10,
     warmup: Annotated[int, typer.Option(min=0, help="Calls before the first sample.")] = 2,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AXIS=A..B",
+            help="Time and memory at A, 2 A, ... up to B, of views, queries, size or batch.",
+        ),
+    ] = None,
+    predict: Annotated[
+        bool, typer.Option("--predict", help="Whether a training would fit; nothing is run.")
+    ] = False,
+    within: Annotated[
+        str | None,
+        typer.Option(metavar="SIZE", help="Of --predict: memory, as 24GB; default: what is free."),
+    ] = None,
     json: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a report with every sample.")
     ] = None,
@@ -53,82 +64,118 @@ def bench(
     batch. With --memory: on a CPU the peak resident set of a process, on a GPU
     what torch allocated at most.
     """
-    from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
-    from qgs.engine.results import as_json
-    from qgs.io.files import write_text
-    from qgs_bench.run import Subject, refuse_other_file
-    from qgs_bench.run import bench as measure
-    from qgs_bench.work import workload_of
 
-    if json is not None:
-        refuse_other_file(json)
-    if precision not in ("float32", "bf16"):
+    others = {"--step": step, "--memory": memory, "--renderer": renderer}
+    _refuse_beside("--sweep", sweep, {"--memory": memory, "--renderer": renderer})
+    _refuse_beside("--predict", predict, others | {"--sweep": sweep, "--json": json})
+    if within is not None and not predict:
+        raise ValueError("--within says of which memory --predict speaks; give --predict too")
+    if precision not in (None, "float32", "bf16"):
         raise ValueError(f"--precision must be float32 or bf16, got {precision!r}")
     work = {"views": views, "size": parse_size(size), "batch": batch, "precision": precision}
     use_threads(threads)
     console = Console()
+    sources, changes = [str(path) for path in recipes], overrides or []
+    if predict:
+        work["device"] = "cuda" if device == "cuda" else choose_device(device, console.print)
+        return _predict(sources, changes, work, within, console)
+    work |= {"batch": batch or 1, "precision": precision or "float32"}
     work["device"] = choose_device(device, console.print)
-    resolved = [(str(path), resolve(path, overrides or ())) for path in recipes]
+    options: dict[str, Any] = {"step": step, "rounds": rounds, "warmup": warmup}
+    options |= {"overrides": changes}
+    if sweep:
+        return _sweep(sources, sweep, work, options, json, console)
+    _compare(sources, work, options | {"memory": memory, "renderer": renderer}, json, console)
+
+
+def _refuse_beside(option: str, given: object, others: dict[str, Any]) -> None:
+    found = [name for name, value in others.items() if value]
+    if given and found:
+        raise ValueError(f"{option} stands alone; give {', '.join(found)} in a call of its own")
+
+
+def _compare(
+    sources: list[str],
+    work: dict[str, Any],
+    options: dict[str, Any],
+    json: Path | None,
+    console: Console,
+) -> None:
+    from qgs.composer import resolve
+    from qgs.engine.results import as_json
+    from qgs.io.files import write_text
+    from qgs_bench.output import show
+    from qgs_bench.run import Subject, bench, refuse_other_file
+    from qgs_bench.work import workload_of
+
+    if json is not None:
+        refuse_other_file(json)
+    resolved = [(name, resolve(name, options["overrides"])) for name in sources]
     subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
-    options: dict[str, Any] = {"step": step, "memory": memory, "renderer": renderer}
-    options |= {"rounds": rounds, "warmup": warmup, "overrides": overrides or ()}
     with console.status("composing") as status:
-        report = measure(subjects, say=status.update, **options)
-    _show(report, console)
+        report = bench(subjects, say=status.update, **options)
+    show(report, console)
     if json is not None:
         write_text(json, as_json(report))
         console.print(f"written to {json}")
 
 
-def _show(report: dict[str, Any], console: Console) -> None:
-    """The models, then one table for each thing that was measured of them."""
-    from qgs.engine.results import print_table
+def _sweep(
+    sources: list[str],
+    axes: list[str],
+    work: dict[str, Any],
+    options: dict[str, Any],
+    json: Path | None,
+    console: Console,
+) -> None:
+    from qgs_bench.output import refuse_other_files, show_sweep, write_sweep
+    from qgs_bench.run import refuse_other_file
+    from qgs_bench.sweep import KIND, parse_axis, sweep
 
-    recipes, machine = report["recipes"], report["machine"]
-    base = recipes[0]
-    threads = "" if base["device"] == "cuda" else f", {counted(machine['threads'], 'thread')}"
-    console.print(
-        f"{base['device']} ({machine['processor']}{threads}), {base['precision']}, "
-        f"torch {machine['torch']}; {report['rounds']} rounds after {report['warmup']} of warm-up, "
-        "ratios to the first recipe",
-        markup=False,
-    )
-    names = [escape(name) for name in short_names([recipe["recipe"] for recipe in recipes])]
-
-    def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-        lines = [[name, *row] for name, row in zip(names, rows, strict=True)]
-        print_table(console, title, [["recipe", *headers], *lines])
-
-    headers = ("V x H x W", "Gaussians", "parameters", "ratio", "weights, MiB")
-    rows = [
-        (
-            " x ".join(map(str, (recipe["views"], *recipe["size"]))),
-            f"{recipe['gaussians']:,}" if recipe["gaussians"] else "by the views",
-            f"{recipe['parameters']['count']:,}",
-            f"{recipe['parameters']['ratio']:.3f}",
-            f"{recipe['parameters']['weight_bytes'] / MEBIBYTE:,.2f}",
-        )
-        for recipe in recipes
-    ]
-    table(f"models, batch {base['batch']}", headers, rows)
-    for operation, first in base["seconds"].items():
-        unit, scale = ("s", 1.0) if first["median"] >= 10 else ("ms", 1000.0)
-        headers = (f"median, {unit}", "quartiles", "ratio, round by round", "quartiles")
-        times = [recipe["seconds"][operation] for recipe in recipes]
-        rows = [(*_cells(found, scale), *_cells(found["ratio"], 1.0)) for found in times]
-        table(TITLES[operation], headers, rows)
-    for operation in base["memory"]:
-        peaks = [recipe["memory"][operation] for recipe in recipes]
-        sizes = [[f"{p[k] / MEBIBYTE:,.1f}" for k in ("peak_bytes", "idle_bytes")] for p in peaks]
-        rows = [(*size, f"{p['ratio']:.3f}") for size, p in zip(sizes, peaks, strict=True)]
-        table(f"memory: {TITLES[operation]}", ("peak, MiB", "before the model", "ratio"), rows)
+    parsed = [parse_axis(text) for text in axes]
+    if json is not None:
+        refuse_other_file(json, KIND)
+        refuse_other_files(json)
+    with console.status("composing") as status:
+        report = sweep(sources, parsed, work, say=status.update, **options)
+    show_sweep(report, console)
+    if json is not None:
+        files = write_sweep(report, json)
+        console.print(f"written to {', '.join(map(str, files))}")
 
 
-def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
-    """Median and quartiles, four digits each."""
-    lower, median, upper = (
-        f"{value:,.{max(0, 4 - len(str(int(value))))}f}"
-        for value in (found[k] * scale for k in ("lower_quartile", "median", "upper_quartile"))
-    )
-    return median, f"{lower} .. {upper}"
+def _predict(
+    sources: list[str],
+    overrides: list[str],
+    work: dict[str, Any],
+    within: str | None,
+    console: Console,
+) -> None:
+    from dataclasses import replace
+
+    from qgs.composer import resolve
+    from qgs.engine.results import print_lines
+    from qgs.memory import in_words
+    from qgs_bench.output import show_need
+    from qgs_bench.predict import available, largest_batch, need_of, parse_bytes
+    from qgs_bench.work import workload_of
+
+    limit = available(work["device"]) if within is None else parse_bytes(within)
+    for name in sources:
+        recipe = resolve(name, overrides)
+        config = recipe.training
+        given = work | {
+            "batch": work["batch"] or config.batch_size,
+            "precision": work["precision"] or config.precision,
+        }
+        workload = workload_of(recipe, **given)
+        with console.status(f"counting {name}"):
+            need = need_of(recipe, workload)
+            most = largest_batch(lambda b: need_of(recipe, replace(workload, batch=b)).total, limit)
+        show_need(name, need, workload, console)
+        fits = need.total <= limit
+        print_lines(console, [
+            f"{'fits' if fits else 'does not fit'} into {in_words(limit)} on {workload.device}; "
+            + (f"the largest batch that does is {most}" if most else "not even a batch of 1 does")
+        ])  # fmt: skip
