@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
+
+if TYPE_CHECKING:
+    from qgs.composer import Recipe
+    from qgs_bench.work import Workload
 
 app = typer.Typer(help="How fast and how large models are.")
 
@@ -165,17 +169,16 @@ def _predict(
     for name in sources:
         recipe = resolve(name, overrides)
         config = recipe.training
-        given = work | {
-            "batch": work["batch"] or config.batch_size,
-            "precision": work["precision"] or config.precision,
-        }
+        batch, precision = work["batch"] or config.batch_size, work["precision"] or config.precision
+        given = {**work, "batch": batch, "precision": precision}
         workload = workload_of(recipe, **given)
+
+        def total(batch: int, recipe: Recipe = recipe, workload: Workload = workload) -> int:
+            return need_of(recipe, replace(workload, batch=batch)).total
+
         with console.status(f"counting {name}"):
-            need = need_of(recipe, workload)
-            most = largest_batch(lambda b: need_of(recipe, replace(workload, batch=b)).total, limit)
+            need, most = need_of(recipe, workload), largest_batch(total, limit)
         show_need(name, need, workload, console)
-        fits = need.total <= limit
-        print_lines(console, [
-            f"{'fits' if fits else 'does not fit'} into {in_words(limit)} on {workload.device}; "
-            + (f"the largest batch that does is {most}" if most else "not even a batch of 1 does")
-        ])  # fmt: skip
+        told = "fits" if need.total <= limit else "does not fit"
+        batches = f"the largest batch that does is {most}" if most else "not even a batch of 1 does"
+        print_lines(console, [f"{told} into {in_words(limit)} on {workload.device}; {batches}"])
