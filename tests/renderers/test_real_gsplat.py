@@ -53,7 +53,7 @@ def test_the_call_fits_the_signature_and_leaves_the_rest_at_what_it_means(bound,
     assert found["packed"] is False
     assert found["sh_degree"] is None, "colours are given, not coefficients"
     assert (found["rasterize_mode"], found["camera_model"]) == ("classic", "pinhole")
-    assert not (found["with_ut"] or found["with_eval3d"] or found["segmented"])
+    assert not any(found[name] for name in ("with_ut", "with_eval3d", "segmented"))
     assert found["covars"] is None
     assert found["radius_clip"] == 0
     assert found["colors"].shape[-1] + 1 <= found["channel_chunk"], "one pass"
