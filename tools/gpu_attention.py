@@ -84,7 +84,8 @@ def errors(kernel: str | None, clamp: str, device: str, heads: int) -> dict[str,
     for dtype in (torch.float64, torch.float32):
         given, lines = leaves(sizes, device, dtype), rays(sizes[2], device, dtype)
         true = dtype == torch.float64
-        out = (exact if true else lambda *a: attend(*a, kernel))(given, lines, CLAMPS[clamp])
+        read = given, lines, CLAMPS[clamp]
+        out = exact(*read) if true else attend(*read, kernel)
         weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(2))
         (out * weights.to(out)).sum().backward()
         found.append({"out": out.detach(), **{n: x.grad for n, x in given.items()}})

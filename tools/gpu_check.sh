@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs on a machine with a GPU everything that a CPU cannot hold, and writes one report:
 #     tools/gpu_check.sh WHEELS [OUT]      (OUT: a new folder, gpu-report if not given)
-# The machine needs Python 3.11 or newer with pip, torch with CUDA and nvcc (gsplat compiles its kernels), and no
+# The machine needs Python 3.11 or newer with pip, torch with CUDA, and nvcc (gsplat compiles), and no
 # network. WHEELS is a folder with the wheels of all else, filled where there is a network, for the
 # Python of that machine (here 3.12), by
 #     pip download --only-binary=:all: --python-version 3.12 --implementation cp \

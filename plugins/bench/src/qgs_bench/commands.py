@@ -141,11 +141,16 @@ def _sweep(
     if json is not None:
         refuse_other_file(json, KIND)
         refuse_other_files(json)
+    files: list[Path] = []
+
+    def keep(report: dict[str, Any]) -> None:
+        if json is not None:
+            files[:] = write_sweep(report, json)
+
     with console.status("composing") as status:
-        report = sweep(sources, parsed, work, say=status.update, **options)
+        report = sweep(sources, parsed, work, say=status.update, keep=keep, **options)
     show_sweep(report, console)
-    if json is not None:
-        files = write_sweep(report, json)
+    if files:
         console.print(f"written to {', '.join(map(str, files))}")
 
 

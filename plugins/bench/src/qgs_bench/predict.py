@@ -18,7 +18,7 @@ measured; on a GPU the context of CUDA, a round number that nobody measured here
 
 RESERVE = 0.1
 """Of the counted tensors, on top of them: what kernels take inside an operator, and what allocators
-round up and scatter. Measured on a CPU: -1 to 13 % of the resident set, see docs/performance.md."""
+round up and scatter. glibc may keep more, see docs/performance.md."""
 
 _UNITS = {"": 1, "k": 1000, "M": 1000**2, "G": 1000**3, "T": 1000**4}
 

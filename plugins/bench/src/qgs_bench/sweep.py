@@ -104,15 +104,18 @@ def sweep(
     warmup: int = 2,
     overrides: Sequence[str] = (),
     say: Callable[[str], None] = lambda _: None,
+    keep: Callable[[dict[str, Any]], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Measure all recipes along all axes, each from the recipe's own values of the others.
 
     given: fields of the workload, as `workload_of` takes them. step: training steps too. rounds,
     warmup: of each time. A point whose counted memory is more than is available is left out, and
-    named with its reason. Returns the report, plain values for JSON. Raises as `bench` does.
+    named with its reason. keep: called with the report so far, after each axis. Returns the report, plain values for JSON. Raises as `bench` does.
     """
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
     series: list[dict[str, Any]] = []
+    settings = {"overrides": [*overrides], "rounds": rounds, "warmup": warmup}
+    report = {"report": KIND, "machine": machine(given["device"]), **settings, "series": series}
     for source in sources:
         for axis in axes:
             found: dict[Operation, list[dict[str, Any]]] = {o: [] for o in operations}
@@ -129,8 +132,8 @@ def sweep(
                     found[operation].append({"value": value, "counted_bytes": counted, **point})
             for operation, points in found.items():
                 series.append(_series(source, axis.name, operation, points, missing))
-    settings = {"overrides": [*overrides], "rounds": rounds, "warmup": warmup}
-    return {"report": KIND, "machine": machine(given["device"]), **settings, "series": series}
+            keep(report)
+    return report
 
 
 def _too_large(recipe: Recipe, operation: Operation, work: Workload) -> tuple[str, int]:
