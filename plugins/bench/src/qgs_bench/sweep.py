@@ -109,8 +109,9 @@ def sweep(
     """Measure all recipes along all axes, each from the recipe's own values of the others.
 
     given: fields of the workload, as `workload_of` takes them. step: training steps too. rounds,
-    warmup: of each time. A point whose counted memory is more than is available is left out, and
-    named with its reason. keep: called with the report so far, after each axis. Returns the report, plain values for JSON. Raises as `bench` does.
+    warmup: of each time. keep: called with the report so far, after each axis. A point whose
+    counted memory is more than is available is left out, and named with its reason. Returns the
+    report, plain values for JSON. Raises as `bench` does.
     """
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
     series: list[dict[str, Any]] = []
