@@ -34,7 +34,11 @@ DISTRIBUTIONS = {
         name: f"query-gaussians-{name}"
         for name in ("locus", "ellipsoid", "rooms", "c3g", "gslrm", "globalsplat")
     },
-    "qgs.commands": {"data": "query-gaussians-datatools", "study": "query-gaussians-studies"}
+    "qgs.commands": {
+        "data": "query-gaussians-datatools",
+        "study": "query-gaussians-studies",
+        "bench": "query-gaussians-bench",
+    }
     | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
 }

@@ -14,7 +14,7 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 24_000, 200
 FORMER_NAME = re.compile(
-    r"\bqgs-(locus|ellipsoid|c3g|gslrm|globalsplat|rooms|datatools|viewer|studies|plugintools)\b"
+    r"\bqgs-(locus|ellipsoid|c3g|gslrm|globalsplat|rooms|datatools|viewer|studies|bench|plugintools)\b"
     r"|pip install (qgs)\b|\bqgs\["
 )
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")

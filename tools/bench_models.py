@@ -16,10 +16,10 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
+from qgs_bench.work import posed_photos
 from torch import Tensor
 
 from qgs.composer import resolve
-from qgs.engine.bench.work import posed_photos
 from qgs.model import QueryGaussianModel
 from qgs.types import Views
 

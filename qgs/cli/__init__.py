@@ -6,7 +6,6 @@ import sys
 import typer
 
 from qgs.cli import (
-    bench,
     convert,
     demo,
     evaluate,
@@ -41,7 +40,6 @@ COMMANDS = {
     "report": report.report,
     "import": weights.import_,
     "export": weights.export,
-    "bench": bench.bench,
     "demo": demo.demo,
 }
 for _name, _command in COMMANDS.items():

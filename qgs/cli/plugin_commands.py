@@ -19,6 +19,7 @@ HELP = {
     "study": (
         "Train every variant with every seed, judge them alike, and answer: better, and how sure?"
     ),
+    "bench": "Size, latency and memory of models: any number of recipes in turn.",
     "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
     "check-plugin": "Hold every component of a plugin to its contract.",
 }

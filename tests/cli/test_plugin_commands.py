@@ -107,5 +107,7 @@ def test_a_command_of_this_repository_names_its_distribution(
     monkeypatch.setattr("qgs.cli.plugin_commands.entry_points", lambda **_: nothing)
     result = run_qgs("data", "check", "photos")
     assert "run `pip install query-gaussians-datatools`" in str(result.exception)
+    result = run_qgs("bench", "tiny/locus.yaml")
+    assert "run `pip install query-gaussians-bench`" in str(result.exception)
     assert run_qgs("nothing").exit_code == 2
     assert DISTRIBUTIONS[GROUP].keys().isdisjoint(COMMANDS)

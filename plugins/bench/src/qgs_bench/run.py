@@ -15,8 +15,8 @@ from torch.utils.benchmark import timer
 
 import qgs
 from qgs.composer import Recipe
-from qgs.engine.bench.memory import Peak, peak_memory
-from qgs.engine.bench.work import Operation, Task, Workload, make_task
+from qgs_bench.memory import Peak, peak_memory
+from qgs_bench.work import Operation, Task, Workload, make_task
 
 KIND = "qgs bench"
 
@@ -30,17 +30,17 @@ class Subject:
     workload: Workload
 
 
-def refuse_other_file(path: Path) -> None:
-    """Raise FileExistsError when `path` holds anything but an earlier report."""
+def refuse_other_file(path: Path, kind: str = KIND) -> None:
+    """Raise FileExistsError when `path` holds anything but an earlier report of that kind."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return
     except (OSError, ValueError):
         found = None
-    if not isinstance(found, dict) or found.get("report") != KIND:
+    if not isinstance(found, dict) or found.get("report") != kind:
         raise FileExistsError(
-            f"{path} exists and is no report of `{KIND}`; choose another name for the report"
+            f"{path} exists and is no report of `{kind}`; choose another name for the report"
         )
 
 
@@ -107,19 +107,27 @@ def bench(
             subjects, models, counts, weights, times, peaks, strict=True
         )
     ]
-    device = subjects[0].workload.device
-    machine = {
+    settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
+    return {
+        "report": KIND,
+        "machine": machine(subjects[0].workload.device),
+        **settings,
+        "recipes": recipes,
+    }
+
+
+def machine(device: str) -> dict[str, Any]:
+    """What was measured on, for the report."""
+    return {
         "device": device,
         "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
         "cores": os.cpu_count() or 0,
-        "threads": threads,
+        "threads": torch.get_num_threads(),
         "system": platform.platform(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "qgs": qgs.__version__,
     }
-    settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
-    return {"report": KIND, "machine": machine, **settings, "recipes": recipes}
 
 
 def quartiles(samples: Sequence[float]) -> dict[str, float]:

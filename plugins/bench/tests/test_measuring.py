@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from qgs_bench.memory import peak_memory, resident_bytes
+from qgs_bench.run import in_turn, quartiles
+from qgs_bench.work import Operation, Workload, make_task, posed_photos, workload_of
 
 from qgs.composer import resolve
-from qgs.engine.bench.memory import peak_memory, resident_bytes
-from qgs.engine.bench.run import in_turn, quartiles
-from qgs.engine.bench.work import Operation, Workload, make_task, posed_photos, workload_of
 from qgs.geometry.transforms import to_camera, to_pixels
 
-RECIPES = Path(__file__).parents[2] / "recipes"
+RECIPES = Path(__file__).parents[3] / "recipes"
 SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 MODEST = Workload(views=2, targets=2, size=(16, 24))
 

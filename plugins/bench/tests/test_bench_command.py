@@ -8,7 +8,7 @@ import pytest
 from commands import SMALL, run_qgs, sets
 from typer.testing import Result
 
-RECIPES = Path(__file__).parents[2] / "recipes"
+RECIPES = Path(__file__).parents[3] / "recipes"
 TOKENGS, LOCUS = RECIPES / "tiny/tokengs.yaml", RECIPES / "tiny/locus.yaml"
 
 

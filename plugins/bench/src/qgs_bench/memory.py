@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from qgs.composer import Recipe, resolve
-from qgs.engine.bench.work import Operation, Workload, make_task
+from qgs_bench.work import Operation, Workload, make_task
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, thread
     Raises ChildProcessError, with what the process said last, when it failed or was killed.
     """
     order = json.dumps([dict(recipe.tree), operation, asdict(workload), threads])
-    command = [sys.executable, "-m", "qgs.engine.bench.memory"]
+    command = [sys.executable, "-m", "qgs_bench.memory"]
     done = subprocess.run(command, input=order, capture_output=True, text=True)
     if not done.returncode:
         return Peak(**json.loads(done.stdout))

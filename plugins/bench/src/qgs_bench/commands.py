@@ -1,0 +1,189 @@
+"""`qgs bench`: size, latency and memory of models, as tables and as a JSON report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
+
+if TYPE_CHECKING:
+    from qgs.composer import Recipe
+    from qgs_bench.work import Workload
+
+app = typer.Typer(help="How fast and how large models are.")
+
+
+@app.command()
+def bench(
+    recipes: Annotated[
+        list[Path], typer.Argument(help="Recipe files; the first is what others are compared with.")
+    ],
+    overrides: Overrides = None,
+    views: Annotated[
+        int | None, typer.Option(min=1, help="Input views; as the recipe says if not given.")
+    ] = None,
+    size: Size = None,
+    batch: Annotated[
+        int | None, typer.Option(min=1, help="Scenes at once; 1, of --predict the recipe's.")
+    ] = None,
+    precision: Annotated[
+        str | None,
+        typer.Option(help="float32 or bf16 (autocast); float32, of --predict the recipe's."),
+    ] = None,
+    step: Annotated[bool, typer.Option("--step", help="Training steps too.")] = False,
+    memory: Annotated[
+        bool, typer.Option("--memory", help="Peak memory too, of a fresh process each.")
+    ] = False,
+    renderer: Annotated[bool, typer.Option("--renderer", help="The renderer too.")] = False,
+    rounds: Annotated[int, typer.Option(min=1, help="Samples of each latency.")] = 10,
+    warmup: Annotated[int, typer.Option(min=0, help="Calls before the first sample.")] = 2,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AXIS=A..B",
+            help="Time and memory at A, 2 A, ... up to B, of views, queries, size or batch.",
+        ),
+    ] = None,
+    predict: Annotated[
+        bool, typer.Option("--predict", help="Whether a training would fit; nothing is run.")
+    ] = False,
+    within: Annotated[
+        str | None,
+        typer.Option(metavar="SIZE", help="Of --predict: memory, as 24GB; default: what is free."),
+    ] = None,
+    json: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a report with every sample.")
+    ] = None,
+    threads: Threads = None,
+    device: Device = "auto",
+) -> None:
+    """Size, latency and memory of models: any number of recipes in turn.
+
+    Ratios are to the first. Models have their initial weights, photos and poses
+    are random: no data is needed. Latency is from photos to Gaussians, batch by
+    batch. With --memory: on a CPU the peak resident set of a process, on a GPU
+    what torch allocated at most.
+    """
+    from qgs.engine.distributed import choose_device
+
+    others = {"--step": step, "--memory": memory, "--renderer": renderer}
+    _refuse_beside("--sweep", sweep, {"--memory": memory, "--renderer": renderer})
+    _refuse_beside("--predict", predict, others | {"--sweep": sweep, "--json": json})
+    if within is not None and not predict:
+        raise ValueError("--within says of which memory --predict speaks; give --predict too")
+    if precision not in (None, "float32", "bf16"):
+        raise ValueError(f"--precision must be float32 or bf16, got {precision!r}")
+    work = {"views": views, "size": parse_size(size), "batch": batch, "precision": precision}
+    use_threads(threads)
+    console = Console()
+    sources, changes = [str(path) for path in recipes], overrides or []
+    if predict:
+        work["device"] = "cuda" if device == "cuda" else choose_device(device, console.print)
+        return _predict(sources, changes, work, within, console)
+    work |= {"batch": batch or 1, "precision": precision or "float32"}
+    work["device"] = choose_device(device, console.print)
+    options: dict[str, Any] = {"step": step, "rounds": rounds, "warmup": warmup}
+    options |= {"overrides": changes}
+    if sweep:
+        return _sweep(sources, sweep, work, options, json, console)
+    _compare(sources, work, options | {"memory": memory, "renderer": renderer}, json, console)
+
+
+def _refuse_beside(option: str, given: object, others: dict[str, Any]) -> None:
+    found = [name for name, value in others.items() if value]
+    if given and found:
+        raise ValueError(f"{option} stands alone; give {', '.join(found)} in a call of its own")
+
+
+def _compare(
+    sources: list[str],
+    work: dict[str, Any],
+    options: dict[str, Any],
+    json: Path | None,
+    console: Console,
+) -> None:
+    from qgs.composer import resolve
+    from qgs.engine.results import as_json
+    from qgs.io.files import write_text
+    from qgs_bench.output import show
+    from qgs_bench.run import Subject, bench, refuse_other_file
+    from qgs_bench.work import workload_of
+
+    if json is not None:
+        refuse_other_file(json)
+    resolved = [(name, resolve(name, options["overrides"])) for name in sources]
+    subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
+    with console.status("composing") as status:
+        report = bench(subjects, say=status.update, **options)
+    show(report, console)
+    if json is not None:
+        write_text(json, as_json(report))
+        console.print(f"written to {json}")
+
+
+def _sweep(
+    sources: list[str],
+    axes: list[str],
+    work: dict[str, Any],
+    options: dict[str, Any],
+    json: Path | None,
+    console: Console,
+) -> None:
+    from qgs_bench.output import refuse_other_files, show_sweep, write_sweep
+    from qgs_bench.run import refuse_other_file
+    from qgs_bench.sweep import KIND, parse_axis, sweep
+
+    parsed = [parse_axis(text) for text in axes]
+    if json is not None:
+        refuse_other_file(json, KIND)
+        refuse_other_files(json)
+    files: list[Path] = []
+
+    def keep(report: dict[str, Any]) -> None:
+        if json is not None:
+            files[:] = write_sweep(report, json)
+
+    with console.status("composing") as status:
+        report = sweep(sources, parsed, work, say=status.update, keep=keep, **options)
+    show_sweep(report, console)
+    if files:
+        console.print(f"written to {', '.join(map(str, files))}")
+
+
+def _predict(
+    sources: list[str],
+    overrides: list[str],
+    work: dict[str, Any],
+    within: str | None,
+    console: Console,
+) -> None:
+    from dataclasses import replace
+
+    from qgs.composer import resolve
+    from qgs.engine.results import print_lines
+    from qgs.memory import in_words
+    from qgs_bench.output import show_need
+    from qgs_bench.predict import available, largest_batch, need_of, parse_bytes
+    from qgs_bench.work import workload_of
+
+    limit = available(work["device"]) if within is None else parse_bytes(within)
+    for name in sources:
+        recipe = resolve(name, overrides)
+        config = recipe.training
+        batch, precision = work["batch"] or config.batch_size, work["precision"] or config.precision
+        given = {**work, "batch": batch, "precision": precision}
+        workload = workload_of(recipe, **given)
+
+        def total(batch: int, recipe: Recipe = recipe, workload: Workload = workload) -> int:
+            return need_of(recipe, replace(workload, batch=batch)).total
+
+        with console.status(f"counting {name}"):
+            need, most = need_of(recipe, workload), largest_batch(total, limit)
+        show_need(name, need, workload, console)
+        told = "fits" if need.total <= limit else "does not fit"
+        batches = f"the largest batch that does is {most}" if most else "not even a batch of 1 does"
+        print_lines(console, [f"{told} into {in_words(limit)} on {workload.device}; {batches}"])

@@ -1,0 +1,126 @@
+"""`qgs bench --sweep` and `--predict` as a user types them; exponents of known powers."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from commands import run_qgs, sets
+from qgs_bench import sweep as sweep_module
+from qgs_bench.sweep import fit, parse_axis
+
+from qgs.composer import resolve
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+TOKENGS, LOCUS = RECIPES / "tiny/tokengs.yaml", RECIPES / "tiny/locus.yaml"
+QUICK = ("--rounds", "2", "--warmup", "1", "--device", "cpu", "--size", "16x24")
+
+
+def test_axes_double() -> None:
+    assert parse_axis("views=2..32").values == (2, 4, 8, 16, 32)
+    assert parse_axis("queries=256..16384").values == tuple(256 * 2**n for n in range(7))
+    assert parse_axis("size=24..100").values == (24, 48, 96)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("views=2-32", "AXIS=FIRST..LAST, such as views=2..32"),
+        ("targets=2..32", "an axis of views, queries, size, batch"),
+        ("views=0..4", "AXIS=FIRST..LAST"),
+        ("views=4..7", "one point.*at least 8"),
+    ],
+)
+def test_no_axis_is_told(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_axis(text)
+
+
+def test_the_exponent_of_a_power_and_its_error() -> None:
+    found = fit([2, 4, 8, 16], [3 * n**1.5 for n in (2, 4, 8, 16)])
+    assert found is not None
+    assert found.error is not None
+    assert (found.exponent, found.factor, found.last) == pytest.approx((1.5, 3, 1.5))
+    assert found.error < 1e-9
+    noisy = fit([1, 2, 4], [1, 2, 8])  # logarithms 0, 1, 3: slope 1.5, residuals 1/6, -1/3, 1/6
+    assert noisy is not None
+    assert (noisy.exponent, noisy.last) == pytest.approx((1.5, 2))
+    assert noisy.error == pytest.approx((6 / 36 / 2) ** 0.5)
+    assert getattr(fit([2, 4], [1, 2]), "error", 0) is None
+    assert fit([2], [1]) is None
+
+
+def test_a_sweep_writes_table_and_figure(tmp_path: Path) -> None:
+    file = tmp_path / "sweep.json"
+    words = ("bench", TOKENGS, LOCUS, "--sweep", "views=2..4", "--sweep", "queries=8..16")
+    result = run_qgs(*words, *QUICK, "--json", file, *sets())
+    assert result.exit_code == 0, result.output
+    report = json.loads(file.read_text())
+    series = report["series"]
+    kinds = [(Path(s["recipe"]).stem, s["axis"], s["operation"]) for s in series]
+    assert kinds == [(n, a, "forward") for n in ("tokengs", "locus") for a in ("views", "queries")]
+    assert [p["value"] for p in series[1]["points"]] == [8, 16]
+    for one in series:
+        low, high = one["points"]
+        assert 0 < low["counted_bytes"] <= high["counted_bytes"]
+        assert low["memory"]["peak_bytes"] > low["memory"]["idle_bytes"] > 0
+        assert one["fits"]["seconds"]["error"] is None
+    rows = list(csv.DictReader(file.with_suffix(".csv").open()))
+    assert [row["value"] for row in rows] == ["2", "4", "8", "16"] * 2
+    assert file.with_suffix(".png").stat().st_size > 10_000
+    assert file.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+    assert "exponents: time" in result.output
+    file.unlink()
+    refused = run_qgs(*words, *QUICK, "--json", file, *sets())
+    assert isinstance(refused.exception, FileExistsError)
+    assert "sweep.csv, sweep.png, sweep.pdf" in str(refused.exception)
+
+
+def test_what_does_not_fit_is_left_out_and_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    small = 495 * 2**20
+    monkeypatch.setattr(sweep_module, "available", lambda device: small)
+    words = ("--sweep", "queries=8..32768", "--step", "--json", tmp_path / "s.json")
+    changed = [("--set", "model.width=16"), ("--set", "model.heads=2")]
+    monkeypatch.setattr(
+        sweep_module, "_measured",
+        lambda *_: {"seconds": {"median": 1.0, "lower_quartile": 1.0, "upper_quartile": 1.0},
+                    "memory": {"peak_bytes": 3, "idle_bytes": 1}},
+    )  # fmt: skip
+    result = run_qgs("bench", TOKENGS, *words, *QUICK, *(w for pair in changed for w in pair))
+    assert result.exit_code == 0, result.output
+    _, step = json.loads((tmp_path / "s.json").read_text())["series"]
+    left = [m["value"] for m in step["left_out"]]
+    assert left
+    assert [p["value"] for p in step["points"]] + left == [8 * 2**n for n in range(13)]
+    assert f"left out: queries {left[0]} needs" in result.output
+    assert "519 MB are available" in result.output
+
+
+def test_a_prediction_says_what_fits() -> None:
+    recipe = resolve(LOCUS)
+    result = run_qgs("bench", LOCUS, "--predict", "--within", "1GB", "--device", "cpu")
+    assert result.exit_code == 0, result.output
+    assert f"B x V x H x W {recipe.training.batch_size} x 2 x 64 x 64" in " ".join(
+        result.output.split()
+    )
+    assert "fits into 1 GB on cpu; the largest batch that does is " in result.output
+    assert "kept for the backward pass: encoder " in result.output
+    tight = run_qgs("bench", LOCUS, "--predict", "--within", "10MB", "--device", "cuda")
+    assert "does not fit into 10 MB on cuda; not even a batch of 1 does" in tight.output
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--sweep", "views=2..4", "--predict"], "--predict stands alone; give --sweep in a call"),
+        (["--sweep", "views=2..4", "--memory"], "--sweep stands alone; give --memory in a call"),
+        (["--within", "2GB"], "give --predict too"),
+        (["--predict", "--within", "2 gigs"], "must be a size such as 24GB"),
+    ],
+)
+def test_options_that_do_not_go_together(words: list[str], message: str) -> None:
+    result = run_qgs("bench", TOKENGS, *words, "--device", "cpu")
+    assert isinstance(result.exception, ValueError)
+    assert message in str(result.exception)

@@ -1,0 +1,95 @@
+"""The script for machines with a GPU, as far as it can be run without one."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gpu_check
+import pytest
+import torch
+import typer
+from gpu_attention import main as attention
+from gpu_check import Step, run_all, steps
+from typer.core import TyperGroup
+
+from qgs.cli import app
+
+SCRIPT = Path(__file__).parents[1] / "tools/gpu_check.sh"
+
+
+def test_what_fails_or_hangs_is_recorded_and_the_others_go_on(tmp_path: Path) -> None:
+    write = "import json; json.dump({'recipes': []}, open('found.json', 'w'))"
+    found = [
+        Step("breaks", [sys.executable, "-c", "import sys; print('so bad'); sys.exit(3)"]),
+        Step("hangs", [sys.executable, "-c", "import time; time.sleep(60)"], limit=1),
+        Step("is missing", ["no-such-program"]),
+        Step("works", [sys.executable, "-c", write], result="found.json"),
+    ]
+    done = run_all(found, tmp_path)
+    assert [one.code for one in done] == [3, None, 127, 0]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [one["passed"] for one in report["steps"]] == [False, False, False, True]
+    assert report["steps"][3]["found"] == {"recipes": []}
+    text = (tmp_path / "report.md").read_text()
+    assert "| works | passed |" in text
+    assert "so bad" in text
+    assert "ran past its limit" in text
+    assert "## works" not in text
+
+
+def test_every_command_of_qgs_is_one(tmp_path: Path) -> None:
+    names = [step.name for step in steps(tmp_path)]
+    assert len({*names}) == len(names) > 15
+    tried = 0
+    for step in steps(tmp_path):
+        if step.command[0] == "qgs":
+            command: typer.core.TyperGroup = typer.main.get_command(app)  # type: ignore[assignment]
+            context = command.make_context("qgs", [*step.command[1:]])
+            assert isinstance(command, TyperGroup)
+            rest = [*context._protected_args, *context.args]
+            name, command, rest = command.resolve_command(context, rest)
+            command.make_context(name, rest, parent=context)
+            tried += 1
+    assert tried > 10
+
+
+def test_the_tables_of_the_report(tmp_path: Path) -> None:
+    seconds = {"median": 0.01, "ratio": {"median": 1.2}}
+    recipe = {"recipe": "locus", "seconds": {"forward": seconds, "step": seconds}}
+    command = f"import json; json.dump({{'recipes': [{recipe}]}}, open('l.json', 'w'))"
+    run_all([Step("latency, x", [sys.executable, "-c", command], result="l.json")], tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "The paper's ratio is 1.19." in text
+    assert "| locus | 10.00 | 1.200 | 10.00 | 1.200 |" in text
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = ["bash", str(SCRIPT), str(tmp_path), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, env={"PYTHON": sys.executable,
+                          "PATH": "/usr/bin:/bin"})  # fmt: skip
+    assert done.returncode == 2
+    assert "finds no GPU" in done.stderr
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(sys, "argv", ["gpu_check.py", str(tmp_path / "out")])
+    assert gpu_check.main() == 2
+    wrong = subprocess.run(["bash", str(SCRIPT)], capture_output=True, text=True)
+    assert wrong.returncode == 64
+    assert "WHEELS must be a folder" in wrong.stderr
+
+
+def test_kernels_of_attention_are_held_against_float64(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "a.json"
+    words = ("--device", "cpu", "--size", "32x64", "--heads", "2", "--json", str(file))
+    monkeypatch.setattr(sys, "argv", ["gpu_attention.py", *words])
+    monkeypatch.setattr("gpu_attention.kernels", lambda: [None])
+    with pytest.raises(SystemExit) as ended:
+        attention()
+    assert ended.value.code == 0
+    ours, unbiased = json.loads(file.read_text())["rows"]
+    for clamp in ("none", "some", "all"):
+        assert float(ours[f"error, {clamp} clamped"].split()[0]) < 1e-5
+    assert unbiased["kernel"] == "no bias"

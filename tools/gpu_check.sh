@@ -1,0 +1,46 @@
+#!/usr/bin/env bash
+# Runs on a machine with a GPU everything that a CPU cannot hold, and writes one report:
+#     tools/gpu_check.sh WHEELS [OUT]      (OUT: a new folder, gpu-report if not given)
+# The machine needs Python 3.11 or newer with pip, torch with CUDA, and nvcc (gsplat compiles), and no
+# network. WHEELS is a folder with the wheels of all else, filled where there is a network, for the
+# Python of that machine (here 3.12), by
+#     pip download --only-binary=:all: --python-version 3.12 --implementation cp \
+#         --platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
+#         --no-deps -d WHEELS -r <(pip freeze --exclude-editable | grep -v ^torch) \
+#         gsplat==1.5.3 jaxtyping wadler-lindig ninja hatchling
+# Exit code: 0 all steps passed, 1 some failed (the report says which), 2 there is no GPU.
+set -uo pipefail
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+python=${PYTHON:-python3}
+if (($# < 1)) || [[ ! -d $1 ]]; then
+    echo "gpu_check: usage: tools/gpu_check.sh WHEELS [OUT]; WHEELS must be a folder, got '${1:-nothing}'" >&2
+    exit 64
+fi
+wheels=$(cd "$1" && pwd)
+out=${2:-gpu-report}
+if ! "$python" -c 'import sys, torch; sys.exit(0 if torch.cuda.is_available() else 2)'; then
+    echo "gpu_check: $python finds no GPU: torch is missing, has no CUDA, or there is no device" >&2
+    exit 2
+fi
+if [[ -e $out ]]; then
+    echo "gpu_check: $out exists; name a new folder for the report" >&2
+    exit 64
+fi
+mkdir -p "$out"
+out=$(cd "$out" && pwd)
+environment=$out/environment
+"$python" -m venv --system-site-packages "$environment" || exit 1
+plugins=()
+for plugin in "$root"/plugins/*/; do
+    plugins+=(--editable "$plugin")
+done
+# torch stays the machine's: wheels of it in WHEELS are not looked at.
+mapfile -t files < <(find "$wheels" -name '*.whl' ! -name 'torch-*' ! -name 'nvidia_*' ! -name 'triton-*')
+install=("$environment/bin/python" -m pip install -q --no-index --disable-pip-version-check --no-deps)
+"${install[@]}" "${files[@]}" || echo "gpu_check: some wheels could not be installed (see above)" >&2
+"${install[@]}" --no-build-isolation --editable "$root" "${plugins[@]}" || {
+    echo "gpu_check: qgs could not be installed (see above); WHEELS must have hatchling" >&2
+    exit 1
+}
+export PATH="$environment/bin:$PATH"
+cd "$root" && exec "$environment/bin/python" tools/gpu_check.py "$out"
