@@ -27,11 +27,18 @@ SIZES = {
     "first": ({"width": 384, "heads": 6, "queries": 1024, "depth": 12}, (256, 256)),
     "small": ({"width": 256, "heads": 8, "queries": 512, "depth": 6}, (128, 128)),
 }
-MODELS = ("tokengs", "locus", "ellipsoid")
+MODELS = {
+    "tokengs": ("tokengs", ()),
+    "locus": ("locus", ()),
+    "locus, no bias": ("locus", ("model.decoder.cross_attention={type: qgs/content}",)),
+    "ellipsoid": ("ellipsoid", ()),
+}
+"""Recipes and changes. Without the bias LocusGS has its position MLPs and refinement left: the
+least that it can cost beside TokenGS."""
 
 
 def build(name: str, size: str, layers: int) -> QueryGaussianModel:
-    """The model of a published recipe, made smaller."""
+    """A published model, made smaller."""
     options, _ = SIZES[size]
     depth = options["depth"]
     supervised = [depth // 2, depth] if layers == 2 else [depth]
@@ -41,8 +48,9 @@ def build(name: str, size: str, layers: int) -> QueryGaussianModel:
         f"model.queries.count={options['queries']}",
         f"model.decoder.depth={depth}",
         f"model.supervision.layers={supervised}",
+        *MODELS[name][1],
     ]
-    return resolve(f"{name}/dl3dv_4096_4views.yaml", changes).build_model()
+    return resolve(f"{MODELS[name][0]}/dl3dv_4096_4views.yaml", changes).build_model()
 
 
 def backward(model: QueryGaussianModel, photos: Views) -> None:
@@ -69,8 +77,8 @@ def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
             rows[-1][name] = time.perf_counter() - start
     for name in runs:
         median = statistics.median(row[name] for row in rows)
-        ratio = statistics.median(row[name] / row[MODELS[0]] for row in rows)
-        print(f"  {name:10} {1e3 * median:8.1f} ms   {ratio:.3f}", flush=True)
+        ratio = statistics.median(row[name] / row["tokengs"] for row in rows)
+        print(f"  {name:14} {1e3 * median:8.1f} ms   {ratio:.3f}", flush=True)
 
 
 def main() -> None:
