@@ -26,6 +26,7 @@ from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F
+from qgs_bench.work import posed_photos
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -33,7 +34,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from qgs.components import AttentionBias, attention_bias, blocks
 from qgs.composer import Recipe, resolve
-from qgs.engine.bench.work import posed_photos
 from qgs.model import QueryGaussianModel
 from qgs.types import named_tensors
 
