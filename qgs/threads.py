@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any
@@ -18,13 +18,17 @@ def can_compile() -> bool:
 def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:
     """Call `unit(*item)` for every item of `work`, and wait.
 
-    Every unit of work writes to its own memory, so their order does not matter.
+    Every unit of work writes to its own memory, so their order does not matter. A unit must not
+    call this itself: it would wait for the threads that it holds.
     """
     items = list(work)
     if len(items) == 1:
         unit(*items[0])
     else:
-        list(_threads(torch.get_num_threads()).map(lambda item: unit(*item), items))
+        futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in items]
+        wait(futures)  # all of them, also where one fails: nobody writes when this returns
+        for future in futures:
+            future.result()
 
 
 @lru_cache(maxsize=1)

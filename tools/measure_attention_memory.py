@@ -6,16 +6,17 @@ Each measurement runs in a process of its own, on the CPU (Linux), with glibc to
 memory back; what the process holds before, queries, keys and values among it, is left out. The size
 is that of 4,096 queries and 4 photos of 448 x 256 in patches of 8 x 8: 7,168 tokens, 16 heads.
 --grow measures LocusGS's from 512 to 16,384 queries and from 1,024 to 32,768 tokens instead, with 2
-heads, and fits the exponents with which the memory beyond the block buffers grows.
+heads. What is constant, as the buffers of blocks, drops out of the exponent that it prints: the
+binary logarithm of the last doubling's growth over that of the one before.
 """
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from measure_render_memory import peak, restart_peak
@@ -75,9 +76,10 @@ def in_own_process(kind: str, *size: int) -> float:
     return json.loads(done.stdout)
 
 
-def exponent(sizes: list[int], found: list[float]) -> float:
-    """Slope of the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(found), 1)[0])
+def exponent(found: list[float]) -> float:
+    """Of c in a + b n^c, through the last three sizes, each twice the one before."""
+    *_, first, second, third = found
+    return math.log2((third - second) / (second - first))
 
 
 def main() -> None:
@@ -101,9 +103,7 @@ def main() -> None:
         rows = {kind: [in_own_process(kind, *of(n)) for n in sizes] for kind in ("none", "locus")}
         for n, none, locus in zip(sizes, rows["none"], rows["locus"], strict=True):
             print(f"{name} {n:6,}: {none:7.1f} MB without a bias, {locus:7.1f} MB with LocusGS's")
-        print(
-            f"  exponents {exponent(sizes, rows['none']):.3f}, {exponent(sizes, rows['locus']):.3f}"
-        )
+        print(f"  exponents {exponent(rows['none']):.3f}, {exponent(rows['locus']):.3f}")
 
 
 if __name__ == "__main__":

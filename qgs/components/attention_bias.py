@@ -1,7 +1,7 @@
 """Attention with a bias that is a function of query and token, computed block by block.
 
 The logits are q k / sqrt(d) + b. Neither they, nor b, nor their gradients ever exist for all N x M
-pairs, only for some queries and all tokens at a time: a block of `BLOCK` pairs. The backward pass
+pairs, only for some queries and all tokens at a time: a block. The backward pass
 makes b and the weights p = exp(logits - lse) again from the log-sum-exp of each query
 (FlashAttention, arXiv 2205.14135, section 3.1, whose blocks are of tokens too).
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.components.attention_choice import AttentionKernel, chosen_kernel
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.geometry.precision import full_precision
 from qgs.threads import can_compile, in_threads
 
 T = TypeVar("T")
@@ -40,7 +40,7 @@ class AttentionBias(ABC):
     """A bias of attention logits, the same for all heads: a function of query and token.
 
     queries: (B, N, F), what it reads of queries. tokens: (B, G, M), what it reads of tokens.
-    Gradients flow into both. All geometry, float32 or float64.
+    Gradients flow into both, and into nothing else that `value` reads. Float32 or float64.
     """
 
     def __init__(self, queries: Tensor, tokens: Tensor) -> None:
@@ -92,7 +92,8 @@ class AttentionBias(ABC):
                 leaves = part_nF.detach().requires_grad_(), tokens_GM.detach()
                 leaves[1].requires_grad_(wanted)
                 value_nM = self.value(*leaves)
-            found.append(torch.autograd.grad(value_nM, leaves[: 1 + wanted], part_nM.to(value_nM)))
+            given = leaves[: 1 + wanted], part_nM.to(value_nM)
+            found.append(torch.autograd.grad(value_nM, *given, materialize_grads=True))
         of_queries, *of_tokens = zip(*found, strict=True)
         return torch.cat(of_queries), torch.stack(of_tokens[0]).sum(0) if wanted else None
 
@@ -109,7 +110,7 @@ class AttentionBias(ABC):
         scenes, count, _ = self.queries.shape
         tokens, device = self.tokens.shape[2], self.queries.device
         numbers = BLOCK.get(device.type, BLOCK["cuda"])
-        rows = min(max(numbers // max(buffers * tokens, tokens, 1), 1), count)
+        rows = min(max(numbers // max(buffers * tokens, tokens, 1), 1), max(count, 1))
         memory = _scratch(buffers * rows * tokens, device, dtype).view(buffers, rows, tokens)
         for scene in range(scenes):
             for first in range(0, count, rows):
@@ -220,8 +221,10 @@ class _BiasedAttention(torch.autograd.Function):
     def forward(
         ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, bias: Any
     ) -> Tensor:
-        out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=at_least_float32(q).dtype)
-        for scene, rows, (bias_nM,) in bias.blocks(1, lse.dtype):
+        exact = torch.promote_types(q.dtype, torch.float32)
+        out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=exact)
+        heads = 0 if q.device.type == "cpu" else q.shape[1]  # whose logits `_attend` makes at once
+        for scene, rows, (bias_nM, *_) in bias.blocks(1 + heads, lse.dtype):
             bias.write(queries[scene, rows], tokens[scene], bias_nM)
             out[scene, :, rows], lse[scene, :, rows] = _attend(
                 q[scene, :, rows], k[scene], v[scene], bias_nM

@@ -1,7 +1,9 @@
 """What computes attention with a bias that is a function.
 
-On a CPU blocks do. On CUDA the plain path does, with the bias of all pairs, as long as it fits into
-free memory, as nothing else has been timed there; then kernels in Triton, or blocks without them.
+On a CPU blocks do. On CUDA the plain path does, with the bias of all pairs, as nothing else has
+been timed there, while one layer takes at most 1 / SHARE of the GPU's memory for it: every layer
+keeps its bias for the backward pass. Beyond that kernels in Triton do, or blocks without them. The
+choice goes by sizes alone, so that layers, steps and processes of a training choose alike.
 """
 
 import logging
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
 """plain: torch's attention with the bias of all pairs. blocks: torch, block by block."""
+
+SHARE = 16
 
 _log = logging.getLogger(__name__)
 _forced: list[AttentionKernel] = []
@@ -47,8 +51,8 @@ def chosen_kernel(q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
         return kernel
     if q_BhNd.device.type != "cuda":
         return "blocks"
-    needed, free = plain_bytes(q_BhNd, bias), _free_bytes(q_BhNd.device)
-    if needed <= free:
+    needed = plain_bytes(q_BhNd, bias)
+    if needed * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     hindrance = _hindrance(q_BhNd, bias)
     way = f"blocks in torch, slower than Triton: {hindrance}" if hindrance else "Triton kernels"
@@ -58,7 +62,7 @@ def chosen_kernel(q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
         _log.warning(
             f"attention of {queries:,} queries to {bias.tokens.shape[2]:,} tokens (batch {scenes}, "
             f"{heads} heads) would take {in_words(needed)} for the bias of all pairs and its "
-            f"gradient, and {in_words(free)} of GPU memory are free: it goes through {way}"
+            f"gradient, more than 1/{SHARE} of the GPU's memory: it goes through {way}"
         )
     return "blocks" if hindrance else "triton"
 
@@ -70,12 +74,6 @@ def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
     if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
         each += heads * read
     return scenes * queries * bias.tokens.shape[2] * each
-
-
-def _free_bytes(device: torch.device) -> int:
-    """GPU memory that is free, or kept by torch without use."""
-    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return torch.cuda.mem_get_info(device)[0] + kept
 
 
 def _hindrance(q_BhNd: Tensor, bias: "AttentionBias") -> str | None:

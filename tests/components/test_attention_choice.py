@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs.components import AttentionBias, attention_choice
 from qgs.components.attention_bias import biased_attention
-from qgs.components.attention_choice import attention_kernel, chosen_kernel, plain_bytes
+from qgs.components.attention_choice import SHARE, attention_kernel, chosen_kernel, plain_bytes
 
 
 class Nearness(AttentionBias):
@@ -52,14 +52,12 @@ def _chosen(kernel: Any = "auto", **options: Any) -> str:
 def _nothing_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attention_choice, "_said", set())
     _install(monkeypatch, "3.5.0")
-    _free(monkeypatch, 0)
+    _give(monkeypatch, 0)
 
 
-def _free(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
-    """A GPU of which others hold some, and torch keeps 500 bytes, 300 of them in use."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (size - 200, 10**12))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 500)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 300)
+def _give(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    """A GPU of which a layer may take `size` bytes."""
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, size * SHARE))
 
 
 def _install(monkeypatch: pytest.MonkeyPatch, version: str | None) -> None:
@@ -87,9 +85,9 @@ def test_the_plain_path_is_taken_while_it_fits(
     with torch.set_grad_enabled(trains):
         q, *_, bias = _case(dtype=dtype)
         assert plain_bytes(q, bias) == needed
-        _free(monkeypatch, needed)
+        _give(monkeypatch, needed)
         assert _chosen(dtype=dtype) == "plain"
-        _free(monkeypatch, needed - 1)
+        _give(monkeypatch, needed - 1)
         assert _chosen(dtype=dtype) == "triton"
 
 
@@ -98,7 +96,7 @@ def test_it_says_once_what_does_not_fit(caplog: pytest.LogCaptureFixture) -> Non
         assert [_chosen(), _chosen()] == ["triton", "triton"]
     assert caplog.messages == [
         "attention of 5 queries to 7 tokens (batch 2, 3 heads) would take 1.12 kB for the bias of "
-        "all pairs and its gradient, and 0 bytes of GPU memory are free: it goes through Triton "
+        "all pairs and its gradient, more than 1/16 of the GPU's memory: it goes through Triton "
         "kernels"
     ]
 

@@ -145,9 +145,11 @@ class PhotoScene(EncodedScene):
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
     ) -> np.ndarray:
         """(F, H, W, ...) of what `read` makes of the frames, or made before."""
-        remote = not isinstance(self._frames[frames[0]].path, Path | ArchivePath)
-        with ThreadPoolExecutor(8 if remote else 1) as pool:  # photos that a store sends at a time
-            return np.stack(list(pool.map(partial(self._made, read), frames)))
+        made = partial(self._made, read)
+        if all(isinstance(self._frames[frame].path, Path | ArchivePath) for frame in frames):
+            return np.stack([made(frame) for frame in frames])
+        with ThreadPoolExecutor(8) as pool:  # photos that a store sends at a time
+            return np.stack(list(pool.map(made, frames)))
 
     def _made(self, read: Callable[[PhotoFrame], np.ndarray], frame: int) -> np.ndarray:
         key = self.name, read.__name__, frame

@@ -13,7 +13,7 @@ def value(queries, tokens, step):
     a, b, _, _ = _parts(queries, tokens, step)
     bias = -tl.load(queries + 21) * _squared(a) / _squared(b)
     lower = tl.load(queries + 22)
-    return tl.where(bias > lower, bias, lower)
+    return tl.where(bias <= lower, lower, bias)
 
 
 @jit
@@ -22,7 +22,7 @@ def gradients(queries, tokens, step, gradient, sums):
     a, b, e, u = _parts(queries, tokens, step)
     below, factor, lower = _squared(b), tl.load(queries + 21), tl.load(queries + 22)
     ratio = _squared(a) / below
-    inside = tl.where(-factor * ratio > lower, gradient, 0.0)
+    inside = tl.where(-factor * ratio <= lower, 0.0, gradient)
     up = -2 * factor * inside / below
     down = -up * ratio
     a0, a1, a2 = up * a[0], up * a[1], up * a[2]

@@ -70,4 +70,4 @@ class RayBias(AttentionBias):
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:
     """At least `lower_n1`, to which the gradient goes where it is reached."""
-    return torch.where(bias_nM > lower_n1, bias_nM, lower_n1)
+    return torch.where(bias_nM <= lower_n1, lower_n1, bias_nM)  # so that NaN stays

@@ -12,7 +12,7 @@ def value(queries, tokens, step):
     e0, e1, e2 = _moment(queries, tokens, step)
     bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
     lower = tl.load(queries + 4)
-    return tl.where(bias > lower, bias, lower)
+    return tl.where(bias <= lower, lower, bias)
 
 
 @jit
@@ -22,7 +22,7 @@ def gradients(queries, tokens, step, gradient, sums):
     d0, d1, d2 = tl.load(tokens + 3 * step), tl.load(tokens + 4 * step), tl.load(tokens + 5 * step)
     factor, lower = tl.load(queries + 3), tl.load(queries + 4)
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
-    inside = tl.where(-factor * distance_sq > lower, gradient, 0.0)
+    inside = tl.where(-factor * distance_sq <= lower, 0.0, gradient)
     to_center = -2 * factor * inside
     return (
         sums[0] + tl.sum(to_center * (d1 * e2 - d2 * e1), 1),
