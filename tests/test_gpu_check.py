@@ -85,7 +85,7 @@ def test_kernels_of_attention_are_held_against_float64(
     file = tmp_path / "a.json"
     words = ("--device", "cpu", "--size", "32x64", "--heads", "2", "--json", str(file))
     monkeypatch.setattr(sys, "argv", ["gpu_attention.py", *words])
-    monkeypatch.setattr("gpu_attention.kernels", lambda: [None])
+    monkeypatch.setattr("gpu_attention.KERNELS", [None])
     with pytest.raises(SystemExit) as ended:
         attention()
     assert ended.value.code == 0

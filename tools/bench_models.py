@@ -10,12 +10,10 @@ Prints medians, and medians of the ratios to TokenGS round by round.
 """
 
 import argparse
-import statistics
-import time
-from collections.abc import Callable
 from functools import partial
 
 import torch
+from bench_ray_bias import compare
 from qgs_bench.work import posed_photos
 from torch import Tensor
 
@@ -62,23 +60,6 @@ def backward(model: QueryGaussianModel, photos: Views) -> None:
         parts: list[Tensor] = [gaussians.means, gaussians.scales, gaussians.quats]
         total = total + sum(x.square().mean() for x in [*parts, gaussians.opacities])
     total.backward()
-
-
-def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
-    """Time every run in turn, once a round, and print what came out."""
-    for run in runs.values():
-        run()
-    rows = []
-    for _ in range(rounds):
-        rows.append({})
-        for name, run in runs.items():
-            start = time.perf_counter()
-            run()
-            rows[-1][name] = time.perf_counter() - start
-    for name in runs:
-        median = statistics.median(row[name] for row in rows)
-        ratio = statistics.median(row[name] / row["tokengs"] for row in rows)
-        print(f"  {name:14} {1e3 * median:8.1f} ms   {ratio:.3f}", flush=True)
 
 
 def main() -> None:

@@ -47,14 +47,15 @@ def seconds(run: Callable[[], object]) -> float:
 
 
 def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
-    """Time every run in turn, once a round, and print what came out."""
+    """Time every run in turn, once a round, and print what came out, as ratios to the first."""
     for run in runs.values():
         run()
+    first = next(iter(runs))
     times = [{name: seconds(run) for name, run in runs.items()} for _ in range(rounds)]
     for name in runs:
         median = statistics.median(row[name] for row in times)
-        ratio = statistics.median(row[name] / row["locus"] for row in times)
-        print(f"  {name:18} {1e3 * median:8.2f} ms   {ratio:6.2f}")
+        ratio = statistics.median(row[name] / row[first] for row in times)
+        print(f"  {name:18} {1e3 * median:8.2f} ms   {ratio:6.3f}", flush=True)
 
 
 def main() -> None:

@@ -8,7 +8,6 @@ and peak memory of forward and backward at full size, beside attention without a
 """
 
 import argparse
-import inspect
 import json
 import statistics
 import time
@@ -22,14 +21,10 @@ from qgs_locus.ray_bias import RayBias
 from torch import Tensor
 
 from qgs.components.attention_bias import biased_attention
+from qgs.components.attention_choice import AttentionKernel
 
+KERNELS: tuple[AttentionKernel, ...] = ("plain", "blocks", "triton")
 CLAMPS = {"none": -1e9, "some": -5.0, "all": -1e-9}
-
-
-def kernels() -> list[str | None]:
-    """Names that `biased_attention` takes as its `kernel`; None where it has no such choice."""
-    given = "kernel" in inspect.signature(biased_attention).parameters
-    return ["plain", "blocks", "triton"] if given else [None]
 
 
 def leaves(
@@ -59,10 +54,11 @@ def rays(tokens: int, device: str, dtype: torch.dtype) -> Tensor:
     return lines.mT[None].contiguous().to(device, dtype)
 
 
-def attend(given: dict[str, Tensor], lines: Tensor, lowest: float, kernel: str | None) -> Tensor:
+def attend(
+    given: dict[str, Tensor], lines: Tensor, lowest: float, kernel: AttentionKernel
+) -> Tensor:
     bias = RayBias.of(given["center"], given["sigma"] ** 2, lines, lowest, given["gamma"])
-    options: dict[str, Any] = {} if kernel is None else {"kernel": kernel}
-    return biased_attention(given["q"], given["k"], given["v"], bias, **options)
+    return biased_attention(given["q"], given["k"], given["v"], bias, kernel)
 
 
 def exact(given: dict[str, Tensor], lines: Tensor, lowest: float) -> Tensor:
@@ -75,7 +71,7 @@ def exact(given: dict[str, Tensor], lines: Tensor, lowest: float) -> Tensor:
     return logits.softmax(-1) @ given["v"]
 
 
-def errors(kernel: str | None, clamp: str, device: str, heads: int) -> dict[str, float]:
+def errors(kernel: AttentionKernel, clamp: str, device: str, heads: int) -> dict[str, float]:
     """Largest |difference| of output and gradients, as a share of the largest true value.
 
     Of one that is at least 0.01: where all pairs are clamped the bias has no gradient but rounding.
@@ -126,8 +122,8 @@ def main() -> None:
     device, heads = options.device, options.heads
     rows: list[dict[str, Any]] = []
     failed = False
-    for kernel in kernels():
-        row: dict[str, Any] = {"kernel": kernel or "the only one"}
+    for kernel in KERNELS:
+        row: dict[str, Any] = {"kernel": kernel}
         try:
             for clamp in CLAMPS:
                 worst = max(errors(kernel, clamp, device, heads).items(), key=lambda x: x[1])
@@ -136,7 +132,9 @@ def main() -> None:
             given = leaves((heads, queries, tokens), device, torch.float32)
             lines = rays(tokens, device, torch.float32)
 
-            def run(kernel: str | None = kernel, given: Any = given, lines: Any = lines) -> None:
+            def run(
+                kernel: AttentionKernel = kernel, given: Any = given, lines: Any = lines
+            ) -> None:
                 attend(given, lines, -5.0, kernel).sum().backward()
 
             row["ms"], row["MiB"] = (round(x, 1) for x in timed(run, device))

@@ -1,9 +1,9 @@
 """Attention with a bias that is a function of query and token, computed block by block.
 
 The logits are q k / sqrt(d) + b. Neither they, nor b, nor their gradients ever exist for all N x M
-pairs, only for some queries and all tokens at a time: a block. The backward pass
-makes b and the weights p = exp(logits - lse) again from the log-sum-exp of each query
-(FlashAttention, arXiv 2205.14135, section 3.1, whose blocks are of tokens too).
+pairs, only for some queries and all tokens at a time: a block. The backward pass makes b and the
+weights p = exp(logits - lse) again from the log-sum-exp of each query (FlashAttention, arXiv
+2205.14135, section 3.1, whose blocks are of tokens too).
 
 Axes: F numbers of a query, G numbers of a token, n queries of a block.
 """

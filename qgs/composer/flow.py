@@ -96,7 +96,8 @@ def without_idle_sublayers(parts: Parts, depth: int, problems: Problems) -> Part
     places = [(*decoder, "layers", str(index)) for index in range(depth)]
     classes: list[Any] = [part.component for place in places if (part := parts[(*place, "layer")])]
     read = {(*decoder, name) for component in classes for name in component.sublayers}
-    for place, layer in [(place, parts[(*place, "layer")]) for place in places]:
+    for place in places:
+        layer = parts[(*place, "layer")]
         if layer is None:
             continue
         for name in _absent_sublayers(layer):

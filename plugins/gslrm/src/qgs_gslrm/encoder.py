@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from qgs.components import NORM_EPS
 from qgs.components.blocks import merge_heads, split_heads
+from qgs.components.encoder import undivided
 from qgs.contracts import (
     MEMORY_FIELDS,
     ComponentConfig,
@@ -96,14 +97,7 @@ class Transformer(Encoder):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """A patch that does not divide the images."""
-        size, patch = context.image_size, config.patch_size
-        if size and any(side % patch for side in size):
-            nearest = [max(round(side / patch), 1) * patch for side in size]
-            yield Problem(
-                "patch_size",
-                f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
-                f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
-            )
+        return undivided(config.patch_size, context)
 
     def forward(self, views: Views) -> ImageMemory:
         """Features (B, M, D), before any last norm, which belongs to the head.
