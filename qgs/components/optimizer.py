@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 from torch.optim import AdamW
@@ -16,7 +16,7 @@ Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
 class OneCycleAdamW(Optimizer):
-    """AdamW; the learning rate rises along a cosine and falls along another (LocusGS release).
+    """AdamW; the learning rate rises and falls along cosines (LocusGS release), or rises on a line.
 
     The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that
     comes first. The fall follows the fraction of the budget that is used, the larger of steps and
@@ -30,13 +30,15 @@ class OneCycleAdamW(Optimizer):
         """The learning rate, and AdamW's own options."""
 
         learning_rate: float = Field(default=4e-4, gt=0)
-        """Peak of the one-cycle cosine."""
+        """The peak, at the end of the warm-up."""
         warmup: int = Field(default=2000, ge=0)
         """Optimiser steps up to the peak."""
+        warmup_shape: Literal["cosine", "linear"] = "cosine"
+        """How the rate rises to the peak."""
         initial_divisor: float = Field(default=25.0, ge=1)
         """Peak over first rate."""
-        final_divisor: float = Field(default=1000.0, ge=1)
-        """First rate over last rate, as in torch's OneCycleLR."""
+        final_divisor: float = Field(default=1000.0, gt=0)
+        """First rate over last rate, as in torch's OneCycleLR; below 1 the last one is larger."""
         betas: tuple[Decay, Decay] = (0.9, 0.95)
         """AdamW's decay rates of the averages of gradients and of their squares."""
         weight_decay: float = Field(default=0.05, ge=0)
@@ -71,6 +73,8 @@ class OneCycleAdamW(Optimizer):
             top = self.options.warmup - 1
             warmed = max(step / top if top > 0 else 1.0, of_seconds / WARMUP_TIME)
             if warmed < 1:
+                if self.options.warmup_shape == "linear":
+                    return self.first + (self.peak - self.first) * warmed
                 return _cosine(self.first, self.peak, warmed)
             self._descent_starts = used
         left = 1 - self._descent_starts

@@ -301,7 +301,7 @@ def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[
         inner = [models_in(field.annotation) for name, field, _ in fields if name == step]
         tagged = {m for _, field, m in fields if step in get_args(field.annotation)}
         models = set().union(*inner) or tagged or models
-    return {field.alias or name for model in models for name, field in model.model_fields.items()}
+    return {name for model in models for name in model.model_fields}
 
 
 def models_in(annotation: Any) -> set[type[BaseModel]]:

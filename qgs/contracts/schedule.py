@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from types import UnionType
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, Union, get_args, get_origin
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from qgs.contracts.component import Component, ComponentConfig, OptionError
 
@@ -19,8 +19,6 @@ END = 2**53
 
 class Schedule(ComponentConfig):
     """A number as a function of the optimiser steps that were made: 0 in the first step."""
-
-    model_config = ConfigDict(serialize_by_alias=True)
 
     schedule: str
     """What kind of schedule it is."""
@@ -60,9 +58,7 @@ class Steps(Schedule):
 
     @model_validator(mode="after")
     def _one_value_more(self) -> Self:
-        steps, count = list(self.at), len(self.values)
-        if steps != sorted(set(steps)):
-            raise OptionError(f"`at` must ascend, got {steps}", f"write {sorted(set(steps))}")
+        steps, count = _ascending(self.at), len(self.values)
         if count != len(steps) + 1:
             reason = f"{len(steps)} steps in `at` part {len(steps) + 1} values, got {count}"
             raise OptionError(reason, "give one value more than steps; the first holds from 0")
@@ -79,39 +75,45 @@ class Steps(Schedule):
 
 
 class Linear(Schedule):
-    """From one number to another over a range of steps; constant before and after."""
+    """From each number to the next one over a range of steps; constant before and after."""
 
     schedule: Literal["linear", "cosine"]
-    """From one number to another on a line, or on half a cosine, which is slow at both ends."""
-    start: float = Field(alias="from")
-    """The number until the first of the steps in `over`."""
-    end: float = Field(alias="to")
-    """The number from the last of the steps in `over` on."""
-    over: tuple[Step, Step]
-    """[first, last] step of the change."""
+    """From number to number on lines, or on halves of a cosine, which are slow at both ends."""
+    values: tuple[float, ...] = Field(min_length=2)
+    """The numbers at the steps in `at`: the first also before, the last also after them."""
+    at: tuple[Step, ...]
+    """Steps, ascending, one for each of `values`."""
 
     @model_validator(mode="after")
-    def _takes_time(self) -> Self:
-        first, last = self.over
-        if first >= last:
-            reason = f"`over` must be [first, last] with first < last, got [{first}, {last}]"
-            raise OptionError(reason, "for a jump, write `schedule: steps`")
+    def _one_step_each(self) -> Self:
+        steps, count = _ascending(self.at), len(self.values)
+        if count != len(steps):
+            reason = f"{count} values need {count} steps in `at`, got {len(steps)}"
+            raise OptionError(reason, "give a step for each value; for jumps, `schedule: steps`")
         return self
 
     def number(self, step: int) -> float:
         """See `Schedule`."""
-        first, last = self.over
-        if step <= first or step >= last:
-            return self.start if step <= first else self.end
+        after = bisect_right(self.at, step)
+        if after in (0, len(self.at)):
+            return self.values[min(after, len(self.at) - 1)]
+        (first, last), (start, end) = self.at[after - 1 : after + 1], self.values[after - 1 :][:2]
         share = (step - first) / (last - first)
         if self.schedule == "cosine":
             share = (1 - math.cos(math.pi * share)) / 2
-        return (1 - share) * self.start + share * self.end
+        return (1 - share) * start + share * end
 
     @property
     def corners(self) -> tuple[int, ...]:
         """See `Schedule`."""
-        return self.over
+        return self.at
+
+
+def _ascending(at: tuple[int, ...]) -> list[int]:
+    """The steps; raises OptionError where they do not ascend."""
+    if (steps := list(at)) != sorted(set(steps)):
+        raise OptionError(f"`at` must ascend, got {steps}", f"write {sorted(set(steps))}")
+    return steps
 
 
 SCHEDULES: Mapping[str, type[Schedule]] = {

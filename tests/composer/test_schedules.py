@@ -19,7 +19,7 @@ from qgs.contracts.schedule import SCHEDULES, at_step, follow, number_kinds
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 DILATION = "model.renderer.dilation"
-RAMP = "{schedule: linear, from: 10, to: 0.5, over: [100, 200]}"
+RAMP = "{schedule: linear, values: [10, 0.5], at: [100, 200]}"
 FALL = "{schedule: steps, values: [10, 3, 0.3], at: [10, 20]}"
 
 
@@ -32,12 +32,16 @@ def tiny(*overrides: str) -> Recipe:
     [
         ({"schedule": "constant", "value": 2}, {0: 2, 10**9: 2}),
         (
-            {"schedule": "linear", "from": 10, "to": 0, "over": [100, 200]},
+            {"schedule": "linear", "values": [10, 0], "at": [100, 200]},
             {0: 10, 100: 10, 101: 9.9, 150: 5, 199: 0.1, 200: 0, 10**9: 0},
         ),
         (
-            {"schedule": "cosine", "from": 1, "to": 3, "over": [0, 4]},
+            {"schedule": "cosine", "values": [1, 3], "at": [0, 4]},
             {0: 1, 1: 2 - math.sqrt(0.5), 2: 2, 3: 2 + math.sqrt(0.5), 4: 3, 5: 3},
+        ),
+        (
+            {"schedule": "linear", "values": [0, 1, 1, 3], "at": [10, 20, 40, 60]},
+            {0: 0, 10: 0, 15: 0.5, 20: 1, 30: 1, 40: 1, 50: 2, 60: 3, 61: 3},
         ),
         (
             {"schedule": "steps", "values": [10, 3, 1], "at": [5, 7]},
@@ -54,7 +58,7 @@ def test_a_resolved_recipe_shows_it_and_resolves_to_the_same() -> None:
     recipe = tiny(f"{DILATION}={RAMP}", f"losses.photometric.ssim_weight={FALL}")
     text = annotated(recipe)
     assert [line.split("#")[0].strip() for line in text.splitlines() if "--set" in line] == [
-        *("schedule: linear", "from: 10.0", "to: 0.5", "over: [100, 200]"),
+        *("schedule: linear", "values: [10.0, 0.5]", "at: [100, 200]"),
         *("schedule: steps", "values: [10.0, 3.0, 0.3]", "at: [10, 20]"),
     ]
     again = resolve(yaml.safe_load(text))
@@ -67,8 +71,8 @@ def test_a_resolved_recipe_shows_it_and_resolves_to_the_same() -> None:
 def test_another_schedule_replaces_the_one_below_whole() -> None:
     recipe = tiny(f"{DILATION}={RAMP}", f"{DILATION}={FALL}")
     assert recipe.tree["model"]["renderer"]["dilation"]["at"] == [10, 20]
-    recipe = tiny(f"{DILATION}={RAMP}", f"{DILATION}.to=1")
-    assert recipe.tree["model"]["renderer"]["dilation"]["over"] == [100, 200]
+    recipe = tiny(f"{DILATION}={RAMP}", f"{DILATION}.values=[10, 1]")
+    assert recipe.tree["model"]["renderer"]["dilation"]["at"] == [100, 200]
     assert tiny(f"{DILATION}={RAMP}", f"{DILATION}=1").schedules == {}
 
 
@@ -81,19 +85,24 @@ def test_another_schedule_replaces_the_one_below_whole() -> None:
         ),
         ("optimizer.learning_rate={schedule: constant, value: 3}", "(options that can: none)"),
         ("losses.visibility.clamp={schedule: constant, value: 3}", "(options that can: weight)"),
-        (f"{DILATION}={{schedule: linaer, from: 1, to: 2, over: [1, 2]}}", "mean `linear`?"),
+        (f"{DILATION}={{schedule: linaer, values: [1, 2], at: [1, 2]}}", "mean `linear`?"),
         (
-            f"{DILATION}={{from: 1, to: 2, over: [1, 2]}}",
+            f"{DILATION}={{values: [1, 2], at: [1, 2]}}",
             "schedules: constant, cosine, linear, steps",
         ),
-        (f"{DILATION}={{schedule: linear, from: 1, over: [1, 2]}}", "`to` is missing"),
-        (f"{DILATION}={{schedule: linear, from: 1, too: 2, over: [1, 2]}}", "did you mean `to`?"),
-        (f"{DILATION}={{schedule: linear, from: 1, to: 2, over: [2, 2]}}", "first < last"),
+        (f"{DILATION}={{schedule: linear, at: [1, 2]}}", "`values` is missing"),
+        (f"{DILATION}={{schedule: linear, value: [1, 2], at: [1, 2]}}", "did you mean `values`?"),
+        (f"{DILATION}={{schedule: linear, values: [1], at: [1]}}", "at least 2"),
+        (
+            f"{DILATION}={{schedule: cosine, values: [1, 2], at: [1]}}",
+            "need 2 steps in `at`, got 1",
+        ),
+        (f"{DILATION}={{schedule: linear, values: [1, 2], at: [2, 2]}}", "write [2]"),
         (f"{DILATION}={{schedule: steps, values: [1, 2], at: [3, 2]}}", "write [2, 3]"),
         (f"{DILATION}={{schedule: steps, values: [1, 2], at: [2, 3]}}", "part 3 values, got 2"),
-        (f"{DILATION}={{schedule: linear, from: 1, to: -2, over: [1, 2]}}", "got the number -2"),
+        (f"{DILATION}={{schedule: linear, values: [1, -2], at: [1, 2]}}", "got the number -2"),
         (f"{DILATION}={{schedule: steps, values: [1, -2, 1], at: [2, 3]}}", "got the number -2"),
-        ("model.renderer.near={schedule: linear, from: 1, to: 200, over: [0, 9]}", "near 200 and"),
+        ("model.renderer.near={schedule: linear, values: [1, 200], at: [0, 9]}", "near 200 and"),
         ("training.clip={schedule: constant, value: 3}", "must be a valid number, got a mapping"),
     ],
 )
@@ -105,7 +114,7 @@ def test_what_cannot_be_is_refused(override: str, seen: str) -> None:
 
 
 def test_limits_hold_up_to_the_last_step_before_a_jump() -> None:
-    near = "model.renderer.near={schedule: linear, from: 0.025, to: 10, over: [0, 100]}"
+    near = "model.renderer.near={schedule: linear, values: [0.025, 10], at: [0, 100]}"
     far = "model.renderer.far={{schedule: steps, values: [{}, 100], at: [100]}}"
     with pytest.raises(RecipeError, match=r"near 9\.9\d* and far 5"):
         tiny(near, far.format(5))
@@ -142,8 +151,8 @@ PLUGIN = qgs.Plugin("mine", qgs.CONTRACT_VERSION, (Blend,))
 
 
 def test_components_of_layers_follow_too_and_whole_numbers_are_rounded() -> None:
-    level = "{schedule: linear, from: 1, to: 4, over: [0, 10]}"
-    share = "{schedule: cosine, from: 0, to: 1, over: [0, 10]}"
+    level = "{schedule: linear, values: [1, 4], at: [0, 10]}"
+    share = "{schedule: cosine, values: [0, 1], at: [0, 10]}"
     options = f"model.decoder.feed_forward={{type: mine/blend, level: {level}, share: {share}}}"
     own = "model.decoder.layers.1.feed_forward={level: {schedule: constant, value: 7}}"
     recipe = resolve(
@@ -157,7 +166,7 @@ def test_components_of_layers_follow_too_and_whole_numbers_are_rounded() -> None
         assert [config.level for config in configs] == [wanted, 7, wanted, wanted]
         assert type(configs[0].level) is int
         assert 0 <= configs[0].share <= 1
-    half = options.replace("to: 4", "to: 4.5")
+    half = options.replace("[1, 4]", "[1, 4.5]")
     with pytest.raises(RecipeError, match="must be a valid integer"):
         resolve(RECIPES / "tiny" / "tokengs.yaml", ["plugins=[rooms, mine]", half], [PLUGIN])
 

@@ -77,7 +77,7 @@ def test_null_drops_what_is_inherited(schema):
 
 
 def test_schedules_validate_where_options_may_follow(schema):
-    ramp = {"schedule": "cosine", "from": 1, "to": 0.1, "over": [0, 100]}
+    ramp = {"schedule": "cosine", "values": [1, 0.1], "at": [0, 100]}
     jumps = {"schedule": "steps", "values": [10, 1], "at": [100]}
     recipe = {
         "model": {"renderer": {"dilation": jumps, "far": ramp}},

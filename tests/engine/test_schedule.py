@@ -50,6 +50,15 @@ def test_a_time_budget_takes_over_when_it_runs_out_first(
     assert rates[-1] == pytest.approx(schedule.last)
 
 
+def test_a_linear_warm_up_and_an_end_above_the_first_rate() -> None:
+    options = {"warmup_shape": "linear", "initial_divisor": 1000.0, "final_divisor": 0.01}
+    config = OneCycleAdamW.Config(warmup=11, learning_rate=1e-4, **options)
+    schedule = OneCycleAdamW(config, TrainingConfig(steps=100))
+    rates = [schedule.learning_rate(step, 0.0) for step in range(100)]
+    assert rates[:11] == pytest.approx([1e-7 + (1e-4 - 1e-7) * step / 10 for step in range(11)])
+    assert rates[-1] == pytest.approx(1e-5)
+
+
 def test_a_warm_up_that_never_ends_is_refused() -> None:
     with pytest.raises(ValueError, match=r"optimizer\.warmup is 10, but training\.steps is 10"):
         adamw(10, 10)

@@ -16,7 +16,7 @@ from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering
 
 SCHEDULED = (
     "model.renderer.dilation={schedule: steps, values: [4, 2, 1], at: [1, 3]}",
-    "losses.photometric.ssim_weight={schedule: linear, from: 0.4, to: 0, over: [0, 4]}",
+    "losses.photometric.ssim_weight={schedule: linear, values: [0.4, 0], at: [0, 4]}",
 )
 
 
@@ -56,8 +56,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tiny: Tiny, tmp_path: Path) -
     assert same(weights(parts), weights(whole))
     judged = [read_jsonl(tmp_path / name / "evaluations.jsonl") for name in ("whole", "parts")]
     assert judged[0] == judged[1]
-    other = tiny("locus", *SCHEDULED, "losses.photometric.ssim_weight.to=0.1")
-    with pytest.raises(ValueError, match=r"ssim_weight\.to"):
+    other = tiny("locus", *SCHEDULED, "losses.photometric.ssim_weight.values=[0.4, 0.1]")
+    with pytest.raises(ValueError, match=r"ssim_weight\.values"):
         run(other, tmp_path / "parts", resume=True)
 
 

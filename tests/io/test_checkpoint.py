@@ -185,7 +185,7 @@ def test_extra_metadata_comes_back(model: QueryGaussianModel, tmp_path: Path) ->
 
 def test_a_model_without_a_step_is_saved_without_one(tmp_path: Path) -> None:
     """As an imported one: what follows the training is at its end, in every copy."""
-    ramp = "model.renderer.dilation={schedule: linear, from: 10, to: 0.5, over: [1, 9]}"
+    ramp = "model.renderer.dilation={schedule: linear, values: [10, 0.5], at: [1, 9]}"
     recipe = resolve(RECIPES / "tokengs.yaml", [*SMALL, ramp])
     first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
     tensors = {k: x.detach() for k, x in unique_tensors(recipe.build_model()).items()}

@@ -48,7 +48,13 @@ def test_published_training() -> None:
     level = schedules["level"]
     numbers = {step: level.number(step) for step in (0, 9_999, 12_000, 22_000, 52_000, 219_999)}
     assert list(numbers.values()) == [0, 0, 1, 2, 3, 3]
-    assert [level.number(s) for s in (10_000, 11_000, 20_999, 51_800)] == [0.125, 0.625, 1.5, 3]
+    assert [level.number(s) for s in (10_000, 10_500, 15_000, 21_500, 51_000)] == [
+        0,
+        0.25,
+        1,
+        1.75,
+        2.5,
+    ]
     optimizer = recipe.tree["optimizer"]
     assert optimizer["initial_divisor"] * optimizer["final_divisor"] == 50
     assert optimizer["warmup"] == 0.03 * recipe.training.steps
@@ -86,7 +92,7 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
     assert "has no slot `cross_attention`" in told
     told = refused("model.head.level=5")
     assert "2^5 Gaussians cannot be merged of 16" in told
-    told = refused("model.head.level={schedule: linear, from: 0, to: 4.5, over: [1, 9]}")
+    told = refused("model.head.level={schedule: linear, values: [0, 4.5], at: [1, 9]}")
     assert "2^4.5 Gaussians cannot be merged of 16" in told
     told = refused("model.queries.extra=256")
     assert "all 256 tokens are extra ones" in told
