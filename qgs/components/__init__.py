@@ -2,7 +2,7 @@
 
 from qgs.components.attention_bias import AttentionBias, Kernel
 from qgs.components.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
-from qgs.components.centers import FreeCenters, posact
+from qgs.components.centers import FreeCenters, OffsetCenters, posact
 from qgs.components.decoder import (
     ContentCrossAttention,
     ContentSelfAttention,
@@ -37,6 +37,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     NoRefinement,
     GaussianHead,
     FreeCenters,
+    OffsetCenters,
     LayerSupervision,
     OnePass,
     OneCycleAdamW,
@@ -66,6 +67,7 @@ __all__ = [
     "MultiViewViT",
     "MultiscaleViT",
     "NoRefinement",
+    "OffsetCenters",
     "OneCycleAdamW",
     "OnePass",
     "SelfAttentionCore",

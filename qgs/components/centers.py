@@ -1,4 +1,4 @@
-"""`qgs/free`: means straight from the head's offsets, anywhere in the world (TokenGS)."""
+"""`qgs/free` (TokenGS), `qgs/offset`: means from the head's offsets, anywhere in the world."""
 
 import math
 from typing import ClassVar
@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Centers, ComponentConfig
-from qgs.geometry.precision import full_precision
+from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import QueryState
 
 
@@ -48,4 +48,23 @@ class FreeCenters(Centers):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         means = posact(offsets, self.config.input_limit, self.config.output_limit)
-        return means + torch.tensor([0.0, 0.0, self.config.z_offset]).to(means)
+        return _further(means, self.config.z_offset)
+
+
+class OffsetCenters(Centers):
+    """mean = offset + (0, 0, z_offset)."""
+
+    name: ClassVar[str] = "offset"
+
+    class Config(ComponentConfig):
+        z_offset: float = 1.0
+        """Added to z, world units (1 in C3G, 1.5 in GlobalSplat)."""
+
+    config: Config
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        return _further(at_least_float32(offsets), self.config.z_offset)
+
+
+def _further(means: Tensor, z: float) -> Tensor:
+    return means + torch.tensor([0.0, 0.0, z]).to(means)

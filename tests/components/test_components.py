@@ -12,6 +12,7 @@ from qgs.components import (
     GaussianHead,
     LayerSupervision,
     MultiViewViT,
+    OffsetCenters,
     posact,
 )
 from qgs.contracts import AttentionWeights, ModelDims, RecipeContext
@@ -95,6 +96,15 @@ def test_free_centers_ignore_the_state() -> None:
     offsets = torch.randn(1, 2, 3, 3)
     means = centers(offsets, QueryState(torch.zeros(1, 2, 16)))
     torch.testing.assert_close(means, posact(offsets) + torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_offset_centers_are_the_offsets_further_along_z_in_float32() -> None:
+    offsets = torch.randn(2, 5, 1, 3, dtype=torch.bfloat16)
+    state = QueryState(torch.zeros(2, 5, 16))
+    for z in (1.0, 1.5, -2.0):
+        means = OffsetCenters(OffsetCenters.Config(z_offset=z), DIMS)(offsets, state)
+        assert means.dtype == torch.float32
+        assert torch.equal(means, offsets.float() + torch.tensor([0.0, 0.0, z]))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_c3g.head import C3GHead, OffsetCenters
+from qgs_c3g.head import C3GHead
 from qgs_c3g.joint import JointLayer
 from torch import Tensor
 
@@ -133,15 +133,6 @@ def test_the_head_starts_as_published() -> None:
     bound = 1 / math.sqrt(16)
     assert 0.5 * bound < head.linear.weight.abs().max() <= bound
     assert head.config.scale_unit == 1e-3
-
-
-def test_centres_stand_before_the_first_camera() -> None:
-    offsets = torch.randn(2, 5, 1, 3, dtype=torch.bfloat16)
-    means = OffsetCenters(OffsetCenters.Config(), DIMS)(offsets, state())
-    assert means.dtype == torch.float32
-    assert torch.equal(means, offsets.float() + torch.tensor([0.0, 0.0, 1.0]))
-    moved = OffsetCenters(OffsetCenters.Config(z_offset=-2.0), DIMS)(offsets, state())
-    assert torch.equal(moved, offsets.float() + torch.tensor([0.0, 0.0, -2.0]))
 
 
 def test_weight_decay_is_on_all_parameters() -> None:

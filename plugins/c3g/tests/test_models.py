@@ -81,7 +81,7 @@ def recipe(decoder: Any = OWN_LAYER, **model: Any) -> dict[str, Any]:
         "queries": {"count": 6},
         "decoder": decoder,
         "head": {"type": "c3g/head"},
-        "centers": {"type": "c3g/offset"},
+        "centers": {"type": "qgs/offset"},
         "supervision": {"layers": [2]},
         "renderer": {"type": "qgs/torch"},
     }
@@ -153,7 +153,7 @@ QUERIES = ("qgs/latent", "locus/anchored", "ellipsoid/anchored")
 REFINEMENTS = ("qgs/none", "locus/refine", "ellipsoid/refine")
 CENTERS = (
     "qgs/free",
-    "c3g/offset",
+    "qgs/offset",
     "locus/anchor_offset",
     "locus/radius_scaled",
     "ellipsoid/axis_scaled",

@@ -164,7 +164,7 @@ def written(weights: Path) -> dict[str, Any]:
             "queries": {"count": 6},
             "decoder": {"depth": 1, "layer": {"type": "c3g/joint"}},
             "head": {"type": "c3g/head"},
-            "centers": {"type": "c3g/offset"},
+            "centers": {"type": "qgs/offset"},
             "supervision": {"layers": [1]},
             "renderer": {"type": "qgs/torch"},
         },

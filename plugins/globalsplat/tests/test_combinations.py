@@ -40,7 +40,7 @@ HEADS: dict[str, dict[str, Any]] = {
 CENTERS: dict[str, dict[str, Any]] = {
     "qgs": {"type": "qgs/free"},
     "locus": {"type": "locus/radius_scaled"},
-    "globalsplat": {"type": "globalsplat/shifted"},
+    "globalsplat": {"type": "qgs/offset", "z_offset": 1.5},
 }
 
 

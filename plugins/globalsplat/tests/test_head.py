@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from globalsplat_inputs import DIMS, state
-from qgs_globalsplat.head import MergingHead, ShiftedCenters
+from qgs_globalsplat.head import MergingHead
 from qgs_globalsplat.merging import merged, rotation_6d
 from qgs_globalsplat.slots import TEXTURE
 from torch import Tensor
@@ -185,9 +185,3 @@ def test_options_that_do_not_fit_are_refused() -> None:
     assert not told(candidates=4, level=2)
     with pytest.raises(ValueError, match="must be a power of two, got 12; write 16"):
         MergingHead.Config(candidates=12)
-
-
-def test_centres_are_shifted_along_z() -> None:
-    centers, offsets = ShiftedCenters(ShiftedCenters.Config(), DIMS), torch.randn(2, 5, 8, 3)
-    means = centers(offsets, state())
-    assert torch.equal(means, offsets + torch.tensor([0, 0, 1.5]))

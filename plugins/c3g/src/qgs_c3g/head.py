@@ -1,4 +1,4 @@
-"""`c3g/head`, `c3g/offset`: from a query to its Gaussian, one by default (C3G)."""
+"""`c3g/head`: from a query to its Gaussian, one by default (C3G)."""
 
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import NORM_EPS
-from qgs.contracts import Centers, ComponentConfig, Head, ModelDims
+from qgs.contracts import ComponentConfig, Head, ModelDims
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32
 from qgs.types import GaussianAttributes, QueryState
@@ -64,20 +64,3 @@ class C3GHead(Head):
             opacities=torch.sigmoid(opacity[..., 0]),
             colors=(0.5 + SH_C0 * sh).clamp(0, 1),
         )
-
-
-class OffsetCenters(Centers):
-    """mean = offset + (0, 0, z_offset), in front of the first camera (C3G)."""
-
-    name: ClassVar[str] = "offset"
-
-    class Config(ComponentConfig):
-        z_offset: float = 1.0
-        """Added to z, world units."""
-
-    config: Config
-
-    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
-        means = at_least_float32(offsets)
-        return means + torch.tensor([0.0, 0.0, self.config.z_offset]).to(means)

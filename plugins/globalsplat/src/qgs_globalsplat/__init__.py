@@ -2,7 +2,7 @@
 
 from qgs.contracts import ExpectedError, Plugin
 from qgs_globalsplat.encoder import PatchEncoder
-from qgs_globalsplat.head import MergingHead, ShiftedCenters
+from qgs_globalsplat.head import MergingHead
 from qgs_globalsplat.losses import Frustum, Regularisers
 from qgs_globalsplat.objective import TwoPasses
 from qgs_globalsplat.rounds import Round
@@ -16,7 +16,6 @@ plugin = Plugin(
         SlotQueries,
         Round,
         MergingHead,
-        ShiftedCenters,
         Frustum,
         Regularisers,
         TwoPasses,

@@ -1,4 +1,4 @@
-"""`globalsplat/merging_head`, `globalsplat/shifted`: from two streams to Gaussians."""
+"""`globalsplat/merging_head`: from two streams to Gaussians."""
 
 import math
 from collections.abc import Iterable
@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from qgs.contracts import (
     GAUSSIAN_FIELDS,
-    Centers,
     ComponentConfig,
     Fields,
     Head,
@@ -163,20 +162,3 @@ class MergingHead(Head):
             colors=0.5 + SH_C0 * sh_BNKC3[..., 0, :],
             sh=sh_BNKC3[..., 1:, :] if self.config.sh_degree else None,
         )
-
-
-class ShiftedCenters(Centers):
-    """mean = offset + (0, 0, z_offset)."""
-
-    name: ClassVar[str] = "shifted"
-
-    class Config(ComponentConfig):
-        z_offset: float = 1.5
-        """Added to z, world units."""
-
-    config: Config
-
-    @full_precision
-    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
-        return offsets + offsets.new_tensor([0.0, 0.0, self.config.z_offset])
