@@ -7,7 +7,7 @@
 CHUNKS holds RealEstate10K-style chunks in train/ and test/. OUT/SCENE/train gets all but one scene.
 OUT/SCENE/test gets that one, once for each window of 13 frames: every fourth is an input, the ones
 half way between are targets (a shorter scene has one window, of every other frame). A study is
-recipes/studies/tiny/photos.yaml with these paths.
+recipes/studies/photos/scene_left_out.yaml with these paths.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from upath import UPath
 from qgs.data.chunk_files import list_scenes, load_chunk
 from qgs.io.files import write_text
 
-STUDY = Path(__file__).parents[1] / "recipes" / "studies" / "tiny" / "photos.yaml"
+STUDY = Path(__file__).parents[1] / "recipes" / "studies" / "photos" / "scene_left_out.yaml"
 INPUTS = 4
 
 
