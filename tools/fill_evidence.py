@@ -4,16 +4,22 @@
 
 FOLDER holds a folder of each study, as `qgs study ... --out FOLDER/NAME` left it. A region of the
 page from `<!-- study: NAME -->` to `<!-- end -->` becomes the answer and the tables of table.md
-there; where a study has several evaluations, their tables become one, of mean PSNR. A study without
-a folder keeps what the page has, and a line says so.
+there; where a study has several evaluations, their tables become one, of mean PSNR. Figures go to
+docs/images/evidence_NAME.webp: the study's, or lines over evaluations that are called WHAT_NUMBER.
+A study without a folder keeps what the page has, and a line says so.
 """
 
 import argparse
 import csv
 import re
+from io import BytesIO
 from pathlib import Path
 
-from qgs.io.files import write_text
+from matplotlib.figure import Figure
+from PIL import Image
+
+from qgs.drawing.figures import categorical, figure_style, hex_color
+from qgs.io.files import replacing, write_text
 
 PAGE = Path(__file__).parents[1] / "docs" / "evidence.md"
 REGION = re.compile(r"(<!-- study: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -25,21 +31,55 @@ def table(text: str) -> str:
     return "\n".join(re.sub(r"\|( :?)-+(:?) (?=\|)", r"|\1---\2 ", line) for line in lines) + "\n"
 
 
-def by_evaluation(file: Path) -> str:
+def means(study: Path) -> dict[str, dict[str, tuple[float, float]]]:
+    """PSNR, mean and standard deviation over seeds, by evaluation and variant."""
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    with (study / "table.csv").open(encoding="utf-8") as lines:
+        for row in csv.DictReader(lines):
+            if row["metric"] == "psnr" and row["evaluation"]:
+                of_all = found.setdefault(row["evaluation"], {})
+                of_all[row["variant"]] = float(row["mean"]), float(row["sd"])
+    return found
+
+
+def by_evaluation(study: Path) -> str:
     """Mean PSNR and its standard deviation over seeds, of every variant in every evaluation."""
-    with file.open(encoding="utf-8") as lines:
-        rows = [row for row in csv.DictReader(lines) if row["metric"] == "psnr"]
-    cells: dict[str, dict[str, str]] = {}
-    for row in rows:
-        mean = f"{float(row['mean']):.2f} ({float(row['sd']):.2f})"
-        cells.setdefault(row["evaluation"], {})[row["variant"]] = mean
-    variants = list(dict.fromkeys(row["variant"] for row in rows))
-    heading = f"| PSNR (sd) | {' | '.join(variants)} |\n|---|{'--:|' * len(variants)}\n"
-    of_all = {name: found for name, found in cells.items() if name}
-    return heading + "".join(
-        f"| {name} | {' | '.join(found.get(v, '') for v in variants)} |\n"
-        for name, found in of_all.items()
-    )
+    found = means(study)
+    variants = list(next(iter(found.values())))
+    lines = [f"| PSNR (sd) | {' | '.join(variants)} |", f"|---|{'--:|' * len(variants)}"]
+    for name, of_all in found.items():
+        cells = (f"{of_all[v][0]:.2f} ({of_all[v][1]:.2f})" for v in variants)
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw_lines(study: Path, file: Path) -> None:
+    """A panel for each WHAT of evaluations named WHAT_NUMBER: PSNR over the numbers."""
+    found, panels = means(study), dict[str, list[str]]()
+    for name in found:
+        if match := re.fullmatch(r"(\w+)_(\d+)", name):
+            panels.setdefault(match[1], []).append(name)
+    with figure_style():
+        figure = Figure(figsize=(7.6, 2.9), layout="constrained")
+        for axes, (what, names) in zip(
+            figure.subplots(1, len(panels), sharey=True), panels.items(), strict=True
+        ):
+            at = [int(name.rpartition("_")[2]) for name in names]
+            for place, variant in enumerate(found[names[0]]):
+                values, spread = zip(*(found[name][variant] for name in names), strict=True)
+                look = {"color": hex_color(categorical(place)), "marker": "o", "markersize": 3}
+                axes.errorbar(at, values, spread, label=variant, **look)
+            axes.set(title=f"PSNR, dB, over {what} in the test", xticks=at)
+        figure.axes[0].legend(loc="center left")
+        write_webp(figure, file)
+
+
+def write_webp(figure: Figure, file: Path) -> None:
+    """The figure as a picture for the page."""
+    pixels = BytesIO()
+    figure.savefig(pixels, format="png", dpi=160)
+    with replacing(file) as path:
+        Image.open(pixels).convert("RGB").save(path, "WEBP", quality=88)
 
 
 def page_of(study: Path) -> str:
@@ -47,7 +87,7 @@ def page_of(study: Path) -> str:
     text = (study / "table.md").read_text(encoding="utf-8")
     if single := re.search(r"^\*\*\w+\*\*$", text, re.MULTILINE):
         notes = text[text.rindex("\n\n- ") + 1 :]
-        text = text[: single.start()] + by_evaluation(study / "table.csv") + notes
+        text = text[: single.start()] + by_evaluation(study) + notes
     return table(text)
 
 
@@ -61,7 +101,14 @@ def main() -> None:
         if not (study / "table.md").exists():
             print(f"{study} has no table.md: the page keeps what it has of {region[2]}")
             return region[0]
-        return f"{region[1]}\n{page_of(study)}\n{region[3]}"
+        image = PAGE.parent / "images" / f"evidence_{region[2]}.webp"
+        if means(study):
+            draw_lines(study, image)
+        else:
+            with replacing(image) as path:
+                Image.open(study / "figures" / "values.png").convert("RGB").save(path, "WEBP")
+        shown = f"![{region[2]}: the figures of the table below](images/{image.name})"
+        return f"{region[1]}\n{shown}\n\n{page_of(study)}\n{region[3]}"
 
     write_text(PAGE, REGION.sub(filled, PAGE.read_text(encoding="utf-8")))
 
