@@ -90,6 +90,7 @@ def steps(out: Path) -> Iterator[Step]:
     for name in PAIR:
         command = ["qgs", "bench", name, "--predict", "--device", "cuda"]
         yield Step(f"prediction of {name}", command, 300)
+    yield Step("Triton kernels", [python, *tests, "tests/components/test_attention_triton.py"])
     command = [python, str(ROOT / "tools/gpu_attention.py"), "--json", "attention.json"]
     yield Step("attention kernels against float64, timed", command, 900, "attention.json")
     sweep = ("--sweep", "views=2..32", "--sweep", "queries=256..16384", "--json", "sweep.json")
