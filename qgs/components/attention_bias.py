@@ -245,11 +245,9 @@ class _BiasedAttention(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        q, k, v, queries, tokens, out, lse = ctx.saved_tensors
-        saved = queries, tokens, out, lse, gradients[0], ctx.bias
-        found = _attention_gradients(q, k, v, *saved, needs=ctx.needs_input_grad)
-        read = q, k, v, queries, tokens
-        return *(g if g is None else g.to(x) for g, x in zip(found, read, strict=True)), None
+        saved = ctx.saved_tensors
+        found = _attention_gradients(saved, gradients[0], ctx.bias, ctx.needs_input_grad)
+        return *(g if g is None else g.to(x) for g, x in zip(found, saved[:5], strict=True)), None
 
 
 def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tuple[Tensor, Tensor]:
@@ -273,27 +271,17 @@ def _attend_anywhere(
 
 @full_precision
 def _attention_gradients(
-    q: Tensor,
-    k: Tensor,
-    v: Tensor,
-    queries: Tensor,
-    tokens: Tensor,
-    out: Tensor,
-    lse: Tensor,
-    gradient: Tensor,
-    bias: AttentionBias,
-    needs: tuple[bool, ...],
+    saved: tuple[Tensor, ...], gradient: Tensor, bias: AttentionBias, needs: tuple[bool, ...]
 ) -> tuple[Tensor | None, ...]:
-    """Gradients of q, k, v (all (B, h, ., d)), and of what the bias reads; None where `needs` is
-    False.
+    """Gradients of q, k, v (all (B, h, ., d)) that are needed, and of what the bias reads.
 
     With P the weights of a head and dO the gradient of its output: dV = P' dO,
     dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d), and the gradient
     of the bias is dS, summed over heads.
     """
+    q, k, v, queries, tokens, out, lse = saved
     scale = q.shape[-1] ** -0.5
-    wanted = zip((q, k, v), needs[:3], strict=True)
-    dq, dk, dv = (torch.zeros_like(x) if needed else None for x, needed in wanted)
+    dq, dk, dv = (torch.zeros_like(x) if needs[n] else None for n, x in enumerate(saved[:3]))
     of_bias = _BiasGradients(queries, tokens, bias)
     q, rowsum = q * scale, (gradient * out).sum(-1)
     for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
@@ -304,8 +292,6 @@ def _attention_gradients(
             p.addmm_(q[of_queries], k[of_tokens].mT).exp_()
             if dv is not None:
                 dv[of_tokens].addmm_(p.mT, gradient[of_queries])
-            if dq is None and dk is None and not of_bias.wanted:
-                continue
             torch.mm(gradient[of_queries], v[of_tokens].mT, out=ds)
             ds.sub_(rowsum[of_queries][:, None]).mul_(p)
             if dq is not None:

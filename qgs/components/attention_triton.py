@@ -36,9 +36,10 @@ def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
-    """Write what `_load` would read."""
-    at, inside = _at(x, scene, head, rows, count, width, WIDTH)
-    tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
+    """Write what `_load` would read, unless x is None."""
+    if x is not None:
+        at, inside = _at(x, scene, head, rows, count, width, WIDTH)
+        tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
 
 
 @jit
@@ -94,10 +95,7 @@ def _backward_queries(
     VALUE: tl.constexpr, GRADIENTS: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of q, and of what the bias reads of queries, of each head: (B, h, N, F).
-
-    Either of dq and of_bias may be None.
-    """
+    """Gradients of q, and of what the bias reads of queries by heads, (B, h, N, F); or None."""
     each = tl.program_id(1).to(tl.int64)
     scene, head = each // heads, each % heads
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
@@ -120,8 +118,7 @@ def _backward_queries(
             sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
         if of_bias is not None:
             bias_sums = GRADIENTS(queries, tokens, M, ds, bias_sums)
-    if dq is not None:
-        _store(dq, scene, head, n, N, width, sums * scale, WIDTH)
+    _store(dq, scene, head, n, N, width, sums * scale, WIDTH)
     if of_bias is not None:
         for f in tl.static_range(F):
             tl.store(of_bias + (each * N + n) * F + f, bias_sums[f], mask=n < N)
@@ -133,8 +130,7 @@ def _backward_tokens(
     VALUE: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of k and v, either of which may be None. A query outside has the log-sum-exp inf,
-    so its weights are 0."""
+    """Gradients of k and v, or None. Queries outside have log-sum-exp inf, so weights of 0."""
     each = tl.program_id(1).to(tl.int64)
     scene, head = each // heads, each % heads
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
@@ -157,10 +153,8 @@ def _backward_tokens(
         if dk is not None:
             ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum[:, None])
             k_sums += tl.dot(tl.trans(ds.to(of_q.dtype)), of_q, input_precision="ieee")
-    if dk is not None:
-        _store(dk, scene, head, m, M, width, k_sums * scale, WIDTH)
-    if dv is not None:
-        _store(dv, scene, head, m, M, width, v_sums, WIDTH)
+    _store(dk, scene, head, m, M, width, k_sums * scale, WIDTH)
+    _store(dv, scene, head, m, M, width, v_sums, WIDTH)
 
 
 class TritonAttention(torch.autograd.Function):
@@ -184,10 +178,8 @@ class TritonAttention(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *saved, out, lse = ctx.saved_tensors
         (q, k, v, queries, _), (value, of_bias) = saved, ctx.functions
-        needs = ctx.needs_input_grad
-        wanted = zip((q, k, v), needs[:3], strict=True)
-        dq, dk, dv = (torch.empty_like(x) if needed else None for x, needed in wanted)
-        shape = q.shape[0] * q.shape[1], *queries.shape[1:]
+        needs, shape = ctx.needs_input_grad, (q.shape[0] * q.shape[1], *queries.shape[1:])
+        dq, dk, dv = (torch.empty_like(x) if needs[n] else None for n, x in enumerate((q, k, v)))
         by_head = queries.new_empty(shape) if needs[3] else None
         given = *saved, gradients[0], lse, (gradients[0].float() * out.float()).sum(-1)
         if dq is not None or by_head is not None:
