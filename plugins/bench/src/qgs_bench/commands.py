@@ -152,6 +152,8 @@ def _sweep(
     show_sweep(report, console)
     if files:
         console.print(f"written to {', '.join(map(str, files))}")
+    if not any(series["points"] for series in report["series"]):
+        raise ValueError("no point of the sweep could be measured; the reasons are above")
 
 
 def _predict(

@@ -83,7 +83,7 @@ def _told(machine: Mapping[str, Any], report: Mapping[str, Any]) -> str:
 
 
 def show_sweep(report: Mapping[str, Any], console: Console) -> None:
-    """A table for each series, its exponents, and what was left out."""
+    """A table for each series, its exponents, and what was left out or failed."""
     console.print(_told(report["machine"], report), markup=False)
     names = short_names([*dict.fromkeys(s["recipe"] for s in report["series"])])
     short = dict(zip(dict.fromkeys(s["recipe"] for s in report["series"]), names, strict=True))
@@ -99,10 +99,12 @@ def show_sweep(report: Mapping[str, Any], console: Console) -> None:
         fits = series["fits"]
         words = {"seconds": "time", "counted_bytes": "tensors", "peak_bytes": "process"}
         told = [f"{words[k]} {_exponent(fits[k])}" for k in words if fits[k]]
-        left = [
-            f"left out: {series['axis']} {m['value']} {m['reason']}" for m in series["left_out"]
+        missing = [
+            f"{kind.replace('_', ' ')}: {series['axis']} {m['value']} {m['reason']}"
+            for kind in ("left_out", "failed")
+            for m in series[kind]
         ]
-        print_lines(console, [f"exponents: {'; '.join(told)}"] * bool(told) + left)
+        print_lines(console, [f"exponents: {'; '.join(told)}"] * bool(told) + missing)
 
 
 def _exponent(fit: Mapping[str, Any]) -> str:
