@@ -26,7 +26,8 @@ from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F
-from qgs_bench.work import posed_photos
+from qgs_bench.predict import Need, need_of
+from qgs_bench.work import posed_photos, workload_of
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -47,10 +48,9 @@ BIAS_FLOPS = 3 * 22  # of a pair: cross product, square, scale, clamp; forward, 
 RENDER = 19.39 * 60 / 30_000  # s, a view forward and backward with its loss and Adam on an A100
 RENDER_GAUSSIANS, RENDER_PIXELS = 3.24e6, 1.2e6  # of that view
 RENDER_FASTER = 2.4  # an H200's bandwidth over an A100's (2.0 TB/s)
-RENDER_BYTES = 300  # of a Gaussian in a view: projections, gradients, 8 tiles in two buffers
-PIXEL_BYTES = 400  # of a pixel: rendering, truth, what SSIM keeps
 NODE = 8  # GPUs that NVLink joins
 FLOAT32_USE = 0.75  # of PEAK_FLOAT32 that large products reach
+SHARED = ("weights", "moments of the optimiser, buffers")  # among GPUs by FSDP2
 PASSES = 36  # over a million scenes, as many as the samples of RealEstate10K make
 
 PAPER = (
@@ -59,6 +59,8 @@ PAPER = (
     *(f"{model}/dl3dv.yaml" for model in ("tokengs", "locus")),
     *(f"{model}/dl3dv_4096_{n}views.yaml" for n in (2, 4, 6) for model in ("tokengs", "locus")),
 )
+SCENES = 1, 2  # of which memory is counted; more of them by a line
+ON_GPU: dict[str, Any] = {"device": "cuda", "precision": "bf16"}
 OF_MILLION = "locus/dl3dv_4096_4views.yaml"
 
 
@@ -67,7 +69,7 @@ class Cost:
     """What training costs. forward, backward, biased: FLOPs of matrix products of a scene, biased
     those of attention with a bias in both. pairs: of query and token that have a bias. saved, once:
     bytes of activations of a scene, and of all. operations: of both passes, launched one by one.
-    gaussians: of a layer; layers: that are rendered.
+    gaussians: of a layer; layers: that are rendered. needs: of a training, by scenes.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Cost:
     operations: int
     gaussians: int
     layers: int
+    needs: dict[int, Need]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -125,18 +128,17 @@ class Cost:
         left = max(0.0, self.exchange(gpus) - 0.6 * network)
         return network + self.rendering(scenes, faster) + left
 
-    def memory(self, scenes: float, gpus: int = 1) -> float:
-        """Bytes on a GPU; gpus: that share weights, gradients and moments (FSDP2), 1 for DDP.
+    def memory(self, scenes: int, gpus: int = 1) -> float:
+        """Bytes on a GPU; gpus: that share weights and moments (FSDP2), 1 for DDP.
 
-        Weights, gradients and two moments in float32, DDP's buckets, and where they are shared a
-        layer in whole; activations; Gaussians and renderings of one layer, all views at once.
+        What `qgs bench --predict` counts, and DDP's buckets, or the layer that FSDP2 has in whole.
         """
-        own = 16 * self.parameters / gpus
-        own += 4 * self.parameters * (0.1 if gpus > 1 else 1)
-        height, width = self.size
-        pixels = height * width * PIXEL_BYTES
-        rendered = self.recipe.views.targets * (self.gaussians * RENDER_BYTES + pixels)
-        return own + self.once + scenes * (self.saved + rendered)
+        peaks = {n: need.total for n, need in self.needs.items()}
+        first, second = sorted(peaks)
+        slope = (peaks[second] - peaks[first]) / (second - first)
+        whole = peaks[first] + (scenes - first) * slope
+        shared = sum(self.needs[first].step[what] for what in SHARED) * (1 - 1 / gpus)
+        return whole - shared + 4 * self.parameters * (0.1 if gpus > 1 else 1)
 
 
 class Autocast(TorchFunctionMode):
@@ -232,6 +234,7 @@ def count(name: str, changes: Sequence[str] = ()) -> Cost:
         one.operations.count,
         queries * each,
         len(layers),
+        {n: need_of(recipe, workload_of(recipe, batch=n, **ON_GPU)) for n in SCENES},
     )
 
 
@@ -375,14 +378,14 @@ def print_memory(costs: Sequence[Cost]) -> None:
     )
     rows = []
     for cost in costs:
-        each = cost.memory(1) - cost.memory(0)
+        each = cost.memory(2) - cost.memory(1)
         size = 4 * cost.parameters * (NODE - 1) / NODE / 1e9
         rows.append(
             (
                 f"`{cost.name}`",
                 *(f"{cost.memory(scenes) / 1e9:.0f}" for scenes in (2, 8, 16)),
                 f"{cost.memory(2, NODE) / 1e9:.0f}",
-                f"{(0.9 * MEMORY - cost.memory(0)) // each:.0f}",
+                f"{1 + (0.9 * MEMORY - cost.memory(1)) // each:.0f}",
                 f"{2 * size:.2f}",
                 f"{3 * size:.2f}",
             )

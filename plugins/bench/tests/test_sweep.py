@@ -101,15 +101,26 @@ def test_what_does_not_fit_is_left_out_and_told(
     assert "519 MB are available" in result.output
 
 
-def test_a_prediction_says_what_fits() -> None:
-    recipe = resolve(LOCUS)
-    result = run_qgs("bench", LOCUS, "--predict", "--within", "1GB", "--device", "cpu")
+def test_a_prediction_says_what_fits(tmp_path: Path) -> None:
+    recipe, file = resolve(LOCUS), tmp_path / "p.json"
+    words = ("--predict", "--within", "1GB", "--device", "cpu", "--json", file)
+    result = run_qgs("bench", LOCUS, *words)
     assert result.exit_code == 0, result.output
     assert f"B x V x H x W {recipe.training.batch_size} x 2 x 64 x 64" in " ".join(
         result.output.split()
     )
     assert "fits into 1 GB on cpu; the largest batch that does is " in result.output
     assert "kept for the backward pass: encoder " in result.output
+    report = json.loads(file.read_text())
+    assert (report["report"], report["limit_bytes"]) == ("qgs bench --predict", 10**9)
+    (found,) = report["recipes"]
+    total = sum(found["step"].values()) + sum(found["besides"].values())
+    assert (found["recipe"], found["fits"], found["total_bytes"]) == (str(LOCUS), True, total)
+    assert found["largest_batch"] > found["batch"] == recipe.training.batch_size
+    assert 0 < found["tensor_bytes"] < total
+    assert sum(found["kept"].values()) < found["tensor_bytes"]
+    other = run_qgs("bench", LOCUS, "--sweep", "views=2..4", "--json", file)
+    assert isinstance(other.exception, FileExistsError)
     tight = run_qgs("bench", LOCUS, "--predict", "--within", "10MB", "--device", "cuda")
     assert "does not fit into 10 MB on cuda; not even a batch of 1 does" in tight.output
 
