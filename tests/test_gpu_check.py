@@ -58,12 +58,37 @@ def test_every_command_of_qgs_is_one(tmp_path: Path) -> None:
 
 def test_the_tables_of_the_report(tmp_path: Path) -> None:
     seconds = {"median": 0.01, "ratio": {"median": 1.2}}
-    recipe = {"recipe": "locus", "seconds": {"forward": seconds, "step": seconds}}
-    command = f"import json; json.dump({{'recipes': [{recipe}]}}, open('l.json', 'w'))"
-    run_all([Step("latency, x", [sys.executable, "-c", command], result="l.json")], tmp_path)
+    measured = {
+        "recipe": "locus", "precision": "bf16", "seconds": {"forward": seconds, "step": seconds},
+        "memory": {"step": {"peak_bytes": 100 * 2**20}},
+    }  # fmt: skip
+    counted = [
+        {"recipe": name, "precision": "bf16", "step": {}, "tensor_bytes": 90 * 2**20}
+        for name in ("locus", "tokengs")
+    ]
+    found = {"latency, x": [measured], "predicted memory": counted}
+    made = []
+    for number, (name, recipes) in enumerate(found.items()):
+        command = f"import json; json.dump({{'recipes': {recipes}}}, open('{number}.json', 'w'))"
+        made.append(Step(name, [sys.executable, "-c", command], result=f"{number}.json"))
+    run_all(made, tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "The paper's ratio is 1.19." in text
     assert "| locus | 10.00 | 1.200 | 10.00 | 1.200 |" in text
+    assert "| locus | bf16 | 90 | 100 | -10.0 % |" in text
+    assert "| tokengs | bf16 | 90 |  |  |" in text
+
+
+def test_what_is_measured_is_predicted_by_the_same_names(tmp_path: Path) -> None:
+    found = {"--memory": set(), "--predict": set()}
+    for step in steps(tmp_path):
+        for option, names in found.items():
+            if option in step.command:
+                words = [*step.command]
+                at = words.index("--precision") + 1 if "--precision" in words else None
+                precision = words[at] if at else "float32"
+                names |= {(word, precision) for word in words if word.endswith(".yaml")}
+    assert found["--memory"] == found["--predict"] != set()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
