@@ -21,6 +21,7 @@ The constants below are the assumptions; docs/scale.md gives their sources.
 import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 from unittest.mock import patch
 
@@ -59,8 +60,6 @@ PAPER = (
     *(f"{model}/dl3dv.yaml" for model in ("tokengs", "locus")),
     *(f"{model}/dl3dv_4096_{n}views.yaml" for n in (2, 4, 6) for model in ("tokengs", "locus")),
 )
-SCENES = 1, 2  # of which memory is counted; more of them by a line
-ON_GPU: dict[str, Any] = {"device": "cuda", "precision": "bf16"}
 OF_MILLION = "locus/dl3dv_4096_4views.yaml"
 
 
@@ -69,7 +68,7 @@ class Cost:
     """What training costs. forward, backward, biased: FLOPs of matrix products of a scene, biased
     those of attention with a bias in both. pairs: of query and token that have a bias. saved, once:
     bytes of activations of a scene, and of all. operations: of both passes, launched one by one.
-    gaussians: of a layer; layers: that are rendered. needs: of a training, by scenes.
+    gaussians: of a layer; layers: that are rendered.
     """
 
     name: str
@@ -84,7 +83,12 @@ class Cost:
     operations: int
     gaussians: int
     layers: int
-    needs: dict[int, Need]
+
+    @cached_property
+    def needs(self) -> dict[int, Need]:
+        """Of a training on one GPU, by scenes: memory is a line through these two."""
+        work: dict[str, Any] = {"device": "cuda", "precision": "bf16"}
+        return {n: need_of(self.recipe, workload_of(self.recipe, batch=n, **work)) for n in (1, 2)}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -133,11 +137,9 @@ class Cost:
 
         What `qgs bench --predict` counts, and DDP's buckets, or the layer that FSDP2 has in whole.
         """
-        peaks = {n: need.total for n, need in self.needs.items()}
-        first, second = sorted(peaks)
-        slope = (peaks[second] - peaks[first]) / (second - first)
-        whole = peaks[first] + (scenes - first) * slope
-        shared = sum(self.needs[first].step[what] for what in SHARED) * (1 - 1 / gpus)
+        one, two = self.needs[1], self.needs[2]
+        whole = one.total + (scenes - 1) * (two.total - one.total)
+        shared = sum(one.step[what] for what in SHARED) * (1 - 1 / gpus)
         return whole - shared + 4 * self.parameters * (0.1 if gpus > 1 else 1)
 
 
@@ -234,7 +236,6 @@ def count(name: str, changes: Sequence[str] = ()) -> Cost:
         one.operations.count,
         queries * each,
         len(layers),
-        {n: need_of(recipe, workload_of(recipe, batch=n, **ON_GPU)) for n in SCENES},
     )
 
 
