@@ -41,14 +41,16 @@ def test_a_bias_is_counted_as_attention_is() -> None:
 
 
 def test_memory_is_what_qgs_bench_predicts() -> None:
-    name, changes = "tiny/locus.yaml", ["data.image_size=[32, 32]"]
+    small = ["model.width=32", "model.heads=2", "model.queries.count=12"]
+    name, changes = "tiny/locus.yaml", ["data.image_size=[16, 24]", *small]
     cost, recipe = count(name, changes), resolve(name, changes)
-    work = workload_of(recipe, batch=5, device="cuda", precision="bf16")
+    work = workload_of(recipe, batch=3, device="cuda", precision="bf16")
     need, buckets = need_of(recipe, work), 4 * cost.parameters
-    assert cost.memory(5) == pytest.approx(need.total + buckets, rel=1e-2)
+    apart = abs(cost.memory(3) - need.total - buckets)
+    assert apart < 0.01 * need.tensors, "memory is a line through one and two scenes"
     shared = need.step["weights"] + need.step["moments of the optimiser, buffers"]
     saved = shared * 7 / 8 + 0.9 * buckets
-    assert cost.memory(5) - cost.memory(5, 8) == pytest.approx(saved, rel=1e-6)
+    assert cost.memory(3) - cost.memory(3, 8) == pytest.approx(saved, rel=1e-6)
 
 
 @pytest.mark.slow

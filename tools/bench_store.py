@@ -14,8 +14,9 @@ in training, so that 64 fit into a few gigabytes), and of each number is printed
 - memory and open files of a worker, at a third of the batches and at the end;
 - whether the batches are, bit for bit and in order, those that one process reads of local files.
 
-Each reader draws its faults from `--seed` and its own index. `--patience` and `--pauses` replace
-PATIENCE and PAUSES of `qgs.data.paths`, which would make a run take hours. Exit code 1 when a batch
+Each reader draws its faults from `--seed` and its own index; a reader of photos has eight requests
+at a time, so which of them fails still varies. `--patience` and `--pauses` replace
+PATIENCE and PAUSES of `qgs.data.paths`, with which a run would take hours. Exit code 1 when a batch
 is wrong or missing, or memory or open files grow.
 """
 

@@ -1,9 +1,9 @@
-"""Attention with a bias that is a function, in Triton: what is of a pair stays in registers.
+"""Attention with a bias that is a function, in Triton: numbers of a pair stay in registers.
 
-As FlashAttention-2 (arXiv 2307.08691): a kernel goes through the tokens of a block of queries for
-the result, one for the gradients of the queries, and one through the queries of a block of tokens
-for those of keys and values. The bias and all sums are in float32, and each number is summed by one
-program in one order: the same bits each time.
+As FlashAttention-2 (arXiv 2307.08691): one kernel loops over the tokens of a block of queries for
+the result, one for the gradients of the queries, and one over the queries of a block of tokens for
+those of keys and values. The bias and all sums are in float32. Each number is summed by one program
+in one order, so results have the same bits each time.
 
 A bias brings two `jit` functions (`AttentionBias.triton_functions`), for a block of n queries and m
 tokens, of which it gets pointers (n, 1) and (1, m). The F numbers of a query are at `queries + f`,
