@@ -13,7 +13,8 @@ memory is taken: both passes of one scene run on "meta" as they would on a GPU w
   query and token. `--check` compares with what the counter sees of the real code;
 - activations by saved_tensors_hooks: the bytes of all tensors that the backward pass needs, each
   storage once, without parameters; of one scene and of two, so that what is there once for all
-  scenes, such as bf16 copies of the weights, is separated from what each takes.
+  scenes, such as bf16 copies of the weights, is separated from what each takes;
+- memory by `qgs_bench.predict`, as `qgs bench --predict` reports it, and what DDP and FSDP2 change.
 
 The constants below are the assumptions; docs/scale.md gives their sources.
 """
