@@ -3,13 +3,15 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gpu_attention
 import gpu_check
 import pytest
 import torch
 import typer
-from gpu_attention import main as attention
 from gpu_check import Step, run_all, steps
 from typer.core import TyperGroup
 
@@ -56,12 +58,37 @@ def test_every_command_of_qgs_is_one(tmp_path: Path) -> None:
 
 def test_the_tables_of_the_report(tmp_path: Path) -> None:
     seconds = {"median": 0.01, "ratio": {"median": 1.2}}
-    recipe = {"recipe": "locus", "seconds": {"forward": seconds, "step": seconds}}
-    command = f"import json; json.dump({{'recipes': [{recipe}]}}, open('l.json', 'w'))"
-    run_all([Step("latency, x", [sys.executable, "-c", command], result="l.json")], tmp_path)
+    measured = {
+        "recipe": "locus", "precision": "bf16", "seconds": {"forward": seconds, "step": seconds},
+        "memory": {"step": {"peak_bytes": 100 * 2**20}},
+    }  # fmt: skip
+    counted = [
+        {"recipe": name, "precision": "bf16", "step": {}, "tensor_bytes": 90 * 2**20}
+        for name in ("locus", "tokengs")
+    ]
+    found = {"latency, x": [measured], "predicted memory": counted}
+    made = []
+    for number, (name, recipes) in enumerate(found.items()):
+        command = f"import json; json.dump({{'recipes': {recipes}}}, open('{number}.json', 'w'))"
+        made.append(Step(name, [sys.executable, "-c", command], result=f"{number}.json"))
+    run_all(made, tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "The paper's ratio is 1.19." in text
     assert "| locus | 10.00 | 1.200 | 10.00 | 1.200 |" in text
+    assert "| locus | bf16 | 90 | 100 | -10.0 % |" in text
+    assert "| tokengs | bf16 | 90 |  |  |" in text
+
+
+def test_what_is_measured_is_predicted_by_the_same_names(tmp_path: Path) -> None:
+    found = {"--memory": set(), "--predict": set()}
+    for step in steps(tmp_path):
+        for option, names in found.items():
+            if option in step.command:
+                words = [*step.command]
+                at = words.index("--precision") + 1 if "--precision" in words else None
+                precision = words[at] if at else "float32"
+                names |= {(word, precision) for word in words if word.endswith(".yaml")}
+    assert found["--memory"] == found["--predict"] != set()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -79,17 +106,51 @@ def test_without_a_gpu_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "WHEELS must be a folder" in wrong.stderr
 
 
+def _attention(monkeypatch: pytest.MonkeyPatch, file: Path) -> tuple[int, list[dict[str, str]]]:
+    words = ("--device", "cpu", "--size", "32x64", "--heads", "2", "--json", str(file))
+    monkeypatch.setattr(sys, "argv", ["gpu_attention.py", *words])
+    with pytest.raises(SystemExit) as ended:
+        gpu_attention.main()
+    return int(ended.value.code or 0), json.loads(file.read_text())["rows"]
+
+
 def test_kernels_of_attention_are_held_against_float64(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "a.json"
-    words = ("--device", "cpu", "--size", "32x64", "--heads", "2", "--json", str(file))
-    monkeypatch.setattr(sys, "argv", ["gpu_attention.py", *words])
-    monkeypatch.setattr("gpu_attention.KERNELS", [None])
-    with pytest.raises(SystemExit) as ended:
-        attention()
-    assert ended.value.code == 0
-    ours, unbiased = json.loads(file.read_text())["rows"]
-    for clamp in ("none", "some", "all"):
-        assert float(ours[f"error, {clamp} clamped"].split()[0]) < 1e-5
-    assert unbiased["kernel"] == "no bias"
+    cases = gpu_attention.CASES.items()
+    small = {n: replace(c, queries=min(c.queries, 60), tokens=min(c.tokens, 250)) for n, c in cases}
+    monkeypatch.setattr(gpu_attention, "CASES", small)
+    code, (unbiased, plain, blocks) = _attention(monkeypatch, tmp_path / "a.json")
+    assert code == 0
+    for row in (plain, blocks):
+        for dtype, tolerance in gpu_attention.TOLERANCES.items():
+            error = float(row[f"error, {str(dtype).removeprefix('torch.')}"].split()[0])
+            assert tolerance / 100 < error <= tolerance
+    assert [row["kernel"] for row in (unbiased, plain, blocks)] == ["no bias", "plain", "blocks"]
+
+
+def test_a_kernel_that_is_wrong_or_fails_is_in_the_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = gpu_attention.biased_attention
+
+    def wrong(*given: Any) -> torch.Tensor:
+        q, k, v, bias, kernel = given
+        return real(q, k, v * (1 + 1e-4 * (kernel == "plain")), bias, kernel)
+
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(gpu_attention, "biased_attention", wrong)
+    monkeypatch.setattr(gpu_attention, "TOLERANCES", {torch.float32: 1e-5})
+    cases = {name: case for name, case in gpu_attention.CASES.items() if name.endswith("query")}
+    monkeypatch.setattr(gpu_attention, "CASES", cases)
+    monkeypatch.setitem(gpu_attention.KERNELS, "cpu", ("plain",))
+    code, (_, plain) = _attention(monkeypatch, tmp_path / "a.json")
+    assert code == 1
+    assert plain["error, float32"].startswith("1.0e-04 (")
+    monkeypatch.setitem(gpu_attention.KERNELS, "cpu", ("triton", "blocks"))
+    code, (_, triton, blocks) = _attention(monkeypatch, tmp_path / "a.json")
+    assert code == 1
+    assert "ValueError: the Triton kernel of attention cannot be used" in triton["failed"]
+    assert "ms" not in triton
+    assert float(blocks["error, float32"].split()[0]) < 1e-5
+    assert "ms" in blocks

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from functools import partial
 from itertools import islice
 from multiprocessing import active_children
 from pathlib import Path
@@ -31,6 +32,7 @@ import numpy as np
 import torch
 from PIL import Image
 from process_memory import megabytes
+from qgs_bench.run import in_turn
 from qgs_datatools.entries import chunk_entry
 from qgs_datatools.packing import opened_replacing, write_bytes
 from upath import UPath
@@ -114,12 +116,10 @@ def _frame(number: int, data: bytes) -> EncodedFrame:
 
 def report_decoding(scenes: Sequence[Scene]) -> None:
     """Images per second with one and two threads, measured in turn."""
-    rates: dict[int, list[float]] = {1: [], 2: []}
-    for _ in range(5):
-        for threads, measured in rates.items():
-            measured.append(IMAGES / seconds(lambda threads=threads: _decode(scenes, threads)))
-    for threads, measured in rates.items():
-        print(f"{threads} thread(s): {statistics.median(measured):.0f} images/s")
+    tasks = {threads: partial(_decode, scenes, threads) for threads in (1, 2)}
+    columns = in_turn([*tasks.values()], rounds=5, warmup=0)
+    for threads, samples in zip(tasks, columns, strict=True):
+        print(f"{threads} thread(s): {IMAGES / statistics.median(samples):.0f} images/s")
     begin = time.process_time()
     _decode(scenes, 1)
     print(f"{1000 * (time.process_time() - begin) / IMAGES:.2f} ms of processor time an image")

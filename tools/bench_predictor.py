@@ -11,7 +11,6 @@ import argparse
 import os
 
 import torch
-from qgs_bench.counting import count
 from qgs_bench.memory import peak_memory
 from qgs_bench.predict import need_of
 from qgs_bench.work import workload_of
@@ -50,10 +49,10 @@ def main() -> None:
         supervised = [f"model.supervision.layers={layers}"] if middle else []
         recipe = resolve(name, [*changes, *supervised])
         work = workload_of(recipe, size=size, batch=batch, precision=precision)
-        counted = count(recipe, "step", work).peak
-        predicted = sum(need_of(recipe, work).step.values())
+        need = need_of(recipe, work)
+        predicted = sum(need.step.values())
         os.environ.pop(GIVES_BACK, None)
-        cells = [f"{counted / 2**20:,.0f} MiB", f"{predicted / 2**20:,.0f} MiB"]
+        cells = [f"{need.tensors / 2**20:,.0f} MiB", f"{predicted / 2**20:,.0f} MiB"]
         for _ in range(2):
             peak = peak_memory(recipe, "step", work, torch.get_num_threads()).peak_bytes
             cells += [f"{peak / 2**20:,.0f} MiB", f"{100 * (predicted / peak - 1):+.1f} %"]

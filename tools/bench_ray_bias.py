@@ -8,11 +8,12 @@ pass.
 
 import argparse
 import statistics
-import time
 from collections.abc import Callable
+from operator import truediv
 
 import torch
 import torch.nn.functional as F
+from qgs_bench.run import in_turn
 from qgs_ellipsoid.fields import anchor_rotation
 from qgs_ellipsoid.ray_bias import EllipsoidBias
 from qgs_ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
@@ -39,22 +40,12 @@ def biases(anchors: int, rays: int) -> dict[str, Callable[[], Tensor]]:
     }
 
 
-def seconds(run: Callable[[], object]) -> float:
-    """Wall-clock seconds of one call."""
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
-
-
 def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
     """Time every run in turn, once a round, and print what came out, as ratios to the first."""
-    for run in runs.values():
-        run()
-    first = next(iter(runs))
-    times = [{name: seconds(run) for name, run in runs.items()} for _ in range(rounds)]
-    for name in runs:
-        median = statistics.median(row[name] for row in times)
-        ratio = statistics.median(row[name] / row[first] for row in times)
+    columns = in_turn([*runs.values()], rounds, warmup=1)
+    for name, samples in zip(runs, columns, strict=True):
+        median = statistics.median(samples)
+        ratio = statistics.median(map(truediv, samples, columns[0]))
         print(f"  {name:18} {1e3 * median:8.2f} ms   {ratio:6.3f}", flush=True)
 
 

@@ -8,8 +8,11 @@ Unset PYTHONDONTWRITEBYTECODE, or every start compiles qgs anew.
 import statistics
 import subprocess
 import sys
-import time
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+
+from qgs_bench.run import in_turn
 
 TINY = Path(__file__).parents[1] / "recipes" / "tiny"
 QGS = str(Path(sys.executable).with_name("qgs"))
@@ -17,12 +20,10 @@ TOKENGS, LOCUS = (str(TINY / f"{name}.yaml") for name in ("tokengs", "locus"))
 COMMANDS = (("--help",), ("list",), ("compose", LOCUS), ("diff", TOKENGS, LOCUS))
 
 
-def seconds(*command: str) -> float:
-    """Wall time of one run of `command`."""
-    start = time.perf_counter()
+def run(command: Sequence[str]) -> None:
+    """One run of `command`, in silence."""
     silent = subprocess.DEVNULL
     subprocess.run(command, check=True, stdout=silent, stderr=silent)
-    return time.perf_counter() - start
 
 
 def main() -> None:
@@ -37,13 +38,9 @@ def main() -> None:
         ),
         **{" ".join(("qgs", *words)): (QGS, *words) for words in COMMANDS},
     }
-    times: dict[str, list[float]] = {name: [] for name in commands}
-    for repetition in range(repetitions + 1):
-        for name, command in commands.items():
-            elapsed = seconds(*command)
-            if repetition:  # the first round fills the file cache
-                times[name].append(elapsed)
-    for name, values in times.items():
+    # The first round fills the file cache.
+    columns = in_turn([partial(run, c) for c in commands.values()], repetitions, warmup=1)
+    for name, values in zip(commands, columns, strict=True):
         print(f"{statistics.median(values):7.3f} s  {name}")
 
 

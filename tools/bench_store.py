@@ -1,6 +1,6 @@
 """How scenes are read from a remote store that is slow and fails, by many processes.
 
-    python tools/bench_store.py [--kind chunks|photos] [--readers 1 4 16 64] [--faults]
+    python tools/bench_store.py [--kind chunks|photos] [--readers 1 4 16 64] [--faults] [--seed 0]
 
 Writes scenes of synthetic photos (JPEG, 640 x 360) as chunks or as folders of photos to a temporary
 folder and serves them through fsspec as `slow://`: every request waits 50 ms, all readers share one
@@ -14,9 +14,10 @@ in training, so that 64 fit into a few gigabytes), and of each number is printed
 - memory and open files of a worker, at a third of the batches and at the end;
 - whether the batches are, bit for bit and in order, those that one process reads of local files.
 
-`--patience` takes the place of `qgs.data.paths.PATIENCE`, and `--pauses` of PAUSES, so that reads
-that never end and pauses do not last as long as they do in earnest. Exit code 1 when a batch is
-wrong or missing, or memory or open files grow.
+Each reader draws its faults from `--seed` and its own index; a reader of photos has eight requests
+at a time, so which of them fails still varies. `--patience` and `--pauses` replace
+PATIENCE and PAUSES of `qgs.data.paths`, with which a run would take hours. Exit code 1 when a batch
+is wrong or missing, or memory or open files grow.
 """
 
 import argparse
@@ -45,7 +46,7 @@ import torch
 from bench_data import PHOTO, chunks_at, synthetic_photo
 from fsspec.implementations.local import LocalFileSystem
 from process_memory import megabytes
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, get_worker_info
 
 from qgs.composer import Recipe, resolve
 from qgs.data import paths, stream
@@ -68,6 +69,7 @@ class Settings:
     faults: bool
     patience: float
     pauses: tuple[float, ...]
+    seed: int
 
 
 class SlowStore(LocalFileSystem):
@@ -93,8 +95,7 @@ class SlowStore(LocalFileSystem):
         """Bytes of a file; fewer than there are, an error, or nothing ever, by chance."""
         content = super().cat_file(path, start, end, **options)
         assert isinstance(content, bytes)
-        pid = os.getpid()
-        drawn = self._randoms.setdefault(pid, random.Random(pid))
+        drawn = self._random()
         kind = self._chance(drawn.random())
         if kind == "short":
             content = content[: drawn.randrange(1, max(2, len(content)))]
@@ -111,6 +112,12 @@ class SlowStore(LocalFileSystem):
         """What a folder holds, after the store's latency."""
         self._wait("list", 0)
         return super().ls(path, detail, **options)
+
+    def _random(self) -> random.Random:
+        """Of the seed and the reader's index; -1 for the process that trains."""
+        worker = get_worker_info()
+        reader = -1 if worker is None else worker.id
+        return self._randoms.setdefault(reader, random.Random(f"{self._settings.seed} {reader}"))
 
     def _chance(self, at: float) -> str:
         for kind, share in FAULTS.items() if self._settings.faults else ():
@@ -168,6 +175,9 @@ def main() -> int:
     parser.add_argument("--latency", type=float, default=0.05)
     parser.add_argument("--bandwidth", type=float, default=250.0, help="MB/s, of all readers")
     parser.add_argument("--faults", action="store_true")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of the faults, with each reader's index"
+    )
     parser.add_argument("--patience", type=float, default=10.0)
     parser.add_argument("--pauses", type=float, nargs="+", default=[0.25, 1.0, 4.0, 16.0])
     options = parser.parse_args()
@@ -181,6 +191,7 @@ def main() -> int:
             options.faults,
             options.patience,
             tuple(options.pauses),
+            options.seed,
         )
         wanted = [fingerprint(b) for b in batches(options.kind, folder, 0, options.batches)]
         held = True

@@ -13,7 +13,8 @@ memory is taken: both passes of one scene run on "meta" as they would on a GPU w
   query and token. `--check` compares with what the counter sees of the real code;
 - activations by saved_tensors_hooks: the bytes of all tensors that the backward pass needs, each
   storage once, without parameters; of one scene and of two, so that what is there once for all
-  scenes, such as bf16 copies of the weights, is told from what each takes.
+  scenes, such as bf16 copies of the weights, is separated from what each takes;
+- memory by `qgs_bench.predict`, as `qgs bench --predict` reports it, and what DDP and FSDP2 change.
 
 The constants below are the assumptions; docs/scale.md gives their sources.
 """
@@ -21,12 +22,14 @@ The constants below are the assumptions; docs/scale.md gives their sources.
 import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F
-from qgs_bench.work import posed_photos
+from qgs_bench.predict import Need, need_of
+from qgs_bench.work import posed_photos, workload_of
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -47,10 +50,9 @@ BIAS_FLOPS = 3 * 22  # of a pair: cross product, square, scale, clamp; forward, 
 RENDER = 19.39 * 60 / 30_000  # s, a view forward and backward with its loss and Adam on an A100
 RENDER_GAUSSIANS, RENDER_PIXELS = 3.24e6, 1.2e6  # of that view
 RENDER_FASTER = 2.4  # an H200's bandwidth over an A100's (2.0 TB/s)
-RENDER_BYTES = 300  # of a Gaussian in a view: projections, gradients, 8 tiles in two buffers
-PIXEL_BYTES = 400  # of a pixel: rendering, truth, what SSIM keeps
 NODE = 8  # GPUs that NVLink joins
 FLOAT32_USE = 0.75  # of PEAK_FLOAT32 that large products reach
+SHARED = ("weights", "moments of the optimiser, buffers")  # among GPUs by FSDP2
 PASSES = 36  # over a million scenes, as many as the samples of RealEstate10K make
 
 PAPER = (
@@ -82,6 +84,12 @@ class Cost:
     operations: int
     gaussians: int
     layers: int
+
+    @cached_property
+    def needs(self) -> dict[int, Need]:
+        """Of a training on one GPU, by scenes: memory is a line through these two."""
+        work: dict[str, Any] = {"device": "cuda", "precision": "bf16"}
+        return {n: need_of(self.recipe, workload_of(self.recipe, batch=n, **work)) for n in (1, 2)}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -125,18 +133,15 @@ class Cost:
         left = max(0.0, self.exchange(gpus) - 0.6 * network)
         return network + self.rendering(scenes, faster) + left
 
-    def memory(self, scenes: float, gpus: int = 1) -> float:
-        """Bytes on a GPU; gpus: that share weights, gradients and moments (FSDP2), 1 for DDP.
+    def memory(self, scenes: int, gpus: int = 1) -> float:
+        """Bytes on a GPU; gpus: that share weights and moments (FSDP2), 1 for DDP.
 
-        Weights, gradients and two moments in float32, DDP's buckets, and where they are shared a
-        layer in whole; activations; Gaussians and renderings of one layer, all views at once.
+        What `qgs bench --predict` counts, and DDP's buckets, or the layer that FSDP2 has in whole.
         """
-        own = 16 * self.parameters / gpus
-        own += 4 * self.parameters * (0.1 if gpus > 1 else 1)
-        height, width = self.size
-        pixels = height * width * PIXEL_BYTES
-        rendered = self.recipe.views.targets * (self.gaussians * RENDER_BYTES + pixels)
-        return own + self.once + scenes * (self.saved + rendered)
+        one, two = self.needs[1], self.needs[2]
+        whole = one.total + (scenes - 1) * (two.total - one.total)
+        shared = sum(one.step[what] for what in SHARED) * (1 - 1 / gpus)
+        return whole - shared + 4 * self.parameters * (0.1 if gpus > 1 else 1)
 
 
 class Autocast(TorchFunctionMode):
@@ -375,14 +380,14 @@ def print_memory(costs: Sequence[Cost]) -> None:
     )
     rows = []
     for cost in costs:
-        each = cost.memory(1) - cost.memory(0)
+        each = cost.memory(2) - cost.memory(1)
         size = 4 * cost.parameters * (NODE - 1) / NODE / 1e9
         rows.append(
             (
                 f"`{cost.name}`",
                 *(f"{cost.memory(scenes) / 1e9:.0f}" for scenes in (2, 8, 16)),
                 f"{cost.memory(2, NODE) / 1e9:.0f}",
-                f"{(0.9 * MEMORY - cost.memory(0)) // each:.0f}",
+                f"{1 + (0.9 * MEMORY - cost.memory(1)) // each:.0f}",
                 f"{2 * size:.2f}",
                 f"{3 * size:.2f}",
             )

@@ -1,158 +1,212 @@
-"""Attention with LocusGS's bias by every kernel there is, against float64, timed, on a GPU.
+"""Attention with the biases of LocusGS and of ellipsoids by every kernel there is, on a GPU.
 
     python tools/gpu_attention.py [--json FILE] [--device cuda] [--size 4096x7168] [--heads 16]
 
-For each kernel: the largest relative error of the output and of each gradient against float64
-autograd of the direct formula at 257 x 1,031 pairs (none, some and all of them clamped), then time
-and peak memory of forward and backward at full size, beside attention without a bias.
+For each kernel and precision: the largest relative error of the output and of each gradient against
+float64 autograd of the formula, from the same rounded inputs, at the sizes and bounds of `CASES`.
+Then time and peak memory of forward and backward with LocusGS's bias at full size, in float32,
+beside attention without a bias. `--device cpu` leaves out Triton, which needs a GPU.
+Exit code 1 where a kernel failed or an error is above its tolerance.
 """
 
 import argparse
 import json
-import statistics
-import time
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+from qgs_bench.run import in_turn, quartiles
+from qgs_ellipsoid.fields import anchor_rotation
+from qgs_ellipsoid.ray_bias import EllipsoidBias
+from qgs_ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
 from qgs_locus.ray_bias import RayBias
+from qgs_locus.ray_bias import ray_tokens as locus_tokens
 from torch import Tensor
 
+from qgs.components import AttentionBias
 from qgs.components.attention_bias import biased_attention
 from qgs.components.attention_choice import AttentionKernel
 
-KERNELS: tuple[AttentionKernel, ...] = ("plain", "blocks", "triton")
-CLAMPS = {"none": -1e9, "some": -5.0, "all": -1e-9}
+KERNELS: dict[str, tuple[AttentionKernel, ...]] = {
+    "cuda": ("plain", "blocks", "triton"),
+    "cpu": ("plain", "blocks"),
+}
+TOLERANCES = {torch.float32: 1e-5, torch.bfloat16: 4 * 2**-7, torch.float16: 4 * 2**-10}
+"""A number in half precision is off by at most half of 2^-7 or 2^-10 of itself. The output is
+rounded once. The kernels also round the weights, and backward their derivative and the output. The
+plain path rounds the bias, so that weights at a bias of -4 to -5 are off by 4 to 5 halves. Errors
+of single weights average out over tokens, so that 8 halves are more than either reaches."""
 
 
-def leaves(
-    sizes: tuple[int, int, int], device: str, dtype: torch.dtype, seed: int = 0
-) -> dict[str, Tensor]:
-    """q, k, v (1, h, ., 64), centres (1, N, 3), sigmas (1, N, 1), gamma; all with gradients."""
-    heads, queries, tokens = sizes
-    draw = torch.Generator().manual_seed(seed)
-    shapes = {
-        "q": (1, heads, queries, 64),
-        "k": (1, heads, tokens, 64),
-        "v": (1, heads, tokens, 64),
-    }
-    found = {n: torch.randn(s, generator=draw, dtype=torch.float64) for n, s in shapes.items()}
-    found["center"] = torch.randn(1, queries, 3, generator=draw, dtype=torch.float64)
-    found["sigma"] = 0.3 + torch.rand(1, queries, 1, generator=draw, dtype=torch.float64)
-    found["gamma"] = torch.tensor(0.9, dtype=torch.float64)
-    return {name: x.to(device, dtype).requires_grad_() for name, x in found.items()}
+@dataclass(frozen=True)
+class Case:
+    """lowest: bound of the bias. width: of q, k, v, (scenes, h, ., width)."""
+
+    kind: type[AttentionBias]
+    lowest: float = -5.0
+    scenes: int = 1
+    queries: int = 257
+    tokens: int = 1031
+    width: int = 64
 
 
-def rays(tokens: int, device: str, dtype: torch.dtype) -> Tensor:
-    """Moments and unit directions (1, 6, M)."""
-    draw = torch.Generator().manual_seed(1)
-    origin = torch.randn(tokens, 3, generator=draw, dtype=torch.float64)
-    direction = F.normalize(torch.randn(tokens, 3, generator=draw, dtype=torch.float64), dim=-1)
-    lines = torch.cat([torch.linalg.cross(origin, direction), direction], -1)
-    return lines.mT[None].contiguous().to(device, dtype)
+ODD: dict[str, dict[str, Any]] = {
+    "some pairs at the bound": {},
+    "none at the bound": {"lowest": -1e9},
+    "all at the bound": {"lowest": -1e-9},
+    "one query": {"queries": 1, "scenes": 50},
+    "one token": {"tokens": 1, "scenes": 2},
+    "heads 96 wide": {"width": 96},
+}
+CASES = {
+    f"{kind.__name__}, {name}": Case(kind, **odd)
+    for kind in (RayBias, EllipsoidBias)
+    for name, odd in ODD.items()
+}
+Leaves = dict[str, Tensor]
 
 
-def attend(
-    given: dict[str, Tensor], lines: Tensor, lowest: float, kernel: AttentionKernel
-) -> Tensor:
-    bias = RayBias.of(given["center"], given["sigma"] ** 2, lines, lowest, given["gamma"])
-    return biased_attention(given["q"], given["k"], given["v"], bias, kernel)
+def drawn(case: Case, heads: int, device: str, dtype: torch.dtype) -> Leaves:
+    """q, k, v and the output's gradient in `dtype`; what the bias reads in float32."""
+    draw = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(case.scenes, *shape, generator=draw)
+
+    counts = {"q": case.queries, "k": case.tokens, "v": case.tokens, "gradient": case.queries}
+    found = {name: normal(heads, n, case.width).to(dtype) for name, n in counts.items()}
+    directions = F.normalize(normal(case.tokens, 3), dim=-1)
+    rays = torch.cat([torch.linalg.cross(normal(case.tokens, 3), directions), directions], -1)
+    center, sigma_sq = normal(case.queries, 3), (0.3 + normal(case.queries, 3).abs()).square()
+    last = case.lowest, torch.tensor(0.9)
+    if case.kind is RayBias:
+        bias = RayBias.of(center, sigma_sq[..., :1], locus_tokens(rays), *last)
+    else:
+        shape = anchor_rotation(normal(case.queries, 4)), sigma_sq
+        bias = EllipsoidBias.of(center, *shape, ellipsoid_tokens(rays), *last)
+    found |= {"queries": bias.queries, "tokens": bias.tokens}
+    return {name: x.to(device) for name, x in found.items()}
 
 
-def exact(given: dict[str, Tensor], lines: Tensor, lowest: float) -> Tensor:
-    """The formula itself, for all pairs at once."""
-    moments, directions = lines.mT.split(3, -1)
-    apart = torch.linalg.cross(given["center"][:, :, None], directions[:, None], dim=-1)
-    squared = (apart - moments[:, None]).square().sum(-1)
-    bias = given["gamma"] * (-squared / (2 * given["sigma"] ** 2)).clamp_min(lowest)
-    logits = given["q"] @ given["k"].mT / given["q"].shape[-1] ** 0.5 + bias[:, None]
-    return logits.softmax(-1) @ given["v"]
+def attend(kernel: AttentionKernel, case: Case, x: Leaves) -> Tensor:
+    """Attention by a kernel."""
+    bias = case.kind(x["queries"], x["tokens"])
+    return biased_attention(x["q"], x["k"], x["v"], bias, kernel)
 
 
-def errors(kernel: AttentionKernel, clamp: str, device: str, heads: int) -> dict[str, float]:
-    """Largest |difference| of output and gradients, as a share of the largest true value.
+def formula(case: Case, x: Leaves) -> Tensor:
+    """The same for all pairs at once."""
+    value, scenes = (
+        case.kind(x["queries"], x["tokens"]).value,
+        zip(x["queries"], x["tokens"], strict=True),
+    )
+    bias = torch.stack([value(*read) for read in scenes])[:, None]
+    return ((x["q"] @ x["k"].mT) / case.width**0.5 + bias).softmax(-1) @ x["v"]
 
-    Of one that is at least 0.01: where all pairs are clamped the bias has no gradient but rounding.
+
+def derived(attention: Callable[[Case, Leaves], Tensor], case: Case, given: Leaves) -> Leaves:
+    """The output and the gradients of q, k, v and of each number that the bias reads of queries."""
+    learnt = ("q", "k", "v", "queries")
+    x = {name: leaf.clone().requires_grad_(name in learnt) for name, leaf in given.items()}
+    out = attention(case, x)
+    gradients = torch.autograd.grad(out, [x[name] for name in learnt], x["gradient"])
+    found = {"out": out, **dict(zip(learnt, gradients, strict=True))}
+    numbers = found.pop("queries").unbind(-1)
+    found |= {f"number {n} of the bias": gradient for n, gradient in enumerate(numbers)}
+    return {name: leaf.detach().double() for name, leaf in found.items()}
+
+
+@cache
+def truth(case: Case, heads: int, device: str, dtype: torch.dtype) -> Leaves:
+    """In float64, of the inputs as they are in `dtype`."""
+    given = drawn(case, heads, device, dtype)
+    return derived(formula, case, {name: x.double() for name, x in given.items()})
+
+
+def worst(
+    kernel: AttentionKernel, dtype: torch.dtype, device: str, heads: int
+) -> tuple[float, str]:
+    """The largest |difference| as a share of the largest true value, of what, and in which case.
+
+    Where the truth is 0 but for rounding, as gradients through one token: of that with two tokens.
     """
-    sizes, found = (heads, 257, 1031), []
-    for dtype in (torch.float64, torch.float32):
-        given, lines = leaves(sizes, device, dtype), rays(sizes[2], device, dtype)
-        true = dtype == torch.float64
-        read = given, lines, CLAMPS[clamp]
-        out = exact(*read) if true else attend(*read, kernel)
-        weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(2))
-        (out * weights.to(out)).sum().backward()
-        found.append({"out": out.detach(), **{n: x.grad for n, x in given.items()}})
-    (truth, ours), result = found, {}
-    for name, value in truth.items():
-        other = torch.zeros_like(value) if ours[name] is None else ours[name].double()
-        largest = value.abs().max().clamp_min(0.01)
-        result[name] = float((value - other).abs().max() / largest)
-    return result
+    errors = []
+    for name, case in CASES.items():
+        ours = derived(partial(attend, kernel), case, drawn(case, heads, device, dtype))
+        for what, true in truth(case, heads, device, dtype).items():
+            size = true.abs().max()
+            if size < 1e-10:
+                size = truth(Case(case.kind, tokens=2), heads, device, dtype)[what].abs().max()
+            error = float((true - ours[what]).abs().max() / size)
+            errors.append((math.inf if math.isnan(error) else error, f"{what}; {name}"))
+    return max(errors)
 
 
-def timed(run: Callable[[], object], device: str, rounds: int = 10) -> tuple[float, float]:
-    """Milliseconds, median, and MiB that it allocates at most (0 on a CPU)."""
-    on_gpu, samples = device == "cuda", []
-    run()
-    if on_gpu:
-        torch.cuda.synchronize()
-        torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated() if on_gpu else 0
-    for _ in range(rounds):
-        start = time.perf_counter()
-        run()
-        if on_gpu:
-            torch.cuda.synchronize()
-        samples.append(time.perf_counter() - start)
-    peak = torch.cuda.max_memory_allocated() - before if on_gpu else 0
-    return 1000 * statistics.median(samples), peak / 2**20
+def peak_mebibytes(task: Callable[[], object]) -> float:
+    """What a call allocates at most on the GPU."""
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    task()
+    torch.cuda.synchronize()
+    return (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
 def main() -> None:
+    """Print a row for each kernel."""
     parser = argparse.ArgumentParser(description="Kernels of attention, checked and timed.")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--device", choices=[*KERNELS], default="cuda")
     parser.add_argument("--size", default="4096x7168", help="queries x tokens")
     parser.add_argument("--heads", type=int, default=16)
     options = parser.parse_args()
     queries, tokens = map(int, options.size.split("x"))
     device, heads = options.device, options.heads
-    rows: list[dict[str, Any]] = []
+    large = Case(RayBias, queries=queries, tokens=tokens)
+    x = drawn(large, heads, device, torch.float32)
+    for name in ("q", "k", "v", "queries"):
+        x[name].requires_grad_()
+    tasks: dict[str, Callable[[], object]] = {
+        "no bias": lambda: F.scaled_dot_product_attention(x["q"], x["k"], x["v"]).sum().backward()
+    }
+    for kernel in KERNELS[device]:
+        tasks[kernel] = lambda kernel=kernel: attend(kernel, large, x).sum().backward()
+    rows: dict[str, dict[str, Any]] = {name: {"kernel": name} for name in tasks}
     failed = False
-    for kernel in KERNELS:
-        row: dict[str, Any] = {"kernel": kernel}
+    for kernel in KERNELS[device]:
+        for dtype, tolerance in TOLERANCES.items():
+            column = f"error, {str(dtype).removeprefix('torch.')}"
+            try:
+                error, where = worst(kernel, dtype, device, heads)
+                rows[kernel][column] = f"{error:.1e} ({where})"
+                failed |= error > tolerance
+            except Exception as error:
+                rows[kernel][column], failed = reason(error), True
+    for name, task in [*tasks.items()]:
         try:
-            for clamp in CLAMPS:
-                worst = max(errors(kernel, clamp, device, heads).items(), key=lambda x: x[1])
-                row[f"error, {clamp} clamped"] = f"{worst[1]:.1e} ({worst[0]})"
-                failed |= worst[1] > 1e-4
-            given = leaves((heads, queries, tokens), device, torch.float32)
-            lines = rays(tokens, device, torch.float32)
-
-            def run(
-                kernel: AttentionKernel = kernel, given: Any = given, lines: Any = lines
-            ) -> None:
-                attend(given, lines, -5.0, kernel).sum().backward()
-
-            row["ms"], row["MiB"] = (round(x, 1) for x in timed(run, device))
+            task()
+            if device == "cuda":
+                rows[name]["MiB"] = round(peak_mebibytes(task), 1)
         except Exception as error:
-            row["failed"], failed = f"{type(error).__name__}: {error}".splitlines()[0], True
-        rows.append(row)
-    given = leaves((heads, queries, tokens), device, torch.float32)
-
-    def unbiased() -> None:
-        F.scaled_dot_product_attention(given["q"], given["k"], given["v"]).sum().backward()
-
-    time_, memory = timed(unbiased, device)
-    rows.append({"kernel": "no bias", "ms": round(time_, 1), "MiB": round(memory, 1)})
-    for row in rows:
+            rows[name]["failed"], failed = reason(error), True
+            del tasks[name]
+    for name, samples in zip(tasks, in_turn([*tasks.values()], 10, 1), strict=True):
+        rows[name]["ms"] = round(1000 * quartiles(samples)["median"], 1)
+    for row in rows.values():
         print(row, flush=True)
     if options.json:
-        options.json.write_text(json.dumps({"size": [queries, tokens], "rows": rows}, indent=1))
+        found = {"size": [queries, tokens], "rows": [*rows.values()]}
+        options.json.write_text(json.dumps(found, indent=1))
     raise SystemExit(failed)
+
+
+def reason(error: Exception) -> str:
+    """Its kind and the first line of what it says."""
+    return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 if __name__ == "__main__":

@@ -82,19 +82,27 @@ def steps(out: Path) -> Iterator[Step]:
     memory = ("--memory", "--step", "--rounds", "5", "--device", "cuda", "--json", "memory.json")
     tiny = [f"tiny/{name}.yaml" for name in TINY]
     yield Step("time and peak memory, tiny", ["qgs", "bench", *tiny, *memory], 900, "memory.json")
+    yield predicted(tiny, "float32", "tiny")
     for precision in ("float32", "bf16"):
         file = f"latency-{precision}.json"
         options = ("--precision", precision, "--device", "cuda", "--rounds", "30", "--warmup", "5")
         command = ["qgs", "bench", *PAIR, *options, "--memory", "--step", "--json", file]
         yield Step(f"latency at published size, {precision}", command, 900, file)
-    for name in PAIR:
-        command = ["qgs", "bench", name, "--predict", "--device", "cuda"]
-        yield Step(f"prediction of {name}", command, 300)
+        yield predicted(PAIR, precision, "published size")
+    yield Step("Triton kernels", [python, *tests, "tests/components/test_attention_triton.py"])
     command = [python, str(ROOT / "tools/gpu_attention.py"), "--json", "attention.json"]
     yield Step("attention kernels against float64, timed", command, 900, "attention.json")
     sweep = ("--sweep", "views=2..32", "--sweep", "queries=256..16384", "--json", "sweep.json")
     command = ["qgs", "bench", *PAIR, *sweep, "--device", "cuda", "--rounds", "5"]
     yield Step("growth with views and queries", command, 1800, "sweep.json")
+
+
+def predicted(recipes: Sequence[str], precision: str, size: str) -> Step:
+    """The prediction of what `qgs bench --memory --step` measures of these recipes."""
+    file = f"predicted-{size.replace(' ', '-')}-{precision}.json"
+    options = ("--batch", "1", "--precision", precision, "--device", "cuda", "--json", file)
+    command = ["qgs", "bench", *recipes, "--predict", *options]
+    return Step(f"predicted memory, {size}, {precision}", command, 300, file)
 
 
 def run_step(step: Step, out: Path) -> Done:
@@ -147,7 +155,7 @@ def write(done: Sequence[Done], out: Path) -> None:
         f"| {one.name} | {'passed' if one.passed else 'FAILED'} | {one.seconds:.0f} |"
         for one in done
     ]
-    lines += [*latencies(done), *attention(done)]
+    lines += [*latencies(done), *memory(done), *attention(done)]
     for one in done:
         if not one.passed:
             ended = "ran past its limit" if one.code is None else f"ended with {one.code}"
@@ -183,6 +191,36 @@ def latencies(done: Sequence[Done]) -> Iterator[str]:
                     ratio = seconds["ratio"]["median"]
                     cells += [f"{1000 * seconds['median']:.2f}", f"{ratio:.3f}"]
                 yield f"| {' | '.join(cells)} |"
+
+
+def memory(done: Sequence[Done]) -> Iterator[str]:
+    """What a training step of one scene takes: predicted and measured."""
+    found = [
+        (recipe["recipe"], recipe["precision"], recipe)
+        for one in done
+        if one.found and "recipes" in one.found
+        for recipe in one.found["recipes"]
+    ]
+    counted = {(name, precision): r for name, precision, r in found if "tensor_bytes" in r}
+    measured = {
+        (name, precision): r for name, precision, r in found if "step" in r.get("memory", ())
+    }
+    if not counted:
+        return
+    yield from ("", "## Memory of a training step", "")
+    yield "Measured is what torch allocated at most; predicted are the tensors of the same step."
+    yield from ("", "| recipe | precision | predicted, MiB | measured, MiB | error |")
+    yield "|---|---|--:|--:|--:|"
+    for name, precision in {**counted, **measured}:
+        cells = ["", "", ""]
+        if one := counted.get((name, precision)):
+            cells[0] = f"{one['tensor_bytes'] / 2**20:,.0f}"
+        if two := measured.get((name, precision)):
+            cells[1] = f"{two['memory']['step']['peak_bytes'] / 2**20:,.0f}"
+        if one and two:
+            error = one["tensor_bytes"] / two["memory"]["step"]["peak_bytes"] - 1
+            cells[2] = f"{100 * error:+.1f} %"
+        yield f"| {name} | {precision} | {' | '.join(cells)} |"
 
 
 def attention(done: Sequence[Done]) -> Iterator[str]:

@@ -11,6 +11,7 @@ Axes: F numbers of a query, G numbers of a token, n queries of a block.
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from copy import copy
 from typing import Any, TypeAlias, TypeVar
 
 import torch
@@ -75,13 +76,13 @@ class AttentionBias(ABC):
     @full_precision
     def gradients(
         self, queries_nF: Tensor, tokens_GM: Tensor, gradient_nM: Tensor
-    ) -> tuple[Tensor, Tensor | None]:
+    ) -> tuple[Tensor | None, Tensor | None]:
         """Gradients (n, F) of the queries and (G, M) of the tokens, given that of the bias.
 
-        The second is None where `self.tokens` requires none.
+        None for `self.queries` or `self.tokens` that require none; one of the two does.
         """
-        wanted = self.tokens.requires_grad
-        kernels = None if wanted else self._kernels(queries_nF)
+        of_queries, of_tokens = self.queries.requires_grad, self.tokens.requires_grad
+        kernels = None if of_tokens else self._kernels(queries_nF)
         if kernels is not None:
             out_nF = torch.empty_like(queries_nF)
             _in_rows(kernels[1], tokens_GM, queries_nF, gradient_nM, out_nF)
@@ -89,21 +90,26 @@ class AttentionBias(ABC):
         found: list[tuple[Tensor, ...]] = []
         for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
             with torch.enable_grad():
-                leaves = part_nF.detach().requires_grad_(), tokens_GM.detach()
-                leaves[1].requires_grad_(wanted)
+                leaves = part_nF.detach(), tokens_GM.detach()
+                leaves = leaves[0].requires_grad_(of_queries), leaves[1].requires_grad_(of_tokens)
                 value_nM = self.value(*leaves)
-            given = leaves[: 1 + wanted], part_nM.to(value_nM)
+            given = [leaf for leaf in leaves if leaf.requires_grad], part_nM.to(value_nM)
             found.append(torch.autograd.grad(value_nM, *given, materialize_grads=True))
-        of_queries, *of_tokens = zip(*found, strict=True)
-        return torch.cat(of_queries), torch.stack(of_tokens[0]).sum(0) if wanted else None
+        parts = list(zip(*found, strict=True))
+        summed_GM = torch.stack(parts[-1]).sum(0) if of_tokens else None
+        return torch.cat(parts[0]) if of_queries else None, summed_GM
 
     def _kernels(self, queries: Tensor) -> tuple[Kernel, Kernel] | None:
         usable = queries.device.type == "cpu" and queries.dtype == torch.float32
         return self.compiled() if usable and can_compile() else None
 
-    def dense(self) -> Tensor:
-        """The bias of all pairs, (B, N, M)."""
-        return _outside_graphs(_Dense.apply)(self.queries, self.tokens, self)
+    def dense(self, chosen: Tensor | None = None) -> Tensor:
+        """The bias of all pairs, (B, N, M), or of the queries with indices `chosen`, (B, Q, M)."""
+        bias = self
+        if chosen is not None:
+            bias = copy(self)
+            bias.queries = self.queries[:, chosen]
+        return _outside_graphs(_Dense.apply)(bias.queries, bias.tokens, bias)
 
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
         """All queries, block by block, with memory for `buffers` tensors of a block's shape."""
@@ -203,13 +209,16 @@ class _BiasGradients:
 
     def __init__(self, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> None:
         self._read, self._bias = (queries, tokens), bias
-        self.queries = torch.empty_like(queries)
+        self.queries = torch.empty_like(queries) if bias.queries.requires_grad else None
         self.tokens = torch.zeros_like(tokens) if bias.tokens.requires_grad else None
+        self.wanted = bias.queries.requires_grad or bias.tokens.requires_grad
 
     def add(self, scene: int, rows: slice, gradient_nM: Tensor) -> None:
         """Add those of a block, given the gradient of its values."""
         read = self._read[0][scene, rows], self._read[1][scene]
-        self.queries[scene, rows], of_tokens = self._bias.gradients(*read, gradient_nM)
+        of_queries, of_tokens = self._bias.gradients(*read, gradient_nM)
+        if self.queries is not None and of_queries is not None:
+            self.queries[scene, rows] = of_queries
         if self.tokens is not None and of_tokens is not None:
             self.tokens[scene] += of_tokens
 
@@ -236,10 +245,9 @@ class _BiasedAttention(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        q, k, v, queries, tokens, out, lse = ctx.saved_tensors
-        saved = queries, tokens, out, lse, gradients[0], ctx.bias
-        dq, dk, dv, *of_bias = _attention_gradients(q, k, v, *saved)
-        return dq.to(q), dk.to(k), dv.to(v), *of_bias, None
+        saved = ctx.saved_tensors
+        found = _attention_gradients(saved, gradients[0], ctx.bias, ctx.needs_input_grad)
+        return *(g if g is None else g.to(x) for g, x in zip(found, saved[:5], strict=True)), None
 
 
 def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tuple[Tensor, Tensor]:
@@ -263,24 +271,17 @@ def _attend_anywhere(
 
 @full_precision
 def _attention_gradients(
-    q: Tensor,
-    k: Tensor,
-    v: Tensor,
-    queries: Tensor,
-    tokens: Tensor,
-    out: Tensor,
-    lse: Tensor,
-    gradient: Tensor,
-    bias: AttentionBias,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """Gradients of q, k, v (all (B, h, ., d)), and of what the bias reads.
+    saved: tuple[Tensor, ...], gradient: Tensor, bias: AttentionBias, needs: tuple[bool, ...]
+) -> tuple[Tensor | None, ...]:
+    """Gradients of q, k, v (all (B, h, ., d)) that are needed, and of what the bias reads.
 
     With P the weights of a head and dO the gradient of its output: dV = P' dO,
     dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d), and the gradient
     of the bias is dS, summed over heads.
     """
+    q, k, v, queries, tokens, out, lse = saved
     scale = q.shape[-1] ** -0.5
-    dq, dk, dv = torch.empty_like(q), torch.zeros_like(k), torch.zeros_like(v)
+    dq, dk, dv = (torch.zeros_like(x) if needs[n] else None for n, x in enumerate(saved[:3]))
     of_bias = _BiasGradients(queries, tokens, bias)
     q, rowsum = q * scale, (gradient * out).sum(-1)
     for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
@@ -289,11 +290,16 @@ def _attention_gradients(
             of_queries, of_tokens = (scene, head, rows), (scene, head)
             torch.sub(b, lse[of_queries][:, None], out=p)
             p.addmm_(q[of_queries], k[of_tokens].mT).exp_()
-            dv[of_tokens].addmm_(p.mT, gradient[of_queries])
+            if dv is not None:
+                dv[of_tokens].addmm_(p.mT, gradient[of_queries])
             torch.mm(gradient[of_queries], v[of_tokens].mT, out=ds)
             ds.sub_(rowsum[of_queries][:, None]).mul_(p)
-            dq[of_queries] = ds @ k[of_tokens]
-            dk[of_tokens].addmm_(ds.mT, q[of_queries])
-            total.copy_(ds) if head == 0 else total.add_(ds)
-        of_bias.add(scene, rows, total)
-    return dq.mul_(scale), dk, dv, of_bias.queries, of_bias.tokens
+            if dq is not None:
+                dq[of_queries] = ds @ k[of_tokens]
+            if dk is not None:
+                dk[of_tokens].addmm_(ds.mT, q[of_queries])
+            if of_bias.wanted:
+                total.copy_(ds) if head == 0 else total.add_(ds)
+        if of_bias.wanted:
+            of_bias.add(scene, rows, total)
+    return None if dq is None else dq.mul_(scale), dk, dv, of_bias.queries, of_bias.tokens

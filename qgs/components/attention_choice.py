@@ -1,9 +1,9 @@
 """What computes attention with a bias that is a function.
 
-On a CPU blocks do. On CUDA the plain path does, with the bias of all pairs, as nothing else has
-been timed there, while one layer takes at most 1 / SHARE of the GPU's memory for it: every layer
-keeps its bias for the backward pass. Beyond that kernels in Triton do, or blocks without them. The
-choice goes by sizes alone, so that layers, steps and processes of a training choose alike.
+On a CPU: blocks. On CUDA: the plain path, with the bias of all pairs, while one layer needs at most
+1 / SHARE of the GPU's memory for it (every layer keeps its bias for the backward pass); for larger
+sizes Triton kernels, or blocks without them. No path has been timed on a GPU. The choice depends on
+sizes alone, so that layers, steps and processes of a training choose alike.
 """
 
 import logging

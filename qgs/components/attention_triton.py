@@ -1,9 +1,9 @@
-"""Attention with a bias that is a function, in Triton: what is of a pair stays in registers.
+"""Attention with a bias that is a function, in Triton: numbers of a pair stay in registers.
 
-As FlashAttention-2 (arXiv 2307.08691): a kernel goes through the tokens of a block of queries for
-the result, one for the gradients of the queries, and one through the queries of a block of tokens
-for those of keys and values. The bias and all sums are in float32, and each number is summed by one
-program in one order: the same bits each time.
+As FlashAttention-2 (arXiv 2307.08691): one kernel loops over the tokens of a block of queries for
+the result, one for the gradients of the queries, and one over the queries of a block of tokens for
+those of keys and values. The bias and all sums are in float32. Each number is summed by one program
+in one order, so results have the same bits each time.
 
 A bias brings two `jit` functions (`AttentionBias.triton_functions`), for a block of n queries and m
 tokens, of which it gets pointers (n, 1) and (1, m). The F numbers of a query are at `queries + f`,
@@ -36,9 +36,10 @@ def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
-    """Write what `_load` would read."""
-    at, inside = _at(x, scene, head, rows, count, width, WIDTH)
-    tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
+    """Write what `_load` would read, unless x is None."""
+    if x is not None:
+        at, inside = _at(x, scene, head, rows, count, width, WIDTH)
+        tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
 
 
 @jit
@@ -94,7 +95,7 @@ def _backward_queries(
     VALUE: tl.constexpr, GRADIENTS: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of q, and of what the bias reads of queries, of each head: (B, h, N, F)."""
+    """Gradients of q, and of what the bias reads of queries by heads, (B, h, N, F); or None."""
     each = tl.program_id(1).to(tl.int64)
     scene, head = each // heads, each % heads
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
@@ -113,11 +114,14 @@ def _backward_queries(
         logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
         of_p = tl.dot(of_g, tl.trans(of_v), input_precision="ieee")
         ds = tl.exp(logits - of_lse[:, None]) * (of_p - of_rowsum[:, None])
-        sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
-        bias_sums = GRADIENTS(queries, tokens, M, ds, bias_sums)
+        if dq is not None:
+            sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
+        if of_bias is not None:
+            bias_sums = GRADIENTS(queries, tokens, M, ds, bias_sums)
     _store(dq, scene, head, n, N, width, sums * scale, WIDTH)
-    for f in tl.static_range(F):
-        tl.store(of_bias + (each * N + n) * F + f, bias_sums[f], mask=n < N)
+    if of_bias is not None:
+        for f in tl.static_range(F):
+            tl.store(of_bias + (each * N + n) * F + f, bias_sums[f], mask=n < N)
 
 
 @jit
@@ -126,7 +130,7 @@ def _backward_tokens(
     VALUE: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of k and v. A query outside has the log-sum-exp inf, so its weights are 0."""
+    """Gradients of k and v, or None. Queries outside have log-sum-exp inf, so weights of 0."""
     each = tl.program_id(1).to(tl.int64)
     scene, head = each // heads, each % heads
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
@@ -144,9 +148,11 @@ def _backward_tokens(
         queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
         logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
         p = tl.exp(logits - of_lse[:, None])
-        v_sums += tl.dot(tl.trans(p.to(of_g.dtype)), of_g, input_precision="ieee")
-        ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum[:, None])
-        k_sums += tl.dot(tl.trans(ds.to(of_q.dtype)), of_q, input_precision="ieee")
+        if dv is not None:
+            v_sums += tl.dot(tl.trans(p.to(of_g.dtype)), of_g, input_precision="ieee")
+        if dk is not None:
+            ds = p * (tl.dot(of_g, tl.trans(of_v), input_precision="ieee") - of_rowsum[:, None])
+            k_sums += tl.dot(tl.trans(ds.to(of_q.dtype)), of_q, input_precision="ieee")
     _store(dk, scene, head, m, M, width, k_sums * scale, WIDTH)
     _store(dv, scene, head, m, M, width, v_sums, WIDTH)
 
@@ -172,22 +178,26 @@ class TritonAttention(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *saved, out, lse = ctx.saved_tensors
         (q, k, v, queries, _), (value, of_bias) = saved, ctx.functions
-        dq, dk, dv = torch.empty_like(q), torch.empty_like(k), torch.empty_like(v)
-        by_head = queries.new_empty(q.shape[0] * q.shape[1], *queries.shape[1:])
+        needs, shape = ctx.needs_input_grad, (q.shape[0] * q.shape[1], *queries.shape[1:])
+        dq, dk, dv = (torch.empty_like(x) if needs[n] else None for n, x in enumerate((q, k, v)))
+        by_head = queries.new_empty(shape) if needs[3] else None
         given = *saved, gradients[0], lse, (gradients[0].float() * out.float()).sum(-1)
-        _launch(_backward_queries, *given, dq, by_head, VALUE=value, GRADIENTS=of_bias)
-        _launch(_backward_tokens, *given, dk, dv, VALUE=value)
-        return dq, dk, dv, by_head.unflatten(0, q.shape[:2]).sum(1), None, None
+        if dq is not None or by_head is not None:
+            _launch(_backward_queries, *given, dq, by_head, VALUE=value, GRADIENTS=of_bias)
+        if dk is not None or dv is not None:
+            _launch(_backward_tokens, *given, dk, dv, VALUE=value)
+        summed = None if by_head is None else by_head.unflatten(0, q.shape[:2]).sum(1)
+        return dq, dk, dv, summed, None, None
 
 
-def _launch(kernel: Any, *tensors: Tensor, **functions: Any) -> None:
+def _launch(kernel: Any, *tensors: Any, **functions: Any) -> None:
     """Run a kernel for each head and block; tensors (B, h, ., d) go with their strides."""
     q, k, _, queries, tokens = tensors[:5]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = {"F": queries.shape[2], "G": tokens.shape[1], **_blocks(kernel, q, queries.shape[2])}
     over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
     grid = -(-over[0] // sizes[over[1]]), scenes * heads
-    arguments = [(x, x.stride()) if x.ndim == 4 else x for x in tensors]
+    arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
     with torch.cuda.device_of(q):
         kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes, **functions)
 

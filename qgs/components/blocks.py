@@ -134,7 +134,8 @@ class CrossAttentionCore(nn.Module):
     ) -> AttentionWeights:
         """Attention of the queries with indices `queries` (Q,), with the bias as in `forward`."""
         q_BhQd = self.project(x_BND)[:, :, queries]
-        bias = bias.dense() if isinstance(bias, AttentionBias) else bias
+        if isinstance(bias, AttentionBias):
+            return attention_weights(q_BhQd, k_BhMd, bias.dense(queries)[:, None])
         full = (len(x_BND), -1, x_BND.shape[1], k_BhMd.shape[2])
         bias_BhQM = None if bias is None else _by_head(bias).expand(full)[:, :, queries]
         return attention_weights(q_BhQd, k_BhMd, bias_BhQM)

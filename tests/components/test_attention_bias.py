@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.components import AttentionBias, attention_bias
+from qgs.components import AttentionBias, CrossAttentionCore, attention_bias
 from qgs.components.attention_bias import BLOCK, biased_attention
 from qgs.kernels import kernel
 
@@ -154,3 +154,70 @@ def test_tokens_get_gradients_where_they_want_them(wanted: bool) -> None:
     biased_attention(case["q"], case["k"], case["v"], bias).sum().backward()
     assert (tokens.grad is not None) == wanted
     assert case["positions"].grad is not None
+
+
+SUBSETS = [
+    [name for n, name in enumerate(("q", "k", "v", "positions", "tokens")) if 1 << n & bits]
+    for bits in range(1, 2**5)
+]
+
+
+@pytest.mark.parametrize("learnt", SUBSETS, ids=" ".join)
+@pytest.mark.parametrize("path", ["blocks", "kernels", "dense"])
+def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(
+    learnt: list[str], path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(BLOCK, "cpu", 4 * 60 * 7)
+    monkeypatch.setattr(attention_bias, "_PART", 100)
+    kind = CompiledNearness if path == "kernels" else Nearness
+    case = _case(13)
+    whole = {name for name in case if name != "gradient"}
+    if kind is CompiledNearness and "tokens" not in learnt:  # for which torch does the derivative
+        whole.remove("tokens")
+    made: list[tuple[object, ...]] = []
+
+    def gradients(names: set[str] | list[str]) -> dict[str, Tensor | None]:
+        leaves = {n: x.detach().clone().requires_grad_(n in names) for n, x in case.items()}
+        q, k, v, positions, tokens = (leaves[n] for n in ("q", "k", "v", "positions", "tokens"))
+        kernel = "plain" if path == "dense" else "blocks"
+        read = biased_attention(q, k, v, kind(positions, tokens), kernel)
+        read.backward(case["gradient"])
+        return {name: leaf.grad for name, leaf in leaves.items()}
+
+    expected = gradients(whole)
+    of_bias = AttentionBias.gradients
+    monkeypatch.setattr(
+        AttentionBias, "gradients", lambda *given: made.append(of_bias(*given)) or made[-1]
+    )
+    for name, found in gradients(learnt).items():
+        if name not in learnt:
+            assert found is None, name
+        elif path == "dense" and name in "qkv" and not {"positions", "tokens"} & {*learnt}:
+            torch.testing.assert_close(found, expected[name])  # torch's kernel is another one
+        else:
+            assert found is not None
+            assert torch.equal(found, expected[name]), name
+    for of_positions, of_tokens in made:
+        assert (of_positions is not None) == ("positions" in learnt)
+        assert (of_tokens is not None) == ("tokens" in learnt)
+    assert bool(made) == bool({"positions", "tokens"} & {*learnt})
+
+
+@pytest.mark.parametrize("kind", [Nearness, CompiledNearness])
+def test_an_explanation_makes_the_rows_that_are_asked_for(
+    kind: type[AttentionBias], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[int] = []
+    write = AttentionBias.write
+
+    def counting(self: AttentionBias, queries: Tensor, tokens: Tensor, out: Tensor) -> None:
+        rows.append(len(queries))
+        write(self, queries, tokens, out)
+
+    monkeypatch.setattr(AttentionBias, "write", counting)
+    bias = kind(torch.randn(2, 9, 4), torch.randn(2, 3, 11))
+    keys, chosen = torch.randn(2, 2, 11, 4), torch.tensor([7, 2, 7])
+    explained = CrossAttentionCore(8, 2).explain(torch.randn(2, 9, 8), keys, chosen, bias)
+    assert rows == [3, 3]
+    assert explained.geometry is not None
+    assert torch.equal(explained.geometry, bias.dense()[:, None, chosen])

@@ -199,6 +199,25 @@ def test_the_same_bits_each_time() -> None:
 
 @runs
 @kinds
+@pytest.mark.parametrize("learnt", ["q", "k", "v", "center", "kv", "q center"])
+def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(
+    learnt: str, kind: str
+) -> None:
+    case = {name: x.to(DEVICE) for name, x in _case((1, 2, 40, 70, 16)).items()}
+    names = ("q", "k", "v", "center")
+
+    def gradients(chosen: str) -> Leaves:
+        x = {n: leaf.detach().clone().requires_grad_(n in chosen) for n, leaf in case.items()}
+        _in_triton(x["q"], x["k"], x["v"], _bias(kind, x, -20.0)).backward(case["gradient"])
+        return {n: x[n].grad for n in names if x[n].grad is not None}
+
+    expected, found = gradients(" ".join(names)), gradients(learnt)
+    assert set(found) == {name for name in names if name in learnt}
+    assert all(torch.equal(found[name], expected[name]) for name in found)
+
+
+@runs
+@kinds
 @pytest.mark.skipif(DEVICE == "cpu", reason="the interpreter computes bfloat16 wrongly")
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision(dtype: torch.dtype, kind: str) -> None:
@@ -219,14 +238,17 @@ SHARED = {80: 166_912, 89: 101_376, 90: 232_448}
 @compiles
 @kinds
 @pytest.mark.parametrize(
-    ("arch", "dtype", "sizes"),
+    ("arch", "dtype", "sizes", "learnt"),
     [
-        (80, torch.bfloat16, (2, 4, 1000, 2000, 64)),
-        (89, torch.float16, (2, 4, 1000, 2000, 128)),
-        (89, torch.bfloat16, (1, 1, 100, 100, 256)),
-        (89, torch.float32, (2, 4, 1000, 2000, 128)),
-        (90, torch.bfloat16, (2, 4, 1000, 2000, 64)),
-        (90, torch.float32, (1, 1, 1, 1, 24)),
+        (80, torch.bfloat16, (2, 4, 1000, 2000, 64), "q k v center"),
+        (89, torch.float16, (2, 4, 1000, 2000, 128), "q k v center"),
+        (89, torch.bfloat16, (1, 1, 100, 100, 256), "q k v center"),
+        (89, torch.float32, (2, 4, 1000, 2000, 128), "q k v center"),
+        (90, torch.bfloat16, (2, 4, 1000, 2000, 64), "q k v center"),
+        (90, torch.float32, (1, 1, 1, 1, 24), "q k v center"),
+        (90, torch.bfloat16, (2, 4, 1000, 2000, 64), "v center"),
+        (90, torch.bfloat16, (2, 4, 1000, 2000, 64), "q"),
+        (90, torch.bfloat16, (2, 4, 1000, 2000, 64), "k"),
     ],
     ids=str,
 )
@@ -235,6 +257,7 @@ def test_kernels_compile_for_gpus_that_are_not_here(
     arch: int,
     dtype: torch.dtype,
     sizes: tuple[int, ...],
+    learnt: str,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
@@ -256,15 +279,13 @@ def test_kernels_compile_for_gpus_that_are_not_here(
     )
     monkeypatch.setattr(driver, "_active", gpu)
     case = _case(sizes)
-    bias = _bias(kind, {n: x.requires_grad_(n == "center") for n, x in case.items()}, -20.0)
+    bias = _bias(kind, {n: x.requires_grad_(n in learnt.split()) for n, x in case.items()}, -20.0)
     q, k, v = (case[name].to(dtype) for name in "qkv")
     read = attention.apply(q, k, v, bias.queries, bias.tokens, bias.triton_functions())
     read.sum().backward()
-    assert [kernel.metadata.name for kernel in compiled] == [
-        "_forward",
-        "_backward_queries",
-        "_backward_tokens",
-    ]
+    needed = {"_backward_queries": {"q", "center"}, "_backward_tokens": {"k", "v"}}
+    passes = [name for name, inputs in needed.items() if inputs & {*learnt.split()}]
+    assert [kernel.metadata.name for kernel in compiled] == ["_forward", *passes]
     for kernel in compiled:
         assert kernel.metadata.shared <= SHARED[arch]
         assert "tt.dot" in kernel.asm["ttir"]

@@ -6,7 +6,7 @@ tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
 from qgs_locus.anchors import AnchoredQueries
@@ -15,7 +15,7 @@ from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from torch import Tensor, nn
 
-from qgs.components import AttentionBias, CrossSelfMlp, LatentBottleneck
+from qgs.components import CrossSelfMlp, LatentBottleneck
 from qgs.components.encoder import PatchViT, imagenet_normalised
 from qgs.components.times import time_features
 from qgs.geometry.rays import camera_rays, plucker_rays
@@ -140,8 +140,8 @@ class _Recorder:
         self.found[f"cross_attn_out.{self.layer}"] = update
         if isinstance(module, RayBiasedCrossAttention):
             self.found[f"geo_gamma.{self.layer}"] = module.gamma
-            bias = cast(AttentionBias, module.bias(*args))
-            self.found[f"geo_bias.{self.layer}"] = bias.dense() / module.gamma
+            bias = module.bias(*args).dense()
+            self.found[f"geo_bias.{self.layer}"] = bias / module.gamma
 
     def _self_attention(self, module: nn.Module, args: Any, update: Tensor) -> None:
         self.found[f"self_attn_out.{self.layer}"] = update

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
-
-if TYPE_CHECKING:
-    from qgs.composer import Recipe
-    from qgs_bench.work import Workload
 
 app = typer.Typer(help="How fast and how large models are.")
 
@@ -72,7 +68,7 @@ def bench(
 
     others = {"--step": step, "--memory": memory, "--renderer": renderer}
     _refuse_beside("--sweep", sweep, {"--memory": memory, "--renderer": renderer})
-    _refuse_beside("--predict", predict, others | {"--sweep": sweep, "--json": json})
+    _refuse_beside("--predict", predict, others | {"--sweep": sweep})
     if within is not None and not predict:
         raise ValueError("--within says of which memory --predict speaks; give --predict too")
     if precision not in (None, "float32", "bf16"):
@@ -83,7 +79,7 @@ def bench(
     sources, changes = [str(path) for path in recipes], overrides or []
     if predict:
         work["device"] = "cuda" if device == "cuda" else choose_device(device, console.print)
-        return _predict(sources, changes, work, within, console)
+        return _predict(sources, changes, work, within, json, console)
     work |= {"batch": batch or 1, "precision": precision or "float32"}
     work["device"] = choose_device(device, console.print)
     options: dict[str, Any] = {"step": step, "rounds": rounds, "warmup": warmup}
@@ -152,6 +148,8 @@ def _sweep(
     show_sweep(report, console)
     if files:
         console.print(f"written to {', '.join(map(str, files))}")
+    if not any(series["points"] for series in report["series"]):
+        raise ValueError("no point of the sweep could be measured; the reasons are above")
 
 
 def _predict(
@@ -159,31 +157,31 @@ def _predict(
     overrides: list[str],
     work: dict[str, Any],
     within: str | None,
+    json: Path | None,
     console: Console,
 ) -> None:
-    from dataclasses import replace
-
     from qgs.composer import resolve
-    from qgs.engine.results import print_lines
-    from qgs.memory import in_words
-    from qgs_bench.output import show_need
-    from qgs_bench.predict import available, largest_batch, need_of, parse_bytes
+    from qgs.engine.results import as_json
+    from qgs.io.files import write_text
+    from qgs_bench.output import show_prediction
+    from qgs_bench.predict import KIND, available, parse_bytes, predict
+    from qgs_bench.run import refuse_other_file
     from qgs_bench.work import workload_of
 
+    if json is not None:
+        refuse_other_file(json, KIND)
     limit = available(work["device"]) if within is None else parse_bytes(within)
+    report: dict[str, Any] = {"report": KIND, "overrides": overrides, "limit_bytes": limit}
+    report["recipes"] = []
     for name in sources:
         recipe = resolve(name, overrides)
         config = recipe.training
         batch, precision = work["batch"] or config.batch_size, work["precision"] or config.precision
-        given = {**work, "batch": batch, "precision": precision}
-        workload = workload_of(recipe, **given)
-
-        def total(batch: int, recipe: Recipe = recipe, workload: Workload = workload) -> int:
-            return need_of(recipe, replace(workload, batch=batch)).total
-
+        workload = workload_of(recipe, **{**work, "batch": batch, "precision": precision})
         with console.status(f"counting {name}"):
-            need, most = need_of(recipe, workload), largest_batch(total, limit)
-        show_need(name, need, workload, console)
-        told = "fits" if need.total <= limit else "does not fit"
-        batches = f"the largest batch that does is {most}" if most else "not even a batch of 1 does"
-        print_lines(console, [f"{told} into {in_words(limit)} on {workload.device}; {batches}"])
+            found = {"recipe": name, **predict(recipe, workload, limit)}
+        report["recipes"].append(found)
+        show_prediction(found, limit, console)
+    if json is not None:
+        write_text(json, as_json(report))
+        console.print(f"written to {json}")

@@ -12,9 +12,7 @@ from qgs.io.files import replacing, write_text
 from qgs.memory import in_words
 from qgs.wording import counted, short_names
 from qgs_bench.figure import sweep_figure
-from qgs_bench.predict import Need
 from qgs_bench.sweep import as_csv
-from qgs_bench.work import Workload
 
 MEBIBYTE = 2**20
 TITLES = {
@@ -83,7 +81,7 @@ def _told(machine: Mapping[str, Any], report: Mapping[str, Any]) -> str:
 
 
 def show_sweep(report: Mapping[str, Any], console: Console) -> None:
-    """A table for each series, its exponents, and what was left out."""
+    """A table for each series, its exponents, and what was left out or failed."""
     console.print(_told(report["machine"], report), markup=False)
     names = short_names([*dict.fromkeys(s["recipe"] for s in report["series"])])
     short = dict(zip(dict.fromkeys(s["recipe"] for s in report["series"]), names, strict=True))
@@ -99,10 +97,12 @@ def show_sweep(report: Mapping[str, Any], console: Console) -> None:
         fits = series["fits"]
         words = {"seconds": "time", "counted_bytes": "tensors", "peak_bytes": "process"}
         told = [f"{words[k]} {_exponent(fits[k])}" for k in words if fits[k]]
-        left = [
-            f"left out: {series['axis']} {m['value']} {m['reason']}" for m in series["left_out"]
+        missing = [
+            f"{kind.replace('_', ' ')}: {series['axis']} {m['value']} {m['reason']}"
+            for kind in ("left_out", "failed")
+            for m in series[kind]
         ]
-        print_lines(console, [f"exponents: {'; '.join(told)}"] * bool(told) + left)
+        print_lines(console, [f"exponents: {'; '.join(told)}"] * bool(told) + missing)
 
 
 def _exponent(fit: Mapping[str, Any]) -> str:
@@ -134,13 +134,17 @@ def write_sweep(report: Mapping[str, Any], path: Path) -> list[Path]:
     return files
 
 
-def show_need(name: str, need: Need, work: Workload, console: Console) -> None:
-    """What a training takes, by what for."""
+def show_prediction(found: Mapping[str, Any], limit: int, console: Console) -> None:
+    """What a training takes, by what for, whether it fits into `limit` bytes, and which batch."""
     rows = [["", "bytes"]]
-    rows += [[what, in_words(size)] for what, size in (*need.step.items(), *need.besides.items())]
-    rows.append(["all", in_words(need.total)])
-    size = " x ".join(map(str, (work.batch, work.views, *work.size)))
-    title = f"{name}: training, B x V x H x W {size}, {work.precision}, on {work.device}"
+    rows += [[what, in_words(n)] for what, n in (*found["step"].items(), *found["besides"].items())]
+    rows.append(["all", in_words(found["total_bytes"])])
+    size = " x ".join(map(str, (found["batch"], found["views"], *found["size"])))
+    device, precision = found["device"], found["precision"]
+    title = f"{found['recipe']}: training, B x V x H x W {size}, {precision}, on {device}"
     print_table(console, title, rows)
-    kept = [f"{what} {in_words(size)}" for what, size in need.kept.items() if size]
-    print_lines(console, [f"kept for the backward pass: {', '.join(kept)}"] if kept else [])
+    kept = [f"{what} {in_words(size)}" for what, size in found["kept"].items() if size]
+    lines = [f"kept for the backward pass: {', '.join(kept)}"] if kept else []
+    fits, most = "fits" if found["fits"] else "does not fit", found["largest_batch"]
+    batches = f"the largest batch that does is {most}" if most else "not even a batch of 1 does"
+    print_lines(console, [*lines, f"{fits} into {in_words(limit)} on {device}; {batches}"])

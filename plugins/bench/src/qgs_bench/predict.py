@@ -1,8 +1,9 @@
-"""Whether a training fits into a memory, told before it begins: `qgs bench --predict`."""
+"""Whether a training fits into a memory, counted before it begins: `qgs bench --predict`."""
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import torch
 
@@ -11,6 +12,8 @@ from qgs.data.sampling import image_bytes
 from qgs.memory import available_bytes
 from qgs_bench.counting import count
 from qgs_bench.work import Workload
+
+KIND = "qgs bench --predict"
 
 PROCESS = {"cpu": 470 * 2**20, "cuda": 512 * 2**20}
 """What a process takes before it has a tensor. On a CPU Python, torch, numba and compiled kernels,
@@ -25,11 +28,12 @@ _UNITS = {"": 1, "k": 1000, "M": 1000**2, "G": 1000**3, "T": 1000**4}
 
 @dataclass(frozen=True)
 class Need:
-    """Bytes that a training takes at its peak. step: of a process that does a step alone, by what
-    for. besides: what `qgs train` holds besides on the same device. kept: of the step, what each
-    part of the model keeps for the backward pass.
+    """Bytes that a training takes at its peak. tensors: of a step alone. step: of a process that
+    does it, by what for. besides: what `qgs train` holds besides on the same device. kept: of the
+    step, what each part of the model keeps for the backward pass.
     """
 
+    tensors: int
     step: Mapping[str, int]
     besides: Mapping[str, int]
     kept: Mapping[str, int]
@@ -67,7 +71,23 @@ def need_of(recipe: Recipe, workload: Workload) -> Need:
         besides["two copies of good weights"] = 2 * found.weights
         images = workload.batch * (workload.views + workload.targets)
         besides["batches on their way"] = config.accumulate * image_bytes(images, workload.size)
-    return Need(held, besides, found.kept)
+    return Need(found.peak, held, besides, found.kept)
+
+
+def predict(recipe: Recipe, workload: Workload, limit: int) -> dict[str, Any]:
+    """What training `recipe` takes and whether that fits into `limit` bytes, for the report."""
+    need = need_of(recipe, workload)
+    most = largest_batch(lambda n: need_of(recipe, replace(workload, batch=n)).total, limit)
+    return {
+        **asdict(workload),
+        "tensor_bytes": need.tensors,
+        "step": dict(need.step),
+        "besides": dict(need.besides),
+        "kept": dict(need.kept),
+        "total_bytes": need.total,
+        "fits": need.total <= limit,
+        "largest_batch": most,
+    }
 
 
 def available(device: str) -> int:

@@ -6,18 +6,19 @@ import math
 import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
 
 from qgs.composer import Recipe, resolve
 from qgs.memory import in_words
-from qgs_bench.counting import count
-from qgs_bench.memory import peak_memory
+from qgs_bench.counting import Counted, count
+from qgs_bench.memory import Peak, peak_memory
 from qgs_bench.predict import PROCESS, RESERVE, available
 from qgs_bench.run import in_turn, machine, quartiles
-from qgs_bench.work import Operation, Workload, make_task, workload_of
+from qgs_bench.work import Operation, Task, Workload, make_task, workload_of
 
 KIND = "qgs bench --sweep"
 
@@ -108,73 +109,153 @@ def sweep(
 ) -> dict[str, Any]:
     """Measure all recipes along all axes, each from the recipe's own values of the others.
 
-    given: fields of the workload, as `workload_of` takes them. step: training steps too. rounds,
-    warmup: of each time. keep: called with the report so far, after each axis. A point whose
-    counted memory is more than is available is left out, and named with its reason. Returns the
-    report, plain values for JSON. Raises as `bench` does.
+    At each point the recipes take turns, round by round. given: fields of the workload, as
+    `workload_of` takes them. step: training steps too. rounds, warmup: of each time. keep: called
+    with the report so far, after each point. A recipe whose counted memory is more than is
+    available is left out of a point, one that raises there has failed; both are named with the
+    reason, and the others go on. Returns the report, plain values for JSON. Raises as `resolve`
+    does, before anything is measured.
     """
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
-    series: list[dict[str, Any]] = []
     settings = {"overrides": [*overrides], "rounds": rounds, "warmup": warmup}
-    report = {"report": KIND, "machine": machine(given["device"]), **settings, "series": series}
-    for source in sources:
-        for axis in axes:
-            found: dict[Operation, list[dict[str, Any]]] = {o: [] for o in operations}
-            missing: list[dict[str, Any]] = []
-            for value in axis.values:
-                recipe, work = at_point(source, overrides, axis.name, value, given)
-                for operation in operations:
-                    say(f"{source}: {operation}, {axis.name} {value}")
-                    reason, counted = _too_large(recipe, operation, work)
-                    if reason:
-                        missing.append({"value": value, "operation": operation, "reason": reason})
-                        continue
-                    point = _measured(recipe, operation, work, rounds, warmup)
-                    found[operation].append({"value": value, "counted_bytes": counted, **point})
-            for operation, points in found.items():
-                series.append(_series(source, axis.name, operation, points, missing))
-            keep(report)
-    return report
-
-
-def _too_large(recipe: Recipe, operation: Operation, work: Workload) -> tuple[str, int]:
-    """Why it is left out, or nothing; the bytes of its tensors."""
-    counted = count(recipe, operation, replace(work, device="cpu")).peak
-    needed = PROCESS[work.device] + round((1 + RESERVE) * counted)
-    limit = available(work.device)
-    if needed <= limit:
-        return "", counted
-    return f"needs {in_words(needed)}, {in_words(limit)} are available", counted
-
-
-def _measured(
-    recipe: Recipe, operation: Operation, work: Workload, rounds: int, warmup: int
-) -> dict[str, Any]:
-    """Seconds, and the peak of a fresh process."""
-    peak = peak_memory(recipe, operation, work, torch.get_num_threads())
-    task = make_task(operation, recipe, recipe.build_model(work.device), work)
-    (samples,) = in_turn([task], rounds, warmup)
-    return {"seconds": {**quartiles(samples), "samples": samples}, "memory": asdict(peak)}
-
-
-def _series(
-    source: str, axis: str, operation: Operation, points: list[Any], missing: list[Any]
-) -> dict[str, Any]:
-    values = [point["value"] for point in points]
-    costs = {
-        "seconds": [point["seconds"]["median"] for point in points],
-        "peak_bytes": [p["memory"]["peak_bytes"] - p["memory"]["idle_bytes"] for p in points],
-        "counted_bytes": [point["counted_bytes"] for point in points],
+    plan = {
+        (axis.name, value): [at_point(s, overrides, axis.name, value, given) for s in sources]
+        for axis in axes
+        for value in axis.values
     }
-    fits = {name: fit(values, found) for name, found in costs.items()}
-    return {
-        "recipe": source,
-        "axis": axis,
-        "operation": operation,
-        "points": points,
-        "left_out": [m for m in missing if m["operation"] == operation],
-        "fits": {name: found and asdict(found) for name, found in fits.items()},
+    series = {
+        (number, axis.name, operation): _Series(source, axis.name, operation)
+        for number, source in enumerate(sources)
+        for axis in axes
+        for operation in operations
     }
+
+    def report() -> dict[str, Any]:
+        found = [one.as_dict() for one in series.values()]
+        head = {"report": KIND, "machine": machine(given["device"]), **settings}
+        return {**head, "series": found}
+
+    for (axis, value), works in plan.items():
+        for operation in operations:
+            runs = [_Run(*work, operation) for work in works]
+            _measure(runs, rounds, warmup, say, f"{axis} {value}: {operation}, ")
+            for number, run in enumerate(runs):
+                series[number, axis, operation].add(value, run)
+        keep(report())
+    return report()
+
+
+@dataclass
+class _Run:
+    """A recipe at a point. missing: "left_out" or "failed", and why, if it was not measured."""
+
+    recipe: Recipe
+    work: Workload
+    operation: Operation
+    counted: Counted | None = None
+    peak: Peak | None = None
+    task: Task | None = None
+    samples: Sequence[float] = ()
+    missing: tuple[str, str] | None = None
+
+    def count(self) -> None:
+        self.counted = count(self.recipe, self.operation, replace(self.work, device="cpu"))
+
+    def measure_peak(self) -> None:
+        self.peak = peak_memory(self.recipe, self.operation, self.work, torch.get_num_threads())
+
+    def make(self) -> None:
+        model = self.recipe.build_model(self.work.device)
+        self.task = make_task(self.operation, self.recipe, model, self.work)
+
+    def call(self) -> None:
+        assert self.task is not None
+        self.task()
+
+    def attempt(self, action: Callable[["_Run"], None]) -> None:
+        """Do it, unless something went wrong before; what goes wrong is kept as the reason."""
+        if self.missing is None:
+            try:
+                action(self)
+            except Exception as error:
+                first = str(error).strip().partition("\n")[0]
+                self.missing = "failed", f"{type(error).__name__}: {first}"
+                self.task = None  # gives its memory to the others
+
+
+def _measure(
+    runs: Sequence[_Run], rounds: int, warmup: int, say: Callable[[str], None], label: str
+) -> None:
+    """Memory of each in a fresh process, then time of all in turn."""
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()  # of the point before, which would not count as free
+    say(f"{label}memory")
+    for run in runs:
+        run.attempt(_Run.count)
+    _leave_out(runs)
+    for action in (_Run.measure_peak, _Run.make):
+        for run in runs:
+            run.attempt(action)
+    tasks = [partial(run.attempt, _Run.call) for run in runs]
+    columns = in_turn(tasks, rounds, warmup, say, label)
+    for run, samples in zip(runs, columns, strict=True):
+        run.samples, run.task = samples, None
+
+
+def _leave_out(runs: Sequence[_Run]) -> None:
+    """Leave out what does not fit into memory beside what those before it keep between calls."""
+    kept = most = 0
+    for run in runs:
+        if (found := run.counted) is None:
+            continue
+        own = found.weights + found.inputs + found.gradients + found.moments
+        tensors = kept + own + max(most, found.peak - own)
+        needed = PROCESS[run.work.device] + round((1 + RESERVE) * tensors)
+        limit = available(run.work.device)
+        if needed > limit:
+            beside = " with the recipes before it" if kept else ""
+            told = f"needs {in_words(needed)}{beside}, {in_words(limit)} are available"
+            run.missing = "left_out", told
+        else:
+            kept, most = kept + own, max(most, found.peak - own)
+
+
+@dataclass
+class _Series:
+    """What was found of a recipe along an axis; left_out and failed name points with reasons."""
+
+    recipe: str
+    axis: str
+    operation: Operation
+    points: list[dict[str, Any]] = field(default_factory=list)
+    left_out: list[dict[str, Any]] = field(default_factory=list)
+    failed: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, value: int, run: _Run) -> None:
+        """Add what a run has found."""
+        if run.missing is not None:
+            kind, reason = run.missing
+            missing = {"value": value, "operation": self.operation, "reason": reason}
+            (self.left_out if kind == "left_out" else self.failed).append(missing)
+            return
+        assert run.counted is not None
+        assert run.peak is not None
+        seconds = {**quartiles(run.samples), "samples": [*run.samples]}
+        memory = {"counted_bytes": run.counted.peak, "memory": asdict(run.peak)}
+        self.points.append({"value": value, "seconds": seconds, **memory})
+
+    def as_dict(self) -> dict[str, Any]:
+        """With the fits, for the report."""
+        values = [point["value"] for point in self.points]
+        costs = {
+            "seconds": [p["seconds"]["median"] for p in self.points],
+            "peak_bytes": [
+                p["memory"]["peak_bytes"] - p["memory"]["idle_bytes"] for p in self.points
+            ],
+            "counted_bytes": [p["counted_bytes"] for p in self.points],
+        }
+        fits = {name: fit(values, found) for name, found in costs.items()}
+        return asdict(self) | {"fits": {n: found and asdict(found) for n, found in fits.items()}}
 
 
 def as_csv(report: Mapping[str, Any]) -> str:

@@ -29,7 +29,7 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         shape = shape_fields(config) if config.bandwidth == "radius" else {}
         return {n: f for n, f in super().requires(config).items() if n != RAW_RADIUS} | dict(shape)
 
-    def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias | Tensor:
+    def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
         config, sigma_sq_BN3 = self.config, self.sigma_sq(state)
         if not isinstance(sigma_sq_BN3, Tensor):

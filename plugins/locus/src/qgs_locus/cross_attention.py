@@ -90,7 +90,7 @@ class RayBiasedCrossAttention(CrossAttention):
         r_BN1 = support_radius(state[self.raw_radius], self.config)
         return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
-    def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias | Tensor:
+    def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
         config, eps = self.config, self.config.direction_eps
         rays_B6M = memory.once(
