@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = ("qgs", "plugins", "tests", "tools")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
-MAX_CORE_LINES, MAX_CORE_FILES = 23_100, 200
+MAX_CORE_LINES, MAX_CORE_FILES = 23_300, 200
 FORMER_NAME = re.compile(
     r"\bqgs-(locus|ellipsoid|c3g|gslrm|globalsplat|rooms|datatools|viewer|studies|bench|plugintools)\b"
     r"|pip install (qgs)\b|\bqgs\["

@@ -15,7 +15,15 @@ from torch import Tensor
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
-from qgs.data.sampling import Sample, make_sample, own_world, training_frames, views_in
+from qgs.data.sampling import (
+    Sample,
+    make_sample,
+    moments,
+    own_world,
+    spread,
+    training_frames,
+    views_in,
+)
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
     Picture,
@@ -105,9 +113,19 @@ def choose_sample(
     frames: Sequence[int] | None,
     compare: Sequence[int] | None,
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
-    """The views of `scene` that `choose_frames` picks, and their world as of `own_world`."""
+    """The views of `scene` that `choose_frames` picks, and their world as of `own_world`.
+
+    Where times are known, inputs spread over them, and views compared by default are of one.
+    """
     wanted, span = inputs or views.inputs, views.gap[1] + 1
+    usable = moments(scene, training_frames(scene))
+    if scene.times is not None and frames is None and wanted <= len(usable):
+        first = max(len(usable) - max(span, wanted), 0) // 2
+        frames = spread(usable[first : len(usable) - first], wanted)
     picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
+    if scene.times is not None and compare is None and picked[1]:
+        asked = scene.times[picked[1][len(picked[1]) // 2]]
+        picked = picked[0], tuple(frame for frame in picked[1] if scene.times[frame] == asked)
     (height, width), shown = scene.cameras.size, len(picked[0]) + len(picked[1])
     finer_by = max(1, round(ORBIT_SIDE / max(height, width))) ** 2
     refuse_beyond_memory(

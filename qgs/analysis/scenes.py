@@ -110,6 +110,8 @@ class GivenScene(Scene):
         if fault := odd_images(views.images):
             raise ValueError(fault)
         self.views = views.to("cpu")
+        if views.times is not None:
+            self.times = views.times[0].double().cpu()
 
     @property
     def cameras(self) -> Cameras:

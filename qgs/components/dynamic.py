@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.decoder import ContentSelfAttention
-from qgs.components.times import TimeEmbedding, without_data
+from qgs.components.times import TimeEmbedding, without_times
 from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,
@@ -66,7 +66,7 @@ class DynamicQueries(Queries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        yield from without_data(config.time_channels, context)
+        yield from without_times(config.time_channels, context)
         if config.dynamic >= config.count:
             yield Problem(
                 "dynamic",
@@ -96,8 +96,9 @@ class DynamicQueries(Queries):
         if config.time_channels:
             if views.target_time is None:
                 raise ValueError(
-                    "qgs/dynamic queries need the time that is asked for: give the input views a "
-                    "target_time (B, 1), or set model.queries.time_channels to 0"
+                    "qgs/dynamic queries need the time that is asked for: compare with photos of "
+                    "one time, give the input views a target_time (B, 1), or set "
+                    "model.queries.time_channels to 0"
                 )
             x_BND = x_BND + moves_N[:, None] * self.time_embedding(views.target_time)
         return QueryState(x_BND, {MOVES: moves_N.expand(batch, -1)} if config.dynamic else {})

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
-from qgs.components.times import TimeEmbedding, without_data
+from qgs.components.times import TimeEmbedding, without_times
 from qgs.contracts import ComponentConfig, Encoder, ModelDims, Problem, RecipeContext
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
@@ -101,7 +101,7 @@ class PatchViT(Encoder):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        yield from without_data(config.time_channels, context)
+        yield from without_times(config.time_channels, context)
         yield from undivided(config.patch_size, context)
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -135,8 +135,9 @@ class PatchViT(Encoder):
         if self.config.time_channels:
             if views.times is None:
                 raise ValueError(
-                    "this encoder reads the times of photos and these have none: give the views "
-                    "times (B, V), or set model.encoder.time_channels to 0"
+                    "this encoder reads the times of photos and these have none: give each frame "
+                    "of their transforms file a 'time' and pack chunks again, give the views times "
+                    "(B, V), or set model.encoder.time_channels to 0"
                 )
             x_XPD = x_XPD + self.time_embedding(views.times).flatten(0, 1)[:, None]
         return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=len(views.images))

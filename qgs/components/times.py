@@ -19,13 +19,14 @@ def time_features(times: Tensor, channels: int) -> Tensor:
     return torch.cat([angles.cos(), angles.sin()], -1)
 
 
-def without_data(channels: int, context: RecipeContext) -> Iterator[Problem]:
-    """The option `time_channels` where times would have to come from the recipe's data."""
-    if channels and context.inputs is not None:
+def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
+    """The option `time_channels` beside data that never tell times."""
+    if channels and context.inputs is not None and not context.times:
         yield Problem(
             "time_channels",
-            f"no source of data tells times yet: `time_channels: {channels}` reads them",
-            "set time_channels to 0, or take the data out of the recipe and give views with times",
+            f"the data of this recipe tell no times: `time_channels: {channels}` reads them",
+            "set time_channels to 0, or take qgs/photos (each frame of a transforms file with its "
+            "'time') or qgs/chunks packed from them",
         )
 
 

@@ -143,7 +143,9 @@ def resolve(
         data = parts.get(("data",))
         source = data.config if data else None
         size = source.image_size if isinstance(source, contracts.SceneSourceConfig) else None
-        context = contracts.RecipeContext(dims, size, settings["views",].inputs if data else None)
+        inputs = settings["views",].inputs if data else None
+        timed = bool(data and getattr(data.component, "tells_times", False))
+        context = contracts.RecipeContext(dims, size, inputs, timed)
         sound = {
             p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
         }

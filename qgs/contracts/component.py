@@ -75,12 +75,14 @@ class RecipeContext:
     """The rest of a recipe, as far as `Component.problems` sees it.
 
     image_size: (H, W) of the data's images; None for a recipe without data. inputs: how many input
-    views a training sample has; None likewise.
+    views a training sample has; None likewise. times: whether the data may tell when a photo was
+    taken.
     """
 
     dims: ModelDims
     image_size: tuple[int, int] | None = None
     inputs: int | None = None
+    times: bool = False
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ class Scene(ABC):
     """Frames that training never sees, so that evaluation can target them."""
     missing: Sequence[str] = ()
     """Images that are listed and do not exist; they are no frames, so later ones move up."""
+    times: Tensor | None = None
+    """When each frame (F,) was taken, float64, in any unit; None where nothing moves."""
 
     @property
     @abstractmethod
@@ -87,6 +89,8 @@ class SceneSource(Component):
     split_options: ClassVar[frozenset[str]] = frozenset()
     """Options that only choose which scenes and frames are trained on, and which are judged. Where
     an evaluation index names these, hashes of protocols leave them out too."""
+    tells_times: ClassVar[bool] = False
+    """Whether scenes may have `Scene.times`; models that read times are refused beside others."""
 
     class Config(SceneSourceConfig):
         """The common settings."""

@@ -9,7 +9,7 @@ world-to-camera matrix.
 
 `qgs` adds keys that other readers ignore: `names` (V strings), `sizes` (V, 2), the height and width
 of every image, `masks`, a list of V uint8 tensors with the bytes of PNG files, empty where a frame
-has none, and `held_out`, the frames that training is not to see.
+has none, `held_out`, the frames that training is not to see, and `times` (V,) float64, see `Scene`.
 """
 
 import io
@@ -58,6 +58,7 @@ class Record:
     sizes: Tensor | None
     masks: Sequence[Tensor] | None
     held_out: tuple[int, ...]
+    times: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -130,8 +131,11 @@ def parse_record(file: str, data: Any) -> Record:
     of_frames = all(isinstance(frame, int) and 0 <= frame < count for frame in held_out)
     wanted = f"'held_out' must list frames from 0 to {count - 1}"
     _expect(of_frames, where, f"{wanted}, got {listed(map(_said, held_out))}")
-    names = [str(name) for name in names]
-    return Record(where, data["key"], cameras, images, names, sizes, masks, held_out)
+    names, times = [str(name) for name in names], data.get("times")
+    if times is not None:
+        times = _tensor(where, "times", times, (count,)).double()
+        _expect(bool(times.isfinite().all()), where, "'times' must be finite numbers")
+    return Record(where, data["key"], cameras, images, names, sizes, masks, held_out, times)
 
 
 def _expect(valid: bool, where: str, reason: str) -> None:

@@ -83,6 +83,11 @@ class ChunkScene(EncodedScene):
         return tuple(range(every // 2, len(self), every)) if every else self._record.held_out
 
     @cached_property
+    def times(self) -> Tensor | None:  # type: ignore[override]  # known once the chunk is open
+        """See `Scene`."""
+        return self._record.times
+
+    @cached_property
     def cameras(self) -> Cameras:
         """See `Scene`; float64. Raises ValueError for cameras that cannot be used."""
         record, target = self._record, self._config.image_size
@@ -168,6 +173,7 @@ class ChunksSource(LazySource):
 
     name = "chunks"
     Config = ChunksConfig
+    tells_times: ClassVar[bool] = True
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
 

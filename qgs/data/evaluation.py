@@ -13,7 +13,16 @@ from torch import Tensor
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
 from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
-from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, training_frames
+from qgs.data.sampling import (
+    Frames,
+    Sample,
+    draw_frames,
+    gap_range,
+    make_sample,
+    moments,
+    spread,
+    training_frames,
+)
 from qgs.geometry.poses import largest_distance
 from qgs.wording import listed
 
@@ -89,7 +98,7 @@ class EvaluationPlan:
     With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
     of a scene with held-out frames `held_out_windows`, evenly thinned to `evaluation.scenes`; of
     the others `evaluation.samples` samples, inputs drawn as in training with `evaluation.seed`,
-    targets the other frames of the span.
+    targets the other frames of the span, or of one time. Targets of T times are T samples.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
     drawn: scenes of which samples were, once `samples` has run. Raises ValueError without scenes.
@@ -127,10 +136,11 @@ class EvaluationPlan:
                 place = self._places[name]
                 scene = self._scenes[place]
                 noise = np.random.default_rng([self._evaluation.seed, place])
-                for frames in self._choices(scene, place):
+                for inputs, targets in self._choices(scene, place):
                     if self.framing is None:
-                        self.framing = framing(scene, frames[0][0])
-                    yield make_sample(scene, *frames, self._views, mirror=False, noise=noise)
+                        self.framing = framing(scene, inputs[0])
+                    for part in [targets] if scene.times is None else moments(scene, targets):
+                        yield make_sample(scene, inputs, part, self._views, False, noise)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 
@@ -148,8 +158,8 @@ class EvaluationPlan:
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])
                 inputs, drawn = draw_frames(scene, self._views, rng)
-                between = tuple(f for f in range(inputs[0], inputs[-1] + 1) if f not in inputs)
-                yield inputs, between or tuple(sorted(set(drawn)))
+                every = range(inputs[0], inputs[-1] + 1) if scene.times is None else drawn
+                yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))
 
 
 def evaluation_samples(
@@ -186,25 +196,27 @@ def one_line(error: Exception) -> str:
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
     """Input and target frames such that every held-out frame is a target once.
 
-    A window of the largest gap (in training frames) is centred on the first held-out frame not yet
-    covered and shifted into the scene, inputs evenly spaced; all such frames within are targets.
+    A window of the largest gap (in training frames, or their times) is centred on the first
+    held-out frame not yet covered and shifted into the scene, inputs evenly spaced; all such frames
+    within are targets.
     """
-    usable = np.array(training_frames(scene))
-    gap = gap_range(len(usable), views, scene.name)[1]
+    usable = moments(scene, training_frames(scene))
+    gap = gap_range(len(usable), views, scene)[1]
+    when = np.arange(len(scene)) if scene.times is None else scene.times.numpy()
+    starts = when[[frames[0] for frames in usable]]
     windows: list[tuple[Frames, Frames]] = []
     covered: set[int] = set()
-    for frame in sorted(scene.held_out):
+    for frame in sorted(scene.held_out, key=lambda frame: (when[frame], frame)):
         if frame in covered:
             continue
-        centre = int(np.searchsorted(usable, frame))
+        centre = int(np.searchsorted(starts, when[frame]))
         first = min(max(centre - (gap + 1) // 2, 0), len(usable) - 1 - gap)
         span = usable[first : first + gap + 1]
-        places = np.linspace(0, gap, views.inputs) if views.inputs > 1 else np.array([gap // 2])
-        inputs = span[places.round().astype(int)]
-        inside = {f for f in scene.held_out if span[0] < f < span[-1]} | {frame}
+        start, end = when[span[0][0]], when[span[-1][0]]
+        inside = {f for f in scene.held_out if start < when[f] < end or when[f] == when[frame]}
         targets = sorted(inside - covered)
         covered.update(targets)
-        windows.append((tuple(map(int, inputs)), tuple(targets)))
+        windows.append((spread(span, views.inputs), tuple(targets)))
     return windows
 
 

@@ -6,7 +6,8 @@ Images are moved by NumPy, on one thread: torch's would wait for cores that trai
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -27,7 +28,7 @@ from qgs.geometry.poses import (
 )
 from qgs.memory import refuse_beyond_memory
 from qgs.types import Cameras, Views, concatenated, map_tensors
-from qgs.wording import numbered
+from qgs.wording import listed, numbered
 
 Frames: TypeAlias = tuple[int, ...]
 
@@ -69,24 +70,35 @@ def training_frames(scene: Scene) -> list[int]:
     return sorted({*range(len(scene))} - {*scene.held_out})
 
 
-def gap_range(count: int, views: ViewsConfig, scene: str) -> tuple[int, int]:
-    """Least and largest gap that `count` frames allow. Raises ValueError for too few."""
+def moments(scene: Scene, frames: Iterable[int]) -> list[Frames]:
+    """`frames` by the time at which they were taken; one by one, in order, where nothing moves."""
+    if scene.times is None:
+        return [(frame,) for frame in frames]
+    times, together = scene.times.tolist(), defaultdict[float, list[int]](list)
+    for frame in frames:
+        together[times[frame]].append(frame)
+    return [tuple(together[time]) for time in sorted(together)]
+
+
+def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
+    """Least and largest gap that `count` `moments` allow. Raises ValueError for too few."""
     low, high = views.gap
+    what = "frames" if scene.times is None else "times"
     if views.inputs - 1 > high:
         raise ValueError(
             f"views.inputs is {views.inputs}, but views.gap [{low}, {high}] spans only {high + 1} "
-            f"frames: raise the upper gap to {views.inputs - 1} or more, or ask for fewer inputs"
+            f"{what}: raise the upper gap to {views.inputs - 1} or more, or ask for fewer inputs"
         )
     if count < max(views.inputs, 2):
         raise ValueError(
-            f"scene {scene!r} has {count} frames for inputs, but views.inputs is {views.inputs} "
-            f"and at least {max(views.inputs, 2)} are needed: use fewer inputs, hold out fewer "
-            "frames, or drop the scene"
+            f"scene {scene.name!r} has {count} {what} for inputs, but views.inputs is "
+            f"{views.inputs} and at least {max(views.inputs, 2)} are needed: use fewer inputs, "
+            "hold out fewer frames, or drop the scene"
         )
     if count - 1 < low:
         warn_once(
-            f"scene {scene!r} has {count} frames for inputs, fewer than views.gap [{low}, {high}] "
-            f"asks for: its gap is {count - 1}"
+            f"scene {scene.name!r} has {count} {what} for inputs, fewer than views.gap "
+            f"[{low}, {high}] asks for: its gap is {count - 1}"
         )
     high = min(high, count - 1)
     return max(min(low, high), views.inputs - 1), high
@@ -114,23 +126,43 @@ def draw_frames(
     """Input frames, ascending, and target frames of a training sample, of a span of usable ones.
 
     Targets are no inputs, where there are enough frames; then inputs join, then frames repeat.
+    Where times are known, the span is of times, each input is of another one and of another camera,
+    as far as there are, and all targets are of one (TokenGS 2026.6).
     """
     refuse_too_many(views.inputs + views.targets, scene)
-    usable = training_frames(scene)
-    low, high = gap_range(len(usable), views, scene.name)
+    usable = moments(scene, training_frames(scene))
+    low, high = gap_range(len(usable), views, scene)
     gap = int(rng.integers(low, high + 1))
     first = int(rng.integers(0, len(usable) - gap))
     span = usable[first : first + gap + 1]
     if views.inputs == 1:
-        inputs = (int(rng.choice(span)),)
-    else:  # the two ends and frames between
+        places = [int(rng.choice(gap + 1))]
+    else:  # the two ends and moments between
         more = views.inputs - 2
-        between = rng.choice(span[1:-1], more, replace=False) if more else ()
-        inputs = (span[0], *sorted(map(int, between)), span[-1])
-    novel = rng.permutation([frame for frame in span if frame not in inputs]).astype(int)
-    targets = [*novel, *rng.permutation(inputs)][: views.targets]
-    targets += list(rng.choice(span, views.targets - len(targets)))
-    return inputs, tuple(map(int, targets))
+        between = rng.choice(range(1, gap), more, replace=False) if more else ()
+        places = [0, *sorted(map(int, between)), gap]
+    chosen = [span[place] for place in places]
+    inputs = one_of_each(chosen, rng.permutation(max(map(len, span))).tolist())  # of 1: no draw
+    pool = [frame for moment in span for frame in moment]
+    if scene.times is not None:
+        novel = [moment for moment in span if {*moment} - {*inputs}] or span
+        pool = novel[rng.integers(len(novel))]
+    targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
+    targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
+    targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
+    return inputs, tuple(map(int, targets[: views.targets]))
+
+
+def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
+    """A frame of each of these moments, by `cameras` in turn, as far as there are."""
+    return tuple(m[cameras[i % len(cameras)] % len(m)] for i, m in enumerate(chosen))
+
+
+def spread(span: Sequence[Frames], count: int) -> Frames:
+    """Frames of `count` moments, evenly spaced from the first to the last; one is the middle."""
+    last = len(span) - 1
+    places = np.linspace(0, last, count) if count > 1 else np.array([last // 2])
+    return one_of_each([span[place] for place in places.round().astype(int)], range(count))
 
 
 def make_sample(
@@ -148,6 +180,8 @@ def make_sample(
     world = own_world(scene, input_frames, views)
     both = views_in(world, scene, (*input_frames, *target_frames))
     count = len(input_frames)
+    if both.times is not None:
+        both = replace(both, target_time=_asked(both.times, count))
     if noise is not None and views.pose_noise:
         c2w = both.cameras.c2w[0].clone()
         c2w[:count] = shaken(c2w[:count], math.radians(views.pose_noise), noise)
@@ -157,6 +191,15 @@ def make_sample(
     names = {frame: scene.frame_name(frame) for frame in (*input_frames, *target_frames)}
     names = {frame: name for frame, name in names.items() if name != str(frame)}
     return Sample(scene.name, inputs, targets, input_frames, target_frames, names)
+
+
+def _asked(times: Tensor, inputs: int) -> Tensor | None:
+    """The time (1, 1) of the targets, of all views' (1, V); the inputs' median without targets.
+
+    None for targets of several times.
+    """
+    asked = times[:, inputs:].unique() if times.shape[1] > inputs else times.median()
+    return asked.reshape(1, 1) if asked.numel() == 1 else None
 
 
 def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
@@ -170,7 +213,7 @@ def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
 
 
 def views_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Views:
-    """Views (1, F) of these frames in a world as of `own_world`, float32."""
+    """Views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
@@ -183,7 +226,14 @@ def views_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> View
         torch.from_numpy(images.numpy()[order])[None],
         Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
         None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
+        None if scene.times is None else from_0_to_1(scene.times[list(frames)])[None].float(),
     )
+
+
+def from_0_to_1(times: Tensor) -> Tensor:
+    """Times (F,) as parts of the way from the first to the last (TokenGS 2026.6); 0 for equal."""
+    first, last = times.aminmax()
+    return (times - first) / (last - first) if last > first else torch.zeros_like(times)
 
 
 def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[Tensor, Tensor]:
@@ -249,7 +299,13 @@ def _flipped(images: Tensor) -> Tensor:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size."""
+    """Stack samples of equal view counts and image size. ValueError where only some have times."""
+    still = [sample.scene for sample in samples if sample.inputs.times is None]
+    if 0 < len(still) < len(samples):
+        raise ValueError(
+            f"scenes without times, {listed(still)}, are in a batch with others that have some: "
+            "write 'time' for the frames of all scenes, or of none"
+        )
     return Batch(
         stack_views([sample.inputs for sample in samples]),
         stack_views([sample.targets for sample in samples]),

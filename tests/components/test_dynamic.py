@@ -134,12 +134,13 @@ def test_views_without_times_are_refused() -> None:
         reconstruct(views(times))
 
 
-def test_data_tell_no_times_so_what_reads_them_is_refused_beside_data() -> None:
+def test_what_reads_times_is_refused_beside_data_that_tell_none() -> None:
     assert resolve(RECIPE)
+    assert resolve({**RECIPE, "data": {"type": "qgs/chunks", "path": "x"}})
     with pytest.raises(RecipeError) as caught:
-        resolve({**RECIPE, "data": {"type": "qgs/chunks", "path": "x"}})
+        resolve({**RECIPE, "plugins": ["rooms"], "data": {"type": "rooms/procedural"}})
     told = {problem.option: problem.reason for problem in caught.value.problems}
-    reason = "no source of data tells times yet: `time_channels: {}` reads them"
+    reason = "the data of this recipe tell no times: `time_channels: {}` reads them"
     assert told == {
         "model.encoder.time_channels": reason.format(4),
         "model.queries.time_channels": reason.format(2),

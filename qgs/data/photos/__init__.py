@@ -9,6 +9,7 @@ from upath import UPath
 
 from qgs.data.photos.blender import Blender
 from qgs.data.photos.cameras import CamerasJson
+from qgs.data.photos.checks import with_equal_times
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.llff import Llff
 from qgs.data.photos.nerfstudio import Nerfstudio
@@ -56,7 +57,7 @@ def read_listing(folder: UPath, format: Format = "auto", images: str | None = No
             f"{folder} holds photos in {len(held)} formats ({listings}) and is read as "
             f"{held[0].name}; `format: {held[1].name}` reads the other"
         )
-    return wanted[0].read(folder, images)
+    return with_equal_times(wanted[0].read(folder, images))
 
 
 def _listings() -> str:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from qgs.data.lenses import Intrinsics, Size
-from qgs.data.photos.reader import FrameProblem, PhotoFrame
+from qgs.data.photos.reader import FrameProblem, Listing, PhotoFrame
 from qgs.data.scenes import warn_once
 from qgs.wording import listed, numbered
 
@@ -108,6 +109,18 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
     said = f"{str(width)[:12]} x {str(height)[:12]}"
     reason = f"the listed size, {said} pixels, is none of a photo"
     return None, (FrameProblem("size", reason, "correct the width and height"),)
+
+
+def with_equal_times(listing: Listing) -> Listing:
+    """`listing`, with a problem for each frame that lacks the time that others have."""
+    count, without = len(listing.frames), sum(frame.time is None for frame in listing.frames)
+    reason = f"it has no 'time', like {without} of {count} frames, and the others have"
+    problem = FrameProblem("time", reason, "write it for each frame, or for none where none moves")
+    said = [
+        replace(frame, problems=frame.problems or (problem,)) if frame.time is None else frame
+        for frame in listing.frames
+    ]
+    return replace(listing, frames=said) if 0 < without < count else listing
 
 
 def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:

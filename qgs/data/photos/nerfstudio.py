@@ -113,6 +113,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
         lens=read(lambda: _lens(values), None),
         mask=folder / mask if isinstance(mask, str) and mask else None,
         depth=folder / depth if isinstance(depth, str) and depth else None,
+        time=read(lambda: _finite(entry, "time", "time"), None),
         problems=tuple(problems),
     )
 
@@ -185,12 +186,17 @@ def _lens(values: Mapping[str, Any]) -> Lens | None:
 
 def _coefficient(values: Mapping[str, Any], key: str) -> float:
     """A distortion coefficient; 0 where it is absent or null."""
+    return _finite(values, key, "lens", "the distortion ") or 0.0
+
+
+def _finite(values: Mapping[str, Any], key: str, field: str, kind: str = "") -> float | None:
+    """A number for a `field` of `PhotoFrame`; None where it is absent or null."""
     if values.get(key) is None:
-        return 0.0
+        return None
     number = _number(values, key)
     if number is None or not math.isfinite(number):
-        reason = f"the distortion {key!r} must be a finite number, got {values[key]!r}"
-        raise _UnreadableError("lens", reason, "correct it")
+        reason = f"{kind}{key!r} must be a finite number, got {values[key]!r}"
+        raise _UnreadableError(field, reason, "correct it")
     return number
 
 

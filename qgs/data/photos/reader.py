@@ -35,7 +35,8 @@ class PhotoFrame:
     name: the image file relative to the scene's folder. path: that file. mask: its mask; the image
     itself for its alpha channel. depth: its depth map. c2w: (4, 4) float64 OpenCV camera-to-world.
     intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the file where the
-    listing gives no size. lens: None for a pinhole. split: as listed, None without splits.
+    listing gives no size. lens: None for a pinhole. split: as listed, None without splits. time:
+    when it was taken, in the listing's unit; None where nothing moves.
     problems: what the listing says that cannot be read; a pose or intrinsics concerned are NaN.
     """
 
@@ -48,6 +49,7 @@ class PhotoFrame:
     mask: UPath | None = None
     depth: UPath | None = None
     split: Literal["train", "test", "unused"] | None = None
+    time: float | None = None
     problems: tuple[FrameProblem, ...] = ()
 
     def at_size(self, size: Size) -> Intrinsics:

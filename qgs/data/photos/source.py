@@ -78,6 +78,8 @@ class PhotoScene(EncodedScene):
         self.name, self._config, self._cache = name, config, cache
         frames, self.missing = present_frames(folder, config.format, config.images)
         self._frames = frames = frames[: config.max_frames or None]
+        times = [frame.time for frame in frames if frame.time is not None]
+        self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
         every = config.holdout
         self.held_out = tuple(range(every // 2, len(frames), every)) if every else ()
         if any(frame.split for frame in frames):
@@ -205,6 +207,7 @@ class PhotosSource(LazySource):
 
     name = "photos"
     Config = PhotosConfig
+    tells_times: ClassVar[bool] = True
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     def __init__(self, config: PhotosConfig) -> None:

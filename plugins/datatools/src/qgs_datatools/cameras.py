@@ -64,8 +64,9 @@ def sharing_findings(
         groups = _groups(poses[place, :3, :3].reshape(len(place), 9), _SAME)
         firsts = [sound[place[alike[0]]] for alike in groups]
         for first, alike in zip(firsts, groups, strict=True):
-            for other in alike[1:]:
-                yield _duplicate(scene, first, sound[place[other]])
+            for other in (sound[place[index]] for index in alike[1:]):
+                if scene.photos[first].listed.time == scene.photos[other].listed.time:
+                    yield _duplicate(scene, first, other)
         if len(groups) > 1:
             first, *rest = firsts
             yield scene.finding(

@@ -195,6 +195,7 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
         c2w=c2w,
         intrinsics=record.intrinsics(frame, size or (1, 1)),
         size=size,
+        time=None if record.times is None else float(record.times[frame]),
         problems=tuple(unit_problems(record, frame)),
     )
     return Photo(

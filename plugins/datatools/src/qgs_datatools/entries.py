@@ -87,8 +87,10 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
     )
 
 
-def chunk_entry(key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int]) -> ChunkEntry:
-    """The entry of a scene; see `qgs.data.chunks` for its keys."""
+def chunk_entry(
+    key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None = None
+) -> ChunkEntry:
+    """The entry of a scene; see `qgs.data.chunk_files` for its keys."""
     names = [frame.name for frame in frames]
     entry = {
         "key": key,
@@ -103,6 +105,8 @@ def chunk_entry(key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int
         entry["masks"] = [_bytes(frame.mask or b"") for frame in frames]
     if held_out:
         entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)
+    if times is not None:
+        entry["times"] = times.double().clone()
     return entry
 
 

@@ -180,7 +180,8 @@ def pack(
                     frames = list(encoded_frames(scene, encoding))
                     packed.frames += len(frames)
                     packed.kept += sum(kept for _, kept in frames)
-                    entry = chunk_entry(name, [frame for frame, _ in frames], scene.held_out)
+                    of_frames = [frame for frame, _ in frames]
+                    entry = chunk_entry(name, of_frames, scene.held_out, scene.times)
                 except (ValueError, OSError) as error:
                     if not leave_out_broken:
                         raise

@@ -77,7 +77,8 @@ def _frame(scene: Scene, frame: int) -> PhotoFrame:
     camera, name = scene.cameras[frame], scene.frame_name(frame)
     fx, fy, cx, cy = camera.intrinsics.tolist()
     c2w = camera.c2w.double().numpy()
-    return PhotoFrame(name, UPath(name), c2w, (fx, fy, cx, cy), camera.size)
+    time = None if scene.times is None else float(scene.times[frame])
+    return PhotoFrame(name, UPath(name), c2w, (fx, fy, cx, cy), camera.size, time=time)
 
 
 def _image_file(scene: Scene, frame: int) -> bytes:

@@ -15,7 +15,7 @@ from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
-from qgs.data.sampling import own_world, views_in
+from qgs.data.sampling import make_sample, own_world, views_in
 from qgs.engine.folder import checkpoint_of
 from qgs.geometry.poses import relative_to, scaled
 from qgs.io.checkpoint import load, load_recipe
@@ -88,7 +88,7 @@ class ModelSource(Source):
         picked, _ = choose_frames(len(self.scene), len(frames), 1, frames, compare=())
         world = own_world(self.scene, picked, self.views)
         device = next(self.model.parameters()).device
-        inputs = views_in(world, self.scene, picked).to(device)
+        inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
         place = Placement.between(world, self.world)
         labels = [self.labels[frame] for frame in picked]
         return look_inside(self.model, inputs, labels, picked, place)
