@@ -6,6 +6,7 @@ import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import typer
@@ -37,6 +38,8 @@ NEXT = {
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 """Parts of recipes that must be equal, so that only the models differ."""
+OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning")
+"""What may differ all the same: how a method trains, and what nobody tunes here."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class Entry:
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
     """Recipes by short name, under one time budget and seed.
 
-    Raises ValueError when two files differ in anything but the model and losses.
+    Raises ValueError when two files differ in anything but model, losses and `OF_THE_METHOD`.
     """
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
     names = short_names(files)
@@ -65,8 +68,13 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 def refuse_unequal(
     name: str, recipe: Recipe, other: str, others: Recipe, parts: Sequence[str]
 ) -> None:
-    """Raise ValueError where two recipes differ in one of `parts`."""
-    if unequal := [part for part in parts if recipe.tree[part] != others.tree[part]]:
+    """Raise ValueError where two recipes differ in one of `parts`, but for `OF_THE_METHOD`."""
+
+    def compared(part: str, of: Recipe) -> dict[str, Any]:
+        options = of.tree[part] or {}
+        return {name: x for name, x in options.items() if f"{part}.{name}" not in OF_THE_METHOD}
+
+    if unequal := [part for part in parts if compared(part, recipe) != compared(part, others)]:
         raise ValueError(
             f"{name} and {other} differ in {', '.join(unequal)}, so their figures could not be "
             "compared; make these parts equal, or take one at a time"
@@ -113,7 +121,8 @@ def _about(recipe: Recipe) -> str:
     readers = (*first, "cross_attention"), (*first, "layer"), ("model", "encoder")
     reader = next(place for place in readers if place in recipe.parts)
     chosen = [recipe.parts[place] for place in (("model", "queries"), reader)]
-    return " ".join(f"{part.type}: {summary_of(part.component)}" for part in chosen)
+    more = ["Trained on its input views too."] if recipe.training.judge_inputs else []
+    return " ".join([*(f"{part.type}: {summary_of(part.component)}" for part in chosen), *more])
 
 
 def curves_of(file: Path) -> Curves | None:

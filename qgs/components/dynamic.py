@@ -40,6 +40,7 @@ class DynamicQueries(Queries):
     """N learned vectors, of which the last ones also know the time that is asked for."""
 
     name: ClassVar[str] = "dynamic"
+    reads_cameras = False
 
     class Config(ComponentConfig):
         count: int = Field(default=1280, ge=1)

@@ -1,5 +1,6 @@
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,6 +60,15 @@ def test_recipes_with_other_data_are_not_compared(recipes):
     recipes[1].write_text(yaml.safe_dump(overlay))
     with pytest.raises(ValueError, match="more and few differ in views"):
         resolve_fairly(recipes, seconds=1, seed=0)
+
+
+def test_all_systems_can_be_compared():
+    """Though C3G trains on its input views and tuning would tune other things."""
+    names = ("tokengs", "locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "tokengs_latent")
+    compared = resolve_fairly([Path(f"tiny/{n}.yaml") for n in names], seconds=1, seed=0)
+    assert [*compared] == [*names]
+    assert compared["c3g"].training.judge_inputs
+    assert _about(compared["c3g"]).endswith("Trained on its input views too.")
 
 
 def test_budget_and_seed_are_those_asked_for(recipes):

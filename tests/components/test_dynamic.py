@@ -19,7 +19,7 @@ from qgs.contracts import ModelDims
 from qgs.contracts.schedule import follow
 from qgs.engine.objective import TrainingPass
 from qgs.model import QueryGaussianModel
-from qgs.types import ImageMemory, LayerPrediction
+from qgs.types import ImageMemory, LayerPrediction, Photos
 
 TOKENGS = Path(__file__).parents[2] / "recipes/tokengs"
 
@@ -132,6 +132,15 @@ def test_views_without_times_are_refused() -> None:
         reconstruct(views(target=torch.zeros(2, 1)))
     with pytest.raises(ValueError, match=r"the time that is asked for: .* target_time \(B, 1\)"):
         reconstruct(views(times))
+
+
+def test_dynamic_queries_do_without_cameras() -> None:
+    queries = DynamicQueries(DynamicQueries.Config(count=7, dynamic=3), DIMS)
+    torch.nn.init.normal_(queries.time_embedding.proj.weight)
+    given = views(target=torch.tensor([[0.1], [0.5]]))
+    photos: Any = Photos(given.images, target_time=given.target_time)
+    assert not DynamicQueries.reads_cameras
+    assert torch.equal(queries(MEMORY, photos).features, queries(MEMORY, given).features)
 
 
 def test_what_reads_times_is_refused_beside_data_that_tell_none() -> None:

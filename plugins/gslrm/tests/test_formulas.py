@@ -57,14 +57,14 @@ def queried() -> QueryState:
 def test_a_patch_knows_the_rays_of_its_pixels() -> None:
     origins, directions = camera_rays(cameras())
     o, d = patch_rays_at(patches(cameras(), ROWS, COLUMNS), P * P)
-    torch.testing.assert_close(d, in_patches(directions))
+    torch.testing.assert_close(F.normalize(d, dim=-1), in_patches(directions))
     torch.testing.assert_close(o.expand_as(d), in_patches(origins))
 
 
 @pytest.mark.parametrize(("count", "rows", "columns"), [(4, 2, 2), (2, 1, 2), (8, 2, 4), (3, 1, 3)])
 def test_another_number_of_gaussians_is_spread_evenly(count: int, rows: int, columns: int) -> None:
     """Their rays are those of a camera with pixels of another size."""
-    seen = patch_rays_at(patches(cameras(), ROWS, COLUMNS), count)[1]
+    seen = F.normalize(patch_rays_at(patches(cameras(), ROWS, COLUMNS), count)[1], dim=-1)
     fine = rows * ROWS, columns * COLUMNS
     factor = torch.tensor([fine[1] / SIZE[1], fine[0] / SIZE[0]] * 2, dtype=torch.float64)
     given = cameras()
@@ -97,6 +97,11 @@ def test_means_lie_on_the_rays_of_their_pixels(near: float, far: float) -> None:
     distance = (means - origins).norm(dim=-1)
     assert distance.min() > near
     assert distance.max() < far
+    deep = AlongRays(AlongRays.Config(near=near, far=far, measure="depth"), DIMS)
+    placed = deep(offsets, queried()).unflatten(1, (VIEWS, -1)).flatten(2, 3)
+    local = cameras().w2c[..., :3, :] @ F.pad(placed, (0, 1), value=1.0).mT
+    depth = (near * (1 - w) + far * w).unflatten(1, (VIEWS, -1)).flatten(2, 3)
+    torch.testing.assert_close(local[..., 2, :], depth[..., 0])
 
 
 def test_the_embedding_sees_nine_channels_of_every_pixel() -> None:

@@ -77,8 +77,8 @@ class VggtFeatures(Encoder):
 
     @classmethod
     def provides(cls, config: ComponentConfig) -> Fields:
-        """Features alone: neither keys and values, nor rays."""
-        return {"memory.features": MEMORY_FIELDS["memory.features"]}
+        """Features and their grid: neither keys and values, nor rays."""
+        return {name: MEMORY_FIELDS[name] for name in ("memory.features", "memory.grid")}
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:

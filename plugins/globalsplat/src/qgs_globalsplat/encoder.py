@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from qgs.components import Mlp
 from qgs.components.encoder import undivided
 from qgs.contracts import (
+    MEMORY_FIELDS,
     ComponentConfig,
     Encoder,
     Fields,
@@ -68,8 +69,10 @@ class PatchEncoder(Encoder):
 
     @classmethod
     def provides(cls, config: Config) -> Fields:
-        """Features of their own width, alone."""
-        return {"memory.features": FieldSpec((config.rgb_width + config.ray_width,))}
+        """Features of their own width, and a grid where there are no registers behind it."""
+        features = {"memory.features": FieldSpec((config.rgb_width + config.ray_width,))}
+        grid = {} if config.registers else {"memory.grid": MEMORY_FIELDS["memory.grid"]}
+        return {**features, **grid}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:

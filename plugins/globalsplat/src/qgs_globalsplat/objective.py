@@ -83,6 +83,9 @@ def subset(count: int, part: int) -> list[int]:
 
 @full_precision
 def disagreement(one: Tensor, other: Tensor) -> Tensor:
-    """Mean |one - other|, 0-d; each side gets half of the gradient, with the other one held."""
+    """Mean |one - other|, 0-d; each side gets half of the gradient, with the other one held.
+
+    The symmetric stop-gradient of the paper, averaged; a sum would give the whole gradient.
+    """
     held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()
     return (held[0] + held[1]) / 2

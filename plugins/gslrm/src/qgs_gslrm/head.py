@@ -26,7 +26,8 @@ class PixelHead(Head):
         """K, the Gaussians of each token: one per pixel where it is the square of the encoder's
         `patch_size`, fewer or more on an even grid otherwise."""
         position_channels: Literal[1, 3] = 3
-        """Raw numbers that place a Gaussian on its ray; of three the mean counts (paper: 1)."""
+        """Raw numbers that place a Gaussian on its ray; of three the mean counts (paper: 1).
+        With 1, centres other than `gslrm/along_rays` get three equal offsets."""
         scale_bias: float = -2.3
         """Added to the logarithm of scales, world units."""
         scale_limit: float | None = -1.2

@@ -1,7 +1,7 @@
 """`gslrm/pixels`, `gslrm/along_rays`: a query for each image token, means along rays of pixels."""
 
 import math
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -80,7 +80,9 @@ def patches(cameras: Cameras, rows: int, columns: int) -> Tensor:
 
 @full_precision
 def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """World-frame origins (B, N, 1, 3) and unit directions (B, N, K, 3) of K = `count` rays.
+    """World-frame origins (B, N, 1, 3) of K = `count` rays, and directions (B, N, K, 3).
+
+    Directions have length 1 along the axis of their camera.
 
     They go through the centres of a grid of K equal cells of the patch, row by row, as nearly
     square as K allows: through those of its pixels where K is their number.
@@ -93,14 +95,15 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
     along_BNc3 = across_BN3[..., None, :] * u_c[:, None]
     along_BNr3 = corner_BN3[..., None, :] + down_BN3[..., None, :] * v_r[:, None]
     directions = rearrange(along_BNr3, "b n r x -> b n r 1 x") + along_BNc3[..., None, :, :]
-    return origin_BN3[..., None, :], F.normalize(directions.flatten(2, 3), dim=-1)
+    return origin_BN3[..., None, :], directions.flatten(2, 3)
 
 
 class AlongRays(Centers):
     """mean = o + t d on the ray of the Gaussian's pixel, t = (1 - w) near + w far.
 
-    w is the sigmoid of the mean of the three raw offsets; d is a unit vector. K Gaussians of a
-    query stand on the rays of `patch_rays_at`.
+    w is the sigmoid of the mean of the three raw offsets; d is a unit vector, or for `measure:
+    depth` one of length 1 along the camera's axis. K Gaussians of a query stand on the rays of
+    `patch_rays_at`.
     """
 
     name: ClassVar[str] = "along_rays"
@@ -110,6 +113,8 @@ class AlongRays(Centers):
         """Least distance from the camera, world units."""
         far: float = Field(default=500.0, gt=0)
         """Largest distance from the camera, world units (500 for scenes, in the paper)."""
+        measure: Literal["distance", "depth"] = "distance"
+        """Whether t counts along the ray, or along the camera's axis (gs-lrm-unofficial)."""
 
         @model_validator(mode="after")
         def _far_is_beyond_near(self) -> Self:
@@ -130,12 +135,14 @@ class AlongRays(Centers):
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
         origins, directions = patch_rays_at(state[PATCH], offsets.shape[2])
-        return _placed(origins, directions, offsets, self.config.near, self.config.far)
+        return _placed(origins, directions, offsets, self.config)
 
 
 @full_precision
 def _placed(
-    origins: Tensor, directions: Tensor, offsets: Tensor, near: float, far: float
+    origins: Tensor, directions: Tensor, offsets: Tensor, config: AlongRays.Config
 ) -> Tensor:
+    if config.measure == "distance":
+        directions = F.normalize(directions, dim=-1)
     w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
-    return origins + ((1 - w_BNK1) * near + w_BNK1 * far) * directions
+    return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Fields, Loss, Problem, RecipeContext
-from qgs.losses import VisibilityOptions, view_visibility
+from qgs.losses import VisibilityOptions, mean_of_gaussians, view_visibility
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs_locus.fields import CENTER, CENTER_FIELD
 
@@ -48,4 +48,4 @@ class AnchorVisibility(Loss):
             behind=self.config.behind,
             z_guard=self.config.z_guard,
         )
-        return {"anchor_visibility": self.config.weight * per_anchor.mean()}
+        return {"anchor_visibility": self.config.weight * mean_of_gaussians(per_anchor, prediction)}

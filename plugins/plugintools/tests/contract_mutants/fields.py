@@ -86,7 +86,7 @@ class SearchesTheFields(NoRefinement):
         return state.replace(fields=moved)
 
 
-@mutant(CHECK, "reads some of rendering.alpha")
+@mutant(CHECK, "reads some of rendering.alpha", also="masked_queries_are_not_judged")
 class ReadsAnUndeclaredRendering(Loss):
     renderings = "none"
 
@@ -94,7 +94,7 @@ class ReadsAnUndeclaredRendering(Loss):
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
 
 
-@mutant(CHECK, "reads anchor.raw_radius")
+@mutant(CHECK, "reads anchor.raw_radius", also="masked_queries_are_not_judged")
 class ReadsAFieldOfThePrediction(Loss):
     renderings = "none"
 

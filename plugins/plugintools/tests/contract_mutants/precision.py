@@ -143,7 +143,7 @@ class ExplainsNoBias(BiasesInHalf):
         return self.core.explain(state.features, memory.keys, queries)
 
 
-@mutant(CHECK, "term: values differ")
+@mutant(CHECK, "term: values differ", also="masked_queries_are_not_judged")
 class MeasuresInHalf(OneTerm):
     renderings = "none"
 

@@ -342,6 +342,14 @@ class IgnoresTheMask(ContentSelfAttention):
         return self.attention(self.norm(state.features))
 
 
+@mutant("masked_queries_are_not_judged", "when masked queries and their Gaussians change")
+class JudgesWhatIsMasked(OneTerm):
+    renderings = "none"
+
+    def term(self, prediction, rendering, target):
+        return prediction.gaussians.scales.mean()
+
+
 @mutant("head_gives_gaussians", "gives {'features'}, and provides None")
 class GivesFeaturesUntold(GaussianHead):
     def activate(self, raw):

@@ -150,7 +150,11 @@ class DarkensByHeight(ChangedRenderer):
         return replace(gaussians, colors=gaussians.colors * height.sigmoid()), cameras
 
 
-@mutant("world_frame_makes_no_difference", "in a moved world, term")
+@mutant(
+    "world_frame_makes_no_difference",
+    "in a moved world, term",
+    also="masked_queries_are_not_judged",
+)
 class MeasuresFromTheOrigin(OneTerm):
     renderings = "none"
 
@@ -158,7 +162,11 @@ class MeasuresFromTheOrigin(OneTerm):
         return prediction.gaussians.means.square().mean()
 
 
-@mutant("world_frame_makes_no_difference", "in a moved world, term")
+@mutant(
+    "world_frame_makes_no_difference",
+    "in a moved world, term",
+    also="masked_queries_are_not_judged",
+)
 class MeasuresHeight(OneTerm):
     """Its spread: no shift of the world changes it, nor a turn about the y axis."""
 

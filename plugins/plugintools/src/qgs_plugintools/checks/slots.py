@@ -23,7 +23,15 @@ from qgs.contracts import (
     Split,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.types import GaussianAttributes, ImageMemory, Photos, QueryState, Views, map_tensors
+from qgs.types import (
+    GaussianAttributes,
+    ImageMemory,
+    LayerPrediction,
+    Photos,
+    QueryState,
+    Views,
+    map_tensors,
+)
 from qgs.wording import listed
 from qgs_plugintools.case import CannotCheck, Case, expect
 from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of
@@ -169,6 +177,33 @@ def check_loss_is_a_mean_over_scenes(case: Case) -> None:
     alone = [module(*map_tensors(lambda x, s=s: x[s : s + 1], inputs).values()) for s in range(2)]
     found = difference(_mean(*alone), module(*inputs.values()), 1e-4, 1e-6)
     expect(not found, f"against the mean over scenes, {found}")
+
+
+@check({"losses"})
+def check_masked_queries_are_not_judged(case: Case) -> None:
+    """What stands where the state's mask is False, with opacity 0, changes no term."""
+    module, inputs = case.lively(), inputs_of(case)
+    prediction, other = (inputs_of(case, seed=seed)["prediction"] for seed in range(2))
+    batch, queries = prediction.state.features.shape[:2]
+    mask_BN = (torch.arange(batch * queries) % 3 != 1).view(batch, queries)
+    mask_BN = mask_BN.to(prediction.state.features.device)
+
+    def seen(given: LayerPrediction) -> Any:
+        opacities = given.gaussians.opacities * _over(mask_BN, given.gaussians.opacities)
+        gaussians = replace(given.gaussians, opacities=opacities)
+        state = replace(given.state, mask=mask_BN)
+        return module(**{**inputs, "prediction": LayerPrediction(gaussians, state)})
+
+    others = leaves(other)
+    moved = mapped(prediction, lambda n, x: torch.where(_over(mask_BN, x), x, others[n]))
+    found = difference(seen(prediction), seen(moved), 1e-4, 1e-6)
+    expect(not found, f"when masked queries and their Gaussians change, {found}")
+
+
+def _over(mask_BN: Tensor, x: Tensor) -> Tensor:
+    """The mask of queries for a tensor of them or of their Gaussians, (B, N or G, 1, ...)."""
+    of_each = mask_BN.repeat_interleave(x.shape[1] // mask_BN.shape[1], 1)
+    return of_each.view(*of_each.shape, *[1] * (x.ndim - 2))
 
 
 @check({"losses"})
