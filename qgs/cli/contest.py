@@ -25,7 +25,7 @@ from qgs.io.files import read_records
 from qgs.io.ply import save_ply
 from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
-from qgs.wording import counted, short_names
+from qgs.wording import counted, listed, short_names
 
 PICTURED_SCENES = 6
 NEXT = {
@@ -182,9 +182,10 @@ def report_of(
     if torch.cuda.is_available():
         device = torch.cuda.get_device_name()
     threads = counted(torch.get_num_threads(), "thread")
+    names = listed((entry.contender.name for entry in entries), most=3)
     return Report(
         columns=entries[0].evaluation.columns,
-        title=f"{' and '.join(entry.contender.name for entry in entries)}: {scenes.lower()}",
+        title=f"{names}: {scenes.lower()}",
         lede=lede,
         scenes=scenes,
         notes=notes,

@@ -53,7 +53,7 @@ class Steps(Schedule):
     """A number for each of several ranges of steps."""
     values: tuple[float, ...]
     """The numbers, one more than there are steps in `at`."""
-    at: tuple[Step, ...] = Field(min_length=1)
+    at: tuple[Annotated[int, Field(ge=1)], ...] = Field(min_length=1)
     """Steps after which the next value holds, ascending."""
 
     @model_validator(mode="after")

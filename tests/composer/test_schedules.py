@@ -98,6 +98,7 @@ def test_another_schedule_replaces_the_one_below_whole() -> None:
             "need 2 steps in `at`, got 1",
         ),
         (f"{DILATION}={{schedule: linear, values: [1, 2], at: [2, 2]}}", "write [2]"),
+        (f"{DILATION}={{schedule: steps, values: [1, 2], at: [0]}}", "at least 1"),
         (f"{DILATION}={{schedule: steps, values: [1, 2], at: [3, 2]}}", "write [2, 3]"),
         (f"{DILATION}={{schedule: steps, values: [1, 2], at: [2, 3]}}", "part 3 values, got 2"),
         (f"{DILATION}={{schedule: linear, values: [1, -2], at: [1, 2]}}", "got the number -2"),
