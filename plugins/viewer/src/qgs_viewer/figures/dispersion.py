@@ -22,6 +22,7 @@ LONGEST = 40
 """Scenes of which each is named under its bars; of more every n-th."""
 FEWEST = 8
 """Scenes that there is room for, so that the bars of few are not broad."""
+IN_A_LINE = 3  # names of models in the legend
 LETTERS = 110
 """Letters that fit below all bars side by side."""
 
@@ -72,8 +73,9 @@ def scene_labels(samples: Sequence[Sample]) -> list[str]:
 def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence[str]) -> Figure:
     """Bars by scene for each model by name and each of its values; its mean as a dashed line."""
     kinds = list(next(iter(values.values())))
+    lines = -(-len(values) // IN_A_LINE) - 1  # of the legend, besides its first
     with paper_style():
-        drawn = new_figure(1.55 * len(kinds) + 0.3, gap=0.04)
+        drawn = new_figure((1.55 + 0.16 * lines) * len(kinds) + 0.3, gap=0.04)
         axes = drawn.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
         for axis, kind in zip(axes, kinds, strict=True):
             _bars(axis, {name: found[kind] for name, found in values.items()})
@@ -99,4 +101,6 @@ def _bars(axis: Axes, values: Mapping[str, Sequence[float]]) -> None:
     axis.tick_params(axis="x", length=0)
     axis.tick_params(axis="y", which="minor", length=0)
     axis.grid(visible=False, axis="x")
-    axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(values), borderaxespad=0)
+    axis.legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=min(len(values), IN_A_LINE), borderaxespad=0
+    )
