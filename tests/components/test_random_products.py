@@ -91,8 +91,9 @@ def _component(random: random.Random, slot: str, kind: str) -> dict[str, Any]:
     if "gaussians_per_query" in options and random.random() < 0.2:
         options["gaussians_per_query"] = random.choice([1, 3, 4])
     for option, _, changed in variants(component.Config.model_construct(**options)):
-        if random.random() < 0.06:
-            options[option] = getattr(changed, option)
+        choice = getattr(changed, option)
+        if isinstance(choice, bool | str) and random.random() < 0.06:
+            options[option] = choice
     return {"type": kind, **options}
 
 
@@ -109,8 +110,7 @@ def _drawn(random: random.Random) -> dict[str, Any]:
             del parts[slot]
     depth = random.choice([0, 1, 1, 2])
     decoder = {slot: parts[slot] for slot in LAYER if slot in parts and depth}
-    losses = {"qgs/photometric": {"type": "qgs/photometric"}}
-    losses |= {kinds["losses"]: parts["losses"]} if "losses" in parts else {}
+    losses = [{"type": "qgs/photometric"}, *([parts["losses"]] if "losses" in parts else [])]
     model = {slot: parts[slot] for slot in ("encoder", "queries", "head", "centers")}
     data = {"type": random.choice(["qgs/photos", "qgs/chunks"]), "path": "nowhere"}
     return {
@@ -123,7 +123,7 @@ def _drawn(random: random.Random) -> dict[str, Any]:
             },
             "renderer": {"type": "qgs/torch"},
         },
-        "losses": {kind.partition("/")[2]: loss for kind, loss in losses.items()},
+        "losses": {loss["type"].partition("/")[2]: loss for loss in losses},
         "objective": parts["objective"],
         "views": {"inputs": SIZES.views},
         **(
