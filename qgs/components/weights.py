@@ -173,6 +173,11 @@ def _read_times(shapes: Shapes, model: dict[str, Any]) -> None:
 def _encoder_of_2026_6(shapes: Shapes, depth: int) -> dict[str, Any]:
     """What the encoder, of `depth` blocks, has besides; nothing if it is none of 2026.6."""
     scales = layer_count(shapes, READOUT)
+    if not scales and LATENTS in shapes:  # published with `use_multiscale_encoder: False`
+        raise LayoutError(
+            f"{LATENTS} without {READOUT}0: latents that read the last block alone name its norm "
+            f"enc_dec_backbone.encoder_norm; rename that to {READOUT}0 in the file"
+        )
     if not scales:
         return {}
     if scales > depth:

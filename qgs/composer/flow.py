@@ -4,6 +4,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Literal, TypeAlias, get_args, get_origin
 
+from pydantic_core import PydanticUndefined, to_jsonable_python
+
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import KeyPath, MapNode, find
@@ -263,22 +265,23 @@ def _fixes(
     """Changes that provide all of `missing`, and the component that each changes or replaces."""
     fixes: dict[str, Chosen | None] = {}
     for earlier in before:
-        for option, value, config in variants(earlier.config):
+        for option, value, config in variants(earlier.config, ()):
             if missing.keys() <= _offers(earlier.component, config).keys():
                 fixes[f"set `{earlier.path}.{option}: {value}` on `{earlier.type}`"] = earlier
     if not fixes:
         standing = {chosen.place.slot.name: chosen for chosen in before}
         for slot in _FLOW[: _FLOW.index(reader.place.slot.name)]:
             for kind, component in registry.components(slot).items():
-                default = default_config(component)
+                default, there = default_config(component), standing.get(slot)
                 if default is None:
                     continue
+                plain = " with its default options" if there and there.type == kind else ""
                 others = ((f" with `{o}: {v}`", config) for o, v, config in variants(default))
-                for words, config in (("", default), *others):
+                for words, config in ((plain, default), *others):
                     if missing.keys() <= _offers(component, config).keys():
-                        fixes[f"use `{kind}`{words} in the slot `{slot}`"] = standing.get(slot)
+                        fixes[f"use `{kind}`{words} in the slot `{slot}`"] = there
                         break
-    for option, value, config in variants(reader.config):
+    for option, value, config in variants(reader.config, ()):
         with suppress(Exception):  # what fails with this option is not suggested
             if not missing.keys() & reader.component.requires(config).keys():
                 names = " and no ".join(missing)
@@ -303,22 +306,48 @@ def _mismatch(
         f"`{writer.type}` at {writer.path} ({writer.chosen_at}) writes it as {found}"
     )
     ours, theirs = reader.config.model_dump(mode="json"), writer.config.model_dump(mode="json")
-    differing = {o: theirs[o] for o in ours if o in theirs and ours[o] != theirs[o]}
-    if not differing:
-        return reason, f"choose another component than `{reader.type}` or `{writer.type}`"
-    words = ", ".join(f"{option}: {inline(value)}" for option, value in differing.items())
-    return reason, f"set `{words}` on `{reader.type}`, as on `{writer.type}`"
+    differing = [o for o in ours if o in theirs and ours[o] != theirs[o]]
+    shared = {option: getattr(writer.config, option) for option in differing}
+    if _asked(name, reader, reader.config.model_copy(update=shared)) == found and shared:
+        words = ", ".join(f"{option}: {inline(theirs[option])}" for option in differing)
+        return reason, f"set `{words}` on `{reader.type}`, as on `{writer.type}`"
+    numbers = [size for size in found.shape if isinstance(size, int)]
+    fixes = [
+        f"set `{reader.path}.{option}: {value}` on `{reader.type}`"
+        for option, value, config in variants(reader.config, numbers)
+        if _asked(name, reader, config) == found
+    ]
+    other = f"choose another component than `{reader.type}` or `{writer.type}`"
+    return reason, ", or ".join(fixes) or other
 
 
-def variants(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
-    """`config` with one choice made otherwise: option, new value in YAML, new config."""
+def _asked(name: str, reader: Chosen, config: ComponentConfig) -> FieldSpec | None:
+    """How `reader` would read the field `name` with `config`; None if it would not, or fails."""
+    with suppress(Exception):
+        return reader.component.requires(config).get(name)
+    return None
+
+
+def variants(
+    config: ComponentConfig, sizes: Sequence[int] | None = None
+) -> Iterator[tuple[str, str, ComponentConfig]]:
+    """`config` with one choice made otherwise: option, new value in YAML, new config.
+
+    With `sizes` other options are also set to their defaults, whole numbers to each of the sizes.
+    """
     for option, field in type(config).model_fields.items():
-        choices: tuple[object, ...] = (True, False) if field.annotation is bool else ()
-        if get_origin(field.annotation) is Literal:
+        choices: Sequence[object] = ()
+        if field.annotation is bool:
+            choices = True, False
+        elif get_origin(field.annotation) is Literal:
             choices = get_args(field.annotation)
+        elif sizes is not None:
+            numbers = sizes if field.annotation in (int, int | None) else ()
+            choices = [field.default, *(n for n in numbers if n != field.default)]
         for choice in choices:
-            if choice != getattr(config, option):
-                yield option, inline(choice), config.model_copy(update={option: choice})
+            if choice not in (getattr(config, option), PydanticUndefined):
+                new = config.model_copy(update={option: choice})
+                yield option, inline(to_jsonable_python(choice)), new
 
 
 def fits(shape: tuple[int, ...], wanted: Sequence[int | str | None]) -> bool:

@@ -87,7 +87,7 @@ class Recipe:
         return build_model(*arguments, device)
 
     def build_losses(self) -> dict[str, contracts.Loss]:
-        """Losses by the names that the recipe gives; without any, training refuses to start."""
+        """Losses by the names that the recipe gives; only one without data may have none."""
         return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
 
     def build_objective(self) -> contracts.Objective:
@@ -153,6 +153,10 @@ def resolve(
     _check_tuning(tree, settings["evaluation",], parts["model", "encoder"], registry, problems)
     _check_layer_scale(tree, decoder, parts, problems)
     _check_judged_inputs(tree, settings, parts["objective",], problems)
+    if ("data",) in parts and not any(path[0] == "losses" for path in parts):
+        reason = "a recipe with data needs at least one loss to train"
+        fix = "add one under `losses`, or drop the data with `data: null`"
+        problems.add(tree.origins.get("losses", tree.origin), "losses", reason, fix)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     out = _spell_out(tree, settings, registry, chosen)

@@ -93,6 +93,13 @@ def test_that_nothing_reads_which_queries_move_is_no_warning(dynamic: int) -> No
         resolve({**RECIPE, "model": {**RECIPE["model"], "queries": queries}})
 
 
+def test_a_recipe_without_dynamic_queries_is_told_which_option_makes_them() -> None:
+    with pytest.raises(RecipeError) as caught:
+        resolve(TOKENGS / "dynamic.yaml", ["model.queries.dynamic=0"])
+    fix = "set `model.queries.dynamic: 256` on `qgs/dynamic`"
+    assert [problem.fix for problem in caught.value.problems] == [fix, fix]
+
+
 def test_static_queries_do_not_see_dynamic_ones() -> None:
     queries = DynamicQueries(DynamicQueries.Config(count=7, dynamic=3, time_channels=0), DIMS)
     state = queries(MEMORY, views())

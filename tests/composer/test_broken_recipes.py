@@ -269,6 +269,11 @@ BROKEN = {
         "needs place.center (3 float32, world frame) and place.radius (1 float32, world frame)",
         "use `spatial/placed` in the slot `queries`",
     ),
+    "data without losses": (
+        "recipe: 1\nlosses: {photometric: null, visibility: null}\n"
+        "data: {type: qgs/photos, path: photos}\n",
+        2, "losses", "a recipe with data needs at least one loss", "add one under `losses`",
+    ),
     "missing base": (
         "recipe: 1\nextends: bases.yaml\n",
         2, "extends", "bases.yaml does not exist", "relative to the file it stands in",

@@ -88,6 +88,19 @@ def test_a_readout_of_more_blocks_than_there_are_fits_no_recipe() -> None:
         fitting_recipe(shapes, "file")
 
 
+def test_latents_of_the_last_block_are_read_once_its_norm_is_renamed() -> None:
+    """The release with `use_multiscale_encoder: False`, which parity is checked with."""
+    recipe = resolve(RECIPES / "tokengs/latent_2views_ssim.yaml", [*SMALL, "model.encoder.depth=1",
+                     "model.encoder.blocks=[1]", "model.supervision.layers=[2]"])  # fmt: skip
+    renamed = exact_names_of(recipe).published_shapes()
+    one, other = "enc_dec_backbone.multiscale_norms.0", "enc_dec_backbone.encoder_norm"
+    shapes = {name.replace(one, other): shape for name, shape in renamed.items()}
+    with pytest.raises(PublishedError, match=f"without {one}: .* name its norm {other}; rename"):
+        fitting_recipe(shapes, "file")
+    encoder = resolve(fitting_recipe(renamed, "file")[1]).tree["model"]["encoder"]
+    assert (encoder["type"], encoder["blocks"]) == ("qgs/latent_bottleneck", [1])
+
+
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("ablations/*.yaml")), ids=lambda p: p.stem)
 def test_every_ablation_has_a_published_name_for_each_parameter(recipe: Path) -> None:
     resolved = resolve(recipe)

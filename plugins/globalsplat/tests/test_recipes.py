@@ -81,11 +81,17 @@ def refused(*overrides: str) -> str:
 def test_what_cannot_work_is_refused_with_the_reason() -> None:
     told = refused("model.decoder.layer.memory_width=null")
     assert "`globalsplat/round` reads memory.features as D float32" in told
+    assert "fix: set `model.decoder.layer.memory_width: 96` on `globalsplat/round`" in told
     assert "writes it as 96 float32" in told
     told = refused("model.queries={type: qgs/latent, count: 8}")
     assert "needs globalsplat.texture" in told
     told = refused("model.encoder={type: qgs/multiview_vit}")
     assert "reads memory.features as 96 float32" in told
+    assert "fix: set `model.decoder.layer.memory_width: null` on `globalsplat/round`" in told
+    told = refused("model.encoder.rgb_width=32")
+    assert "fix: set `model.decoder.layer.memory_width: 64` on `globalsplat/round`" in told
+    assert resolve(RECIPES / "tiny" / "globalsplat.yaml", ["model.encoder.rgb_width=32",
+                   "model.decoder.layer.memory_width=64"])  # fmt: skip
     told = refused("model.decoder.layer={type: qgs/cross_self_mlp}")
     assert "needs memory.keys" in told
     told = refused("model.decoder.cross_attention={type: qgs/content}")
