@@ -9,6 +9,7 @@ import math
 import os
 import shutil
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,11 +128,15 @@ def write_nerfstudio(folder: Path, photos: PhotoSet, **top: Any) -> Path:
     return folder
 
 
-def write_blender(folder: Path, photos: PhotoSet, train: int, val: int = 0) -> Path:
+def write_blender(
+    folder: Path, photos: PhotoSet, train: int, val: int = 0, times: Sequence[object] = ()
+) -> Path:
     """The first photos are for training, then `val` for validation, the rest for tests.
 
-    Square pixels and a principal point in the middle are all that the format knows.
+    Square pixels and a principal point in the middle are all that the format knows. times: of the
+    photos, as D-NeRF writes them; ... leaves one out.
     """
+    when = dict(zip(photos.files, times, strict=False))
     parts = {"train": slice(0, train), "val": slice(train, train + val)}
     for part, chosen in {**parts, "test": slice(train + val, None)}.items():
         frames = []
@@ -139,6 +144,8 @@ def write_blender(folder: Path, photos: PhotoSet, train: int, val: int = 0) -> P
             (folder / part).mkdir(parents=True, exist_ok=True)
             Image.open(file).save(folder / part / f"{file.stem}.png")
             frame = {"file_path": f"./{part}/{file.stem}", "rotation": 0.01}
+            if when.get(file, ...) is not ...:
+                frame["time"] = when[file]
             frames.append({**frame, "transform_matrix": opengl(pose)})
         if frames:
             angle = 2 * math.atan(photos.size[1] / 2 / photos.intrinsics[0])

@@ -40,6 +40,7 @@ def test_a_bias_is_counted_as_attention_is() -> None:
     assert (plain.pairs, biased.pairs) == (0, 12 * 1024 * 2048)
 
 
+@pytest.mark.slow
 def test_memory_is_what_qgs_bench_predicts() -> None:
     small = ["model.width=32", "model.heads=2", "model.queries.count=12"]
     name, changes = "tiny/locus.yaml", ["data.image_size=[16, 24]", *small]

@@ -22,6 +22,7 @@ from qgs.drawing.figures import categorical, figure_style, hex_color
 from qgs.io.files import replacing, write_text
 
 PAGE = Path(__file__).parents[1] / "docs" / "evidence.md"
+UNITS = {"noise": "degrees of noise", "views": "input views"}
 REGION = re.compile(r"(<!-- study: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -59,6 +60,9 @@ def draw_lines(study: Path, file: Path) -> None:
     for name in found:
         if match := re.fullmatch(r"(\w+)_(\d+)", name):
             panels.setdefault(match[1], []).append(name)
+    if "exact" in found and "noise" in panels:
+        found["noise_0"] = found["exact"]
+        panels["noise"].insert(0, "noise_0")
     with figure_style():
         figure = Figure(figsize=(7.6, 2.9), layout="constrained")
         for axes, (what, names) in zip(
@@ -69,7 +73,8 @@ def draw_lines(study: Path, file: Path) -> None:
                 values, spread = zip(*(found[name][variant] for name in names), strict=True)
                 look = {"color": hex_color(categorical(place)), "marker": "o", "markersize": 3}
                 axes.errorbar(at, values, spread, label=variant, **look)
-            axes.set(title=f"PSNR, dB, over {what} in the test", xticks=at)
+            axes.set(xlabel=f"{UNITS[what]} in the test", xticks=at)
+        figure.axes[0].set(title="PSNR, dB; bars: sd over seeds")
         figure.axes[0].legend(loc="center left")
         write_webp(figure, file)
 

@@ -59,7 +59,7 @@ def write_fold(folder: Path, left_out: dict[str, Any], others: list[dict[str, An
 
 
 def print_table(out: Path) -> None:
-    """A row a scene: mean PSNR, over seeds and windows, of every variant and the nearest input."""
+    """A row a scene: mean PSNR, over seeds and windows, of every variant and of the baselines."""
     rows: dict[str, dict[str, list[float]]] = {}
     for file in sorted(out.glob("*/study/runs/*/*/evaluation/scenes.csv")):
         scene, variant = file.parts[-7], file.parts[-4]
@@ -67,10 +67,12 @@ def print_table(out: Path) -> None:
         with file.open(encoding="utf-8") as lines:
             for window in csv.DictReader(lines):
                 row.setdefault(variant, []).append(float(window["model_psnr"]))
-                row.setdefault("nearest input", []).append(float(window["nearest_input_psnr"]))
+                for baseline in ("nearest_input", "mean_colour"):
+                    row.setdefault(baseline, []).append(float(window[f"{baseline}_psnr"]))
     names = sorted({name for row in rows.values() for name in row})
     print("| scene left out |", " | ".join(names), "|\n|---|" + "--:|" * len(names))
-    rows["all windows"] = {n: [x for row in rows.values() for x in row.get(n, [])] for n in names}
+    whole = [row for row in rows.values() if row.keys() == {*names}]
+    rows["mean of rows without a gap"] = {n: [mean(row[n]) for row in whole] for n in names}
     for scene, row in rows.items():
         print(
             f"| {scene} |",

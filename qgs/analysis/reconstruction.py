@@ -118,7 +118,7 @@ def choose_sample(
     Where times are known, inputs spread over them, and views compared by default are of one.
     """
     wanted, span = inputs or views.inputs, views.gap[1] + 1
-    usable = moments(scene, training_frames(scene))
+    usable = moments(scene)
     if scene.times is not None and frames is None and wanted <= len(usable):
         first = max(len(usable) - max(span, wanted), 0) // 2
         frames = spread(usable[first : len(usable) - first], wanted)

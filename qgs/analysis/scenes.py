@@ -97,7 +97,7 @@ def reconstruct(
 
 
 class GivenScene(Scene):
-    """Views (1, V) as a scene. Raises ValueError for several scenes and images out of range."""
+    """Views (1, V) as a scene. ValueError for several scenes, odd images and a target time."""
 
     name = "views"
 
@@ -109,9 +109,11 @@ class GivenScene(Scene):
             )
         if fault := odd_images(views.images):
             raise ValueError(fault)
-        self.views = views.to("cpu")
-        if views.times is not None:
-            self.times = views.times[0].double().cpu()
+        if views.target_time is not None:
+            told = "a reconstruction is of the time of the photos that it is compared with"
+            raise ValueError(f"{told}: name them by `compare` in place of a target_time")
+        self.views = views = views.to("cpu")
+        self.times = None if views.times is None else views.times[0].double()
 
     @property
     def cameras(self) -> Cameras:

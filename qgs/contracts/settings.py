@@ -18,8 +18,8 @@ class ViewsConfig(ComponentConfig):
     targets: int = Field(default=4, ge=1)
     """Target views per sample, drawn from the span of the inputs."""
     gap: tuple[int, int] = (10, 40)
-    """[min, max] frames from the first input to the last, which count too; it shrinks to what a
-    scene has, with a warning where that is below min."""
+    """[min, max] frames, or times where they are known, from the first input to the last, which
+    count too; it shrinks to what a scene has, with a warning where that is below min."""
     frame: Literal["first_cam", "mean_cam"] = "first_cam"
     """The camera that becomes the identity: the first input, or the mean of the inputs."""
     scale: Literal["constant", "distance", "auto"] = "constant"

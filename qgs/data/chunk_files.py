@@ -133,7 +133,7 @@ def parse_record(file: str, data: Any) -> Record:
     _expect(of_frames, where, f"{wanted}, got {listed(map(_said, held_out))}")
     names, times = [str(name) for name in names], data.get("times")
     if times is not None:
-        times = _tensor(where, "times", times, (count,)).double()
+        times = _tensor(where, "times", times, (count,)).to(torch.float64, copy=True)
         _expect(bool(times.isfinite().all()), where, "'times' must be finite numbers")
     return Record(where, data["key"], cameras, images, names, sizes, masks, held_out, times)
 

@@ -13,16 +13,7 @@ from torch import Tensor
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
 from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
-from qgs.data.sampling import (
-    Frames,
-    Sample,
-    draw_frames,
-    gap_range,
-    make_sample,
-    moments,
-    spread,
-    training_frames,
-)
+from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, moments, spread
 from qgs.geometry.poses import largest_distance
 from qgs.wording import listed
 
@@ -196,11 +187,10 @@ def one_line(error: Exception) -> str:
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
     """Input and target frames such that every held-out frame is a target once.
 
-    A window of the largest gap (in training frames, or their times) is centred on the first
-    held-out frame not yet covered and shifted into the scene, inputs evenly spaced; all such frames
-    within are targets.
+    A window of the largest gap (in training frames, or times) is centred on the first such frame
+    not yet covered and shifted into the scene, inputs evenly spaced; all within are targets.
     """
-    usable = moments(scene, training_frames(scene))
+    usable = moments(scene)
     gap = gap_range(len(usable), views, scene)[1]
     when = np.arange(len(scene)) if scene.times is None else scene.times.numpy()
     starts = when[[frames[0] for frames in usable]]

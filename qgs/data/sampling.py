@@ -70,13 +70,13 @@ def training_frames(scene: Scene) -> list[int]:
     return sorted({*range(len(scene))} - {*scene.held_out})
 
 
-def moments(scene: Scene, frames: Iterable[int]) -> list[Frames]:
-    """`frames` by the time at which they were taken; one by one, in order, where nothing moves."""
-    if scene.times is None:
-        return [(frame,) for frame in frames]
-    times, together = scene.times.tolist(), defaultdict[float, list[int]](list)
-    for frame in frames:
-        together[times[frame]].append(frame)
+def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
+    """Frames, by default of training, by their times; one by one, as given, where nothing moves."""
+    frames = training_frames(scene) if frames is None else frames
+    times = None if scene.times is None else scene.times.tolist()
+    together = defaultdict[float, list[int]](list)
+    for number, frame in enumerate(frames):
+        together[times[frame] if times else number].append(frame)
     return [tuple(together[time]) for time in sorted(together)]
 
 
@@ -130,7 +130,7 @@ def draw_frames(
     as far as there are, and all targets are of one (TokenGS 2026.6).
     """
     refuse_too_many(views.inputs + views.targets, scene)
-    usable = moments(scene, training_frames(scene))
+    usable = moments(scene)
     low, high = gap_range(len(usable), views, scene)
     gap = int(rng.integers(low, high + 1))
     first = int(rng.integers(0, len(usable) - gap))
@@ -194,10 +194,7 @@ def make_sample(
 
 
 def _asked(times: Tensor, inputs: int) -> Tensor | None:
-    """The time (1, 1) of the targets, of all views' (1, V); the inputs' median without targets.
-
-    None for targets of several times.
-    """
+    """The time (1, 1) of targets, or the inputs' median, of all (1, V); None for several times."""
     asked = times[:, inputs:].unique() if times.shape[1] > inputs else times.median()
     return asked.reshape(1, 1) if asked.numel() == 1 else None
 

@@ -89,6 +89,7 @@ LIMITS: list[tuple[str, tuple[str, ...], float, float, tuple[str, ...]]] = [
     ("free", ("model.centers.input_limit",), 100.0, 0.1, (FREE,)),
     ("free", ("model.centers.output_limit",), 1000.0, 0.1, (FREE,)),
     ("free", ("model.centers.z_offset",), 1.0, 0.5, (FREE,)),
+    ("offset", ("model.centers.z_offset",), 1.0, 0.5, ("model.centers={type: qgs/offset}",)),
 ]
 """Component, its option, published default, another value, what else it takes to matter."""
 

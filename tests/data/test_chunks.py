@@ -1,4 +1,5 @@
 import json
+import math
 import os
 import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
@@ -197,6 +198,8 @@ BROKEN = {
         [record("s0", cameras=torch.zeros(5, 18))],
         r"scene 's0': 'cameras' must be a tensor of shape \[4, 18\].*got \[5, 18\]",
     ),
+    "a time for each": ([record("s0", times=torch.zeros(3))], r"'times' .* shape \[4\].*got \[3\]"),
+    "times": ([record("s0", times=torch.tensor([0, 1, 2, math.nan]))], "'times' must be finite"),
     "no images": ([record("s0", images=None)], "'images' must be a list of one-dimensional uint8"),
     "no frames": ([record("s0", 0)], "scene 's0': there are no frames"),
     "another key": ([record("s9")], "does not hold the scene 's0'.*it holds s9"),

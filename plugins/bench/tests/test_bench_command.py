@@ -17,6 +17,7 @@ def bench(*words: str | Path) -> Result:
     return run_qgs("bench", *words, *small, *sets())
 
 
+@pytest.mark.slow
 def test_tokengs_against_locusgs(tmp_path: Path) -> None:
     file = tmp_path / "reports/bench.json"
     result = bench(TOKENGS, LOCUS, "--step", "--memory", "--views", "3", "--json", file)

@@ -56,6 +56,7 @@ def test_the_exponent_of_a_power_and_its_error() -> None:
     assert fit([2], [1]) is None
 
 
+@pytest.mark.slow
 def test_a_sweep_writes_table_and_figure(tmp_path: Path) -> None:
     file = tmp_path / "sweep.json"
     words = ("bench", TOKENGS, LOCUS, "--sweep", "views=2..4", "--sweep", "queries=8..16")
@@ -82,6 +83,7 @@ def test_a_sweep_writes_table_and_figure(tmp_path: Path) -> None:
     assert "sweep.csv, sweep.png, sweep.pdf" in str(refused.exception)
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_left_out_and_told(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -101,6 +103,7 @@ def test_what_does_not_fit_is_left_out_and_told(
     assert "519 MB are available" in result.output
 
 
+@pytest.mark.slow
 def test_a_prediction_says_what_fits(tmp_path: Path) -> None:
     recipe, file = resolve(LOCUS), tmp_path / "p.json"
     words = ("--predict", "--within", "1GB", "--device", "cpu", "--json", file)

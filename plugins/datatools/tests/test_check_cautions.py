@@ -27,6 +27,32 @@ def test_a_repeated_photo_is_a_warning(room, shots):
     ]
 
 
+def with_times(*times):
+    def change(data):
+        for frame, time in zip(data["frames"], times, strict=False):
+            frame["time"] = time
+
+    return change
+
+
+def test_a_camera_that_stands_still_may_film_what_moves(room, shots):
+    room.poses(lambda number, pose: shots[2].c2w @ FLIP if number == 5 else pose)
+    assert len(told(room.path, geometry=0)) == 1
+    room.listing(with_times(*range(FRAMES)))
+    assert told(room.path, geometry=0) == []
+    room.listing(with_times(*[0.5] * FRAMES))
+    assert len(told(room.path, geometry=0)) == 1
+
+
+def test_times_that_are_wrong_or_missing(room):
+    room.listing(with_times(0, 1, "2", 3))
+    assert told(room.path, geometry=0) == [
+        "error: room, frame 2 (images/2.jpg): 'time' must be a finite number, got '2': correct it",
+        "error: room, frames 4-5 (images/4.jpg to images/5.jpg): it has no 'time', like 3 of 6 "
+        "frames, and the others have: write it for each, or for none where nothing moves",
+    ]
+
+
 def test_chunk_that_index_json_names_and_that_is_missing(chunks):
     index = '{"a": "0.torch", "c": "1.torch", "d": "0.torch"}'
     (chunks.path / "test" / "index.json").write_text(index)

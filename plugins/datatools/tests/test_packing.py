@@ -28,7 +28,9 @@ def noise(seed: int, size=(64, 48)) -> Image.Image:
     return Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
 
 
-def photos(path, frames: int = 4, suffix=".png", convert=lambda image: image, mask=False, **top):
+def photos(
+    path, frames: int = 4, suffix=".png", convert=lambda image: image, mask=False, times=None, **top
+):
     """A scene of noise in nerfstudio's format; returns its folder."""
     entries = []
     (path / "images").mkdir(parents=True, exist_ok=True)
@@ -40,7 +42,7 @@ def photos(path, frames: int = 4, suffix=".png", convert=lambda image: image, ma
         if mask and i % 2:
             noise(100 + i).convert("L").save(path / f"mask{i}.png")
             entry["mask_path"] = f"mask{i}.png"
-        entries.append(entry)
+        entries.append({**entry, "time": times[i]} if times else entry)
     (path / "transforms.json").write_text(json.dumps({**GIVEN, **top, "frames": entries}))
     return path
 
@@ -59,6 +61,8 @@ def same(one, other, tolerance: float = 0.0) -> None:
     frames = range(len(one))
     assert [one.frame_name(i) for i in frames] == [other.frame_name(i) for i in frames]
     assert list(one.held_out) == list(other.held_out)
+    assert (one.times is None) == (other.times is None)
+    assert one.times is None or torch.equal(one.times, other.times)
     assert (one.images(frames) - other.images(frames)).abs().max() <= tolerance
     expected, given = one.masks(frames), other.masks(frames)
     assert given is None if expected is None else torch.equal(expected, given)
@@ -75,6 +79,7 @@ CASES = {
     "grey": ({"convert": lambda image: image.convert("L")}, 0),
     "transparent": ({"convert": lambda image: with_alpha(image)}, 0),
     "masks": ({"mask": True}, 4),
+    "times": ({"times": [0.1, 0.2, 0.2, 0.7]}, 4),
     "distorted": ({"k1": -0.2, "p1": 0.01, "camera_model": "OPENCV"}, 0),
     "distorted masks": ({"mask": True, "k1": -0.2, "camera_model": "OPENCV"}, 0),
 }
@@ -111,7 +116,7 @@ def test_original_bytes_are_kept(tmp_path):
 
 
 def test_resized_and_as_jpeg(tmp_path):
-    before = source(photos(tmp_path / "scene", mask=True))
+    before = source(photos(tmp_path / "scene", mask=True, times=[3, 2, 1, 0]))
     pack(before, tmp_path / "png", packing.Encoding(resized=True))
     same(before.scenes("train")[0], packed(tmp_path / "png").scenes("train")[0])
     pack(before, tmp_path / "jpeg", packing.Encoding(resized=True, jpeg=90))
@@ -124,7 +129,7 @@ def test_resized_and_as_jpeg(tmp_path):
 @pytest.mark.parametrize("url", ["memory://packed{}", "file://{}"])
 def test_to_urls_and_from_chunks_again(tmp_path, url):
     first, second = (UPath(url.format(tmp_path / name)) for name in ("one", "two"))
-    before = source(photos(tmp_path / "scene", mask=True))
+    before = source(photos(tmp_path / "scene", mask=True, times=[1.7e9, 1.7e9, 1.7e9 + 0.01, 0]))
     pack(before, first)
     pack(packed(first), second)
     same(packed(first).scenes("train")[0], packed(second).scenes("train")[0])

@@ -115,7 +115,7 @@ def with_equal_times(listing: Listing) -> Listing:
     """`listing`, with a problem for each frame that lacks the time that others have."""
     count, without = len(listing.frames), sum(frame.time is None for frame in listing.frames)
     reason = f"it has no 'time', like {without} of {count} frames, and the others have"
-    problem = FrameProblem("time", reason, "write it for each frame, or for none where none moves")
+    problem = FrameProblem("time", reason, "write it for each, or for none where nothing moves")
     said = [
         replace(frame, problems=frame.problems or (problem,)) if frame.time is None else frame
         for frame in listing.frames

@@ -52,7 +52,7 @@ def workload_of(
 
 
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
-    """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point.
+    """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point, in time.
 
     The first is the identity; the field of view is some 53 degrees across the longer side.
     """
@@ -65,7 +65,8 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
         c2w[:, index, :3] = torch.tensor(turn)
     (height, width), focal = size, float(max(size))
     intrinsics = torch.tensor([focal, focal, width / 2, height / 2]).expand(batch, count, 4)
-    return Views(images, Cameras(c2w, intrinsics, size))
+    times = torch.linspace(0, 1, count).expand(batch, count)
+    return Views(images, Cameras(c2w, intrinsics, size), None, times, times[:, :1])
 
 
 Task: TypeAlias = Callable[[], object]

@@ -153,7 +153,8 @@ def geometry_findings(
     elif not geometry.agrees:
         reason = f"the poses do not explain the photos ({off}), nor in another convention"
         fix = "check that poses and photos are in the same order, and the intrinsics"
-        severity = "error" if geometry.fraction > _NONSENSE else "warning"
+        moves = len({photo.listed.time for photo in scene.photos}) > 1  # and what moves lies off
+        severity = "error" if geometry.fraction > _NONSENSE and not moves else "warning"
         yield scene.finding(frames, reason, fix, severity)
     else:
         for pair in geometry.pairs:
