@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from qgs.drawing.figures import categorical, figure_style, hex_color
 from qgs.wording import short_names
@@ -53,7 +53,9 @@ def _line(plot: Axes, series: Mapping[str, Any], cost: str, color: str, name: st
 def _label(plot: Axes, axis: str, cost: str, values: Sequence[int]) -> None:
     plot.set(xscale="log", yscale="log", xlabel=AXES[axis], title=cost)
     plot.set_xticks(sorted({*values}))
-    plot.xaxis.set_major_formatter(ScalarFormatter())
-    plot.xaxis.set_minor_formatter(NullFormatter())
+    plot.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    for of_axis in (plot.xaxis, plot.yaxis):
+        of_axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        of_axis.set_minor_formatter(NullFormatter())
     if values:
         plot.legend(fontsize=7)
