@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -76,17 +77,16 @@ def bench(
     work = {"views": views, "size": parse_size(size), "batch": batch, "precision": precision}
     use_threads(threads)
     console = Console()
-    sources, changes = [str(path) for path in recipes], overrides or []
+    call = _Call([str(path) for path in recipes], overrides or [], work, json, console)
     if predict:
         work["device"] = "cuda" if device == "cuda" else choose_device(device, console.print)
-        return _predict(sources, changes, work, within, json, console)
+        return _predict(call, within)
     work |= {"batch": batch or 1, "precision": precision or "float32"}
     work["device"] = choose_device(device, console.print)
     options: dict[str, Any] = {"step": step, "rounds": rounds, "warmup": warmup}
-    options |= {"overrides": changes}
     if sweep:
-        return _sweep(sources, sweep, work, options, json, console)
-    _compare(sources, work, options | {"memory": memory, "renderer": renderer}, json, console)
+        return _sweep(call, sweep, **options)
+    _compare(call, **options, memory=memory, renderer=renderer)
 
 
 def _refuse_beside(option: str, given: object, others: dict[str, Any]) -> None:
@@ -95,86 +95,87 @@ def _refuse_beside(option: str, given: object, others: dict[str, Any]) -> None:
         raise ValueError(f"{option} stands alone; give {', '.join(found)} in a call of its own")
 
 
-def _compare(
-    sources: list[str],
-    work: dict[str, Any],
-    options: dict[str, Any],
-    json: Path | None,
-    console: Console,
-) -> None:
+@dataclass(frozen=True)
+class _Call:
+    """What is measured and where the report goes. work: see `qgs_bench.work.workload_of`."""
+
+    recipes: list[str]
+    overrides: list[str]
+    work: dict[str, Any]
+    json: Path | None
+    console: Console
+
+    def refuse_other_file(self, *kind: str) -> None:
+        """Refuse to replace a file that is no such report, before anything is measured."""
+        from qgs_bench.run import refuse_other_file
+
+        if self.json is not None:
+            refuse_other_file(self.json, *kind)
+
+    def write(self, report: dict[str, Any]) -> None:
+        """Write the report where one is wanted."""
+        from qgs.engine.results import as_json
+        from qgs.io.files import write_text
+
+        if self.json is not None:
+            write_text(self.json, as_json(report))
+            self.console.print(f"written to {self.json}")
+
+
+def _compare(call: _Call, **options: Any) -> None:
     from qgs.composer import resolve
-    from qgs.engine.results import as_json
-    from qgs.io.files import write_text
     from qgs_bench.output import show
-    from qgs_bench.run import Subject, bench, refuse_other_file
+    from qgs_bench.run import Subject, bench
     from qgs_bench.work import workload_of
 
-    if json is not None:
-        refuse_other_file(json)
-    resolved = [(name, resolve(name, options["overrides"])) for name in sources]
-    subjects = [Subject(name, recipe, workload_of(recipe, **work)) for name, recipe in resolved]
-    with console.status("composing") as status:
-        report = bench(subjects, say=status.update, **options)
-    show(report, console)
-    if json is not None:
-        write_text(json, as_json(report))
-        console.print(f"written to {json}")
+    call.refuse_other_file()
+    resolved = [(name, resolve(name, call.overrides)) for name in call.recipes]
+    subjects = [
+        Subject(name, recipe, workload_of(recipe, **call.work)) for name, recipe in resolved
+    ]
+    with call.console.status("composing") as status:
+        report = bench(subjects, overrides=call.overrides, say=status.update, **options)
+    show(report, call.console)
+    call.write(report)
 
 
-def _sweep(
-    sources: list[str],
-    axes: list[str],
-    work: dict[str, Any],
-    options: dict[str, Any],
-    json: Path | None,
-    console: Console,
-) -> None:
+def _sweep(call: _Call, axes: list[str], **options: Any) -> None:
     from qgs_bench.output import refuse_other_files, show_sweep, write_sweep
-    from qgs_bench.run import refuse_other_file
     from qgs_bench.sweep import KIND, parse_axis, sweep
 
     parsed = [parse_axis(text) for text in axes]
-    if json is not None:
-        refuse_other_file(json, KIND)
-        refuse_other_files(json)
+    call.refuse_other_file(KIND)
+    if call.json is not None:
+        refuse_other_files(call.json)
     files: list[Path] = []
 
     def keep(report: dict[str, Any]) -> None:
-        if json is not None:
-            files[:] = write_sweep(report, json)
+        if call.json is not None:
+            files[:] = write_sweep(report, call.json)
 
-    with console.status("composing") as status:
-        report = sweep(sources, parsed, work, say=status.update, keep=keep, **options)
-    show_sweep(report, console)
+    given: dict[str, Any] = {"overrides": call.overrides, "keep": keep, **options}
+    with call.console.status("composing") as status:
+        report = sweep(call.recipes, parsed, call.work, say=status.update, **given)
+    show_sweep(report, call.console)
     if files:
-        console.print(f"written to {', '.join(map(str, files))}")
+        call.console.print(f"written to {', '.join(map(str, files))}")
     if not any(series["points"] for series in report["series"]):
         raise ValueError("no point of the sweep could be measured; the reasons are above")
 
 
-def _predict(
-    sources: list[str],
-    overrides: list[str],
-    work: dict[str, Any],
-    within: str | None,
-    json: Path | None,
-    console: Console,
-) -> None:
+def _predict(call: _Call, within: str | None) -> None:
     from qgs.composer import resolve
-    from qgs.engine.results import as_json
-    from qgs.io.files import write_text
     from qgs_bench.output import show_prediction
     from qgs_bench.predict import KIND, available, parse_bytes, predict
-    from qgs_bench.run import refuse_other_file
     from qgs_bench.work import workload_of
 
-    if json is not None:
-        refuse_other_file(json, KIND)
+    call.refuse_other_file(KIND)
+    work, console = call.work, call.console
     limit = available(work["device"]) if within is None else parse_bytes(within)
-    report: dict[str, Any] = {"report": KIND, "overrides": overrides, "limit_bytes": limit}
+    report: dict[str, Any] = {"report": KIND, "overrides": call.overrides, "limit_bytes": limit}
     report["recipes"] = []
-    for name in sources:
-        recipe = resolve(name, overrides)
+    for name in call.recipes:
+        recipe = resolve(name, call.overrides)
         config = recipe.training
         batch, precision = work["batch"] or config.batch_size, work["precision"] or config.precision
         workload = workload_of(recipe, **{**work, "batch": batch, "precision": precision})
@@ -182,6 +183,4 @@ def _predict(
             found = {"recipe": name, **predict(recipe, workload, limit)}
         report["recipes"].append(found)
         show_prediction(found, limit, console)
-    if json is not None:
-        write_text(json, as_json(report))
-        console.print(f"written to {json}")
+    call.write(report)
