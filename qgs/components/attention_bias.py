@@ -33,7 +33,7 @@ BLOCK = {"cpu": 2**22, "cuda": 2**25}
 
 _kept = threading.local()
 
-_UNIT = 2**16  # pairs that are worth a thread
+_UNIT = 2**20  # pairs that are worth a thread: some 0.1 ms
 _PART = 2**21  # pairs whose `value` is computed at a time, as it may take ten times the memory
 
 
