@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from qgs.contracts import Column
-from qgs.engine.comparison import crossed_interval, paired_interval
+from qgs.engine.comparison import CONFIDENCE, CROSSED, crossed_interval, paired_interval
 from qgs.engine.results import StoredResults, read_results
 from qgs.wording import listed
 from qgs_studies.hypotheses import MAIN, Contrast
@@ -188,8 +188,7 @@ class Results:
         if any(len(e.by_seed) > 1 for e in estimates):
             notes.append(
                 "intervals: 95 %, of the mean paired difference to the reference over trainings "
-                "and scenes, both random (two-way variance, t with the degrees of freedom of "
-                "Hillis 2007); sd: over seeds, of means over scenes"
+                f"and scenes, both random ({CROSSED}); sd: over seeds, of means over scenes"
             )
         if any(len(e.by_seed) == 1 for e in estimates):
             notes.append(
