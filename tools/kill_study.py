@@ -35,6 +35,7 @@ variants:
 reference: locus
 seeds: [0, 1, 2]
 budget: {{steps: {steps}}}
+differs: [losses.anchor_visibility]
 evaluations: {{more: {{views: {{inputs: 3}}}}}}
 hypotheses: [free < locus, tokengs@more - tokengs < locus@more - locus]
 """
