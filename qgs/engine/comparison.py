@@ -264,9 +264,9 @@ def crossed_interval(
     """Interval of the mean of differences (S, C) of S >= 2 trainings, each on the same C scenes.
 
     Both are random: it holds for other trainings and for other scenes; see `crossed_error`. None
-    for fewer than two trainings.
+    for fewer than two of either.
     """
-    if len(values) < 2:
+    if min(values.shape) < 2:
         return None
     error, freedom = crossed_error(values)
     half = t_quantile(float(freedom), confidence) * error
@@ -282,17 +282,15 @@ def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     *_, trainings, scenes = values.shape
     of_training, of_scene = values.mean(-1, keepdims=True), values.mean(-2, keepdims=True)
-    whole = scenes * of_training.var((-2, -1), ddof=1)
-    spread, least = whole**2 / (trainings - 1), min(trainings, scenes) - 1
-    if scenes > 1:
-        between = trainings * of_scene.var((-2, -1), ddof=1)
-        rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
-        noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
-        own = between > noise  # else scenes add no variance of their own
-        whole = whole + own * (between - noise)
-        spread = spread + own * (between**2 + noise**2 / (trainings - 1)) / (scenes - 1)
-    freedom = whole**2 / np.where(spread, spread, 1.0)
-    return np.sqrt(whole / (trainings * scenes)), np.maximum(freedom, max(least, 1))
+    rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
+    noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
+    first = scenes * of_training.var((-2, -1), ddof=1)
+    second = trainings * of_scene.var((-2, -1), ddof=1)
+    own = second > noise  # else scenes add no variance of their own
+    whole = first + own * (second - noise)
+    spread = first**2 + own * (second**2 * (trainings - 1) + noise**2) / (scenes - 1)
+    freedom = (trainings - 1) * whole**2 / np.where(spread, spread, 1.0)
+    return np.sqrt(whole / (trainings * scenes)), np.maximum(freedom, min(trainings, scenes) - 1)
 
 
 def t_quantile(freedom: float, confidence: float = CONFIDENCE) -> float:

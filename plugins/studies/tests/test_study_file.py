@@ -151,7 +151,9 @@ def test_what_is_wrong_is_told_with_its_line_before_anything_trains(
     assert fix in text
 
 
-INDICES = "overlay: {evaluation: {index: 2views.json}}\nevaluations: {more: {evaluation: {index: 3views.json}}}\n"
+INDICES = """overlay: {evaluation: {index: 2views.json}}
+evaluations: {more: {evaluation: {index: 3views.json}}}
+"""
 
 
 def study_with_indices(folder: Path) -> Study:
