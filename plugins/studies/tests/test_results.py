@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import fill_evidence
 import numpy as np
 import pytest
 from qgs_studies.figures import write_figures
@@ -283,3 +284,15 @@ def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path: P
     )
     head, *rows = table_rows(found)
     assert [row[head.index("published")] for row in rows][:2] == ["24.000", "23.500"]
+
+
+@pytest.mark.parametrize("notes", ["", "- one note\n- and another\n"])
+def test_the_evidence_page_takes_studies_of_one_seed_with_notes_and_without(
+    tmp_path: Path, notes: str
+) -> None:
+    write_files(results(tmp_path, simple, seeds=1))
+    table, text = tmp_path / "table.md", (tmp_path / "table.md").read_text()
+    table.write_text(text[: text.index("\n\n- ")] + "\n\n" + notes)
+    page = fill_evidence.page_of(tmp_path)
+    assert "| noisy | 23.01 (–) |" in page
+    assert page.endswith(notes or "|\n")

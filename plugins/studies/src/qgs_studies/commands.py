@@ -106,9 +106,10 @@ def _work(
     console: Console,
 ) -> tuple[str | None, int]:
     """The signal that ended the queue, and how many runs failed."""
+    from qgs.threads import usable_cores
     from qgs_studies.queue import Queue
 
-    threads = threads or max(len(os.sched_getaffinity(0)) // workers, 1)
+    threads = threads or max(usable_cores() // workers, 1)
     queue = Queue(plan, workers, threads, device, console, most, _gpus(device))
     return queue.work(), len(queue.failures)
 
