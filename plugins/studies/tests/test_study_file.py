@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from commands import run_qgs
 from qgs_studies.hypotheses import parsed
 from qgs_studies.plan import (
     composed,
@@ -248,3 +249,21 @@ def test_hypotheses_are_sums_that_weigh_alike() -> None:
     ):
         with pytest.raises(OptionError, match=reason):
             parsed(text, "abc", ["noisy"])
+
+
+@pytest.mark.parametrize("place", ["help", "README", "docs"])
+def test_the_studies_that_are_shown_can_be_copied(tmp_path: Path, place: str) -> None:
+    """As they are, but for the recipe that docs/studies.md calls the reader's own."""
+    if place == "help":
+        lines = [line.rstrip() for line in run_qgs("study", "--help").output.splitlines()]
+        text = "\n".join(lines) + "\n"
+        shown = re.findall(r"^ {5}study: 1\n(?: {5}.*\n)+", text, re.MULTILINE)
+        shown = [re.sub("^ {5}", "", text, flags=re.MULTILINE) for text in shown]
+    else:
+        file = {"README": "plugins/studies/README.md", "docs": "docs/studies.md"}[place]
+        page = (RECIPES.parent / file).read_text(encoding="utf-8")
+        shown = re.findall(r"```\w+\n(study: 1\n.*?)```", page, re.DOTALL)
+    (tmp_path / "mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nmodel: {width: 96}\n")
+    assert len(shown) == 1
+    found = planned(read(tmp_path, shown[0]), tmp_path / "out")
+    assert len(found.runs) == 3 * len(found.recipes) >= 6
