@@ -237,7 +237,14 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
         return results
     several = [len({run.seed for run in runs}) == len(runs) > 1 for runs in groups.values()]
     found = zip(groups.values(), several, strict=True)
-    return [side for runs, one in found for side in ([_mean(runs)] if one else runs)]
+    sides = [side for runs, one in found for side in ([_mean(runs)] if one else runs)]
+    names = [side.name for side in sides]  # of several in one folder, all of their runs
+    return [
+        replace(side, name=", ".join(run.name for run in side.runs))
+        if side.runs and names.count(side.name) > 1
+        else side
+        for side in sides
+    ]
 
 
 def _mean(runs: Sequence[StoredResults]) -> StoredResults:

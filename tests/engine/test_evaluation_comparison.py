@@ -1,5 +1,6 @@
 """Paired comparisons of results."""
 
+import json
 import re
 from dataclasses import replace
 from functools import cache
@@ -147,6 +148,31 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed() -> None:
 def test_one_training_a_side_says_nothing_of_training() -> None:
     pair = [training("x", "A", 0, a=1.0, b=2.5), training("y", "B", 0, a=2.0, b=2.0)]
     assert "one training a side: says nothing of training" in compare(pair).markdown()
+
+
+def test_seeds_whose_index_was_moved_between_them_are_one_side(tmp_path: Path) -> None:
+    """The protocol holds what the index says; where it lay is no matter."""
+    summary = {
+        "protocol": {"name": "x"},
+        "columns": {"psnr": {"heading": "PSNR", "better": "higher"}},
+        "step": 9,
+    }
+    summary |= {"missing": {}, "null_entries": [], "scenes_in_protocol": 1}
+    for name in ("a0", "a1", "b0", "b1"):
+        folder = tmp_path / name / "evaluation"
+        folder.mkdir(parents=True)
+        (folder / "summary.json").write_text(json.dumps(summary))
+        (folder / "protocol.json").write_text("{}")
+        row = f"s,0,1,{10.0 + ord(name[0])},"
+        text = f"scene,input_frames,target_frames,model_psnr,problem\n{row}\n"
+        (folder / "scenes.csv").write_text(text)
+        recipe = f"seed: {name[1]}\nmodel: {name[0]}\ntraining: {{steps: 9, seconds: null}}\n"
+        recipe += f"evaluation: {{index: /in/{name}.json}}\n"
+        (tmp_path / name / "recipe.yaml").write_text(recipe)
+    (pair,) = compare([read_results(folder) for folder in sorted(tmp_path.iterdir())]).pairs
+    assert [len(side.runs) for side in (pair.first, pair.second)] == [2, 2]
+    assert pair.differences[0].low is None
+    assert "one scene is too few for an interval" in [*pair.notes()]
 
 
 def test_seeds_of_one_recipe_alone_are_compared_with_each_other() -> None:
