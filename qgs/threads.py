@@ -1,4 +1,4 @@
-"""Kernels on as many threads as torch uses."""
+"""Kernels on as many threads as torch uses, and the cores that there are."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -13,6 +13,12 @@ import torch
 def can_compile() -> bool:
     """Whether numba is installed, which `qgs.kernels` needs."""
     return find_spec("numba") is not None
+
+
+def usable_cores() -> int:
+    """CPU cores that this process may use; all of the machine where the system does not say."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    return len(allowed) or os.cpu_count() or 1
 
 
 def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:

@@ -33,13 +33,13 @@ def table(text: str) -> str:
 
 
 def means(study: Path) -> dict[str, dict[str, tuple[float, float]]]:
-    """PSNR, mean and standard deviation over seeds, by evaluation and variant."""
+    """PSNR, mean and standard deviation over seeds (nan of one), by evaluation and variant."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     with (study / "table.csv").open(encoding="utf-8") as lines:
         for row in csv.DictReader(lines):
             if row["metric"] == "psnr" and row["evaluation"]:
                 of_all = found.setdefault(row["evaluation"], {})
-                of_all[row["variant"]] = float(row["mean"]), float(row["sd"])
+                of_all[row["variant"]] = float(row["mean"]), float(row["sd"] or "nan")
     return found
 
 
@@ -49,7 +49,7 @@ def by_evaluation(study: Path) -> str:
     variants = list(next(iter(found.values())))
     lines = [f"| PSNR (sd) | {' | '.join(variants)} |", f"|---|{'--:|' * len(variants)}"]
     for name, of_all in found.items():
-        cells = (f"{of_all[v][0]:.2f} ({of_all[v][1]:.2f})" for v in variants)
+        cells = (f"{of_all[v][0]:.2f} ({of_all[v][1]:.2f})".replace("nan", "–") for v in variants)
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
@@ -91,8 +91,8 @@ def page_of(study: Path) -> str:
     """What the page shows of a finished study."""
     text = (study / "table.md").read_text(encoding="utf-8")
     if single := re.search(r"^\*\*\w+\*\*$", text, re.MULTILINE):
-        notes = text[text.rindex("\n\n- ") + 1 :]
-        text = text[: single.start()] + by_evaluation(study) + notes
+        notes = re.search(r"\n\n- .*\Z", text, re.DOTALL)  # there may be none
+        text = text[: single.start()] + by_evaluation(study) + (notes[0][1:] if notes else "")
     return table(text)
 
 

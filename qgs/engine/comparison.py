@@ -237,7 +237,14 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
         return results
     several = [len({run.seed for run in runs}) == len(runs) > 1 for runs in groups.values()]
     found = zip(groups.values(), several, strict=True)
-    return [side for runs, one in found for side in ([_mean(runs)] if one else runs)]
+    sides = [side for runs, one in found for side in ([_mean(runs)] if one else runs)]
+    names = [side.name for side in sides]  # of several in one folder, all of their runs
+    return [
+        replace(side, name=", ".join(run.name for run in side.runs))
+        if side.runs and names.count(side.name) > 1
+        else side
+        for side in sides
+    ]
 
 
 def _mean(runs: Sequence[StoredResults]) -> StoredResults:
@@ -255,37 +262,50 @@ def _mean(runs: Sequence[StoredResults]) -> StoredResults:
     return replace(first, name=folder or ", ".join(names), scenes=scenes, runs=tuple(runs))
 
 
-CROSSED = "two-way variance, t with the degrees of freedom of Hillis 2007"
+CROSSED = "two-way variance, t with Satterthwaite's degrees of freedom"
 
 
-def crossed_interval(values: np.ndarray) -> tuple[float, float] | None:
+def crossed_interval(
+    values: np.ndarray, confidence: float = CONFIDENCE
+) -> tuple[float, float] | None:
     """Interval of the mean of differences (S, C) of S >= 2 trainings, each on the same C scenes.
 
-    Both are random: it holds for other trainings and for other scenes. The variance of the mean is
-    that of two-way analysis of variance, its degrees of freedom at least S - 1, as for readers and
-    cases (Hillis 2007, doi.org/10.1002/sim.2532). None for fewer than two trainings.
+    Both are random: it holds for other trainings and for other scenes; see `crossed_error`. None
+    for fewer than two of either.
     """
-    trainings, scenes = values.shape
-    if trainings < 2:
+    if min(values.shape) < 2:
         return None
-    mean, of_training, of_scene = values.mean(), values.mean(1), values.mean(0)
-    between, extra = scenes * of_training.var(ddof=1), 0.0
-    if scenes > 1:
-        rest = values - of_training[:, None] - of_scene + mean
-        noise = (rest**2).sum() / ((trainings - 1) * (scenes - 1))
-        extra = max(trainings * of_scene.var(ddof=1) - noise, 0.0)
-    whole = between + extra
-    freedom = (trainings - 1) * min((whole / between) ** 2, 1e4) if between else 1e4
-    half = t_quantile(freedom) * np.sqrt(whole / values.size)
-    return float(mean - half), float(mean + half)
+    error, freedom = crossed_error(values)
+    half = t_quantile(float(freedom), confidence) * error
+    return float(values.mean() - half), float(values.mean() + half)
 
 
-def t_quantile(freedom: float) -> float:
-    """What |t| of Student's distribution exceeds with probability 1 - CONFIDENCE."""
+def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard error of the means of `values` (..., S, C), and its degrees of freedom, both (...).
+
+    The variance is that of two-way analysis of variance, a sum of mean squares; its degrees of
+    freedom are those of Satterthwaite 1946 (doi.org/10.2307/3002019), at least those of the smaller
+    side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532) it is too narrow for few.
+    """
+    *_, trainings, scenes = values.shape
+    of_training, of_scene = values.mean(-1, keepdims=True), values.mean(-2, keepdims=True)
+    rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
+    noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
+    first = scenes * of_training.var((-2, -1), ddof=1)
+    second = trainings * of_scene.var((-2, -1), ddof=1)
+    own = second > noise  # else scenes add no variance of their own
+    whole = first + own * (second - noise)
+    spread = first**2 + own * (second**2 * (trainings - 1) + noise**2) / (scenes - 1)
+    freedom = (trainings - 1) * whole**2 / np.where(spread, spread, 1.0)
+    return np.sqrt(whole / (trainings * scenes)), np.maximum(freedom, min(trainings, scenes) - 1)
+
+
+def t_quantile(freedom: float, confidence: float = CONFIDENCE) -> float:
+    """What |t| of Student's distribution exceeds with probability 1 - confidence."""
     angles = np.linspace(0.0, np.pi / 2, 40_001)  # t = sqrt(freedom) * tan(angle)
     density = np.cos(angles) ** (freedom - 1)
     below = np.cumsum(density) - (density + density[0]) / 2
-    return float(np.sqrt(freedom) * np.tan(np.interp(CONFIDENCE * below[-1], below, angles)))
+    return float(np.sqrt(freedom) * np.tan(np.interp(confidence * below[-1], below, angles)))
 
 
 def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:

@@ -297,7 +297,7 @@ class StoredResults:
     scenes: `SceneScore.values` of the judged scenes. frames: their input and target frames, as
     scenes.csv writes them. wanted: how many scenes the protocol names. columns, missing, null and
     step as in `Evaluation`.
-    Of a run folder, recipe: its resolved recipe as JSON, without the seed; seed and budget.
+    Of a run folder, recipe: its resolved recipe as JSON, less seed and evaluation; seed and budget.
     runs: the trainings whose mean this is, none of a single one.
     """
 
@@ -362,7 +362,7 @@ def _training(recipe: Path) -> dict[str, Any]:
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
-    seed, training = tree.pop("seed"), tree["training"]
+    seed, training, _ = tree.pop("seed"), tree["training"], tree.pop("evaluation")
     seconds = training["seconds"]
     budget = f"{seconds:g} s" if seconds else f"{training['steps']:,} steps"
     return {"recipe": json.dumps(tree), "seed": seed, "budget": budget}

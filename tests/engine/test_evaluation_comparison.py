@@ -1,7 +1,9 @@
 """Paired comparisons of results."""
 
+import json
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,13 @@ import pytest
 from rich.console import Console
 
 from qgs.contracts import Column
-from qgs.engine.comparison import compare, crossed_interval, paired_interval, t_quantile
+from qgs.engine.comparison import (
+    compare,
+    crossed_error,
+    crossed_interval,
+    paired_interval,
+    t_quantile,
+)
 from qgs.engine.protocol import Protocol
 from qgs.engine.results import StoredResults, read_results
 
@@ -142,6 +150,31 @@ def test_one_training_a_side_says_nothing_of_training() -> None:
     assert "one training a side: says nothing of training" in compare(pair).markdown()
 
 
+def test_seeds_whose_index_was_moved_between_them_are_one_side(tmp_path: Path) -> None:
+    """The protocol holds what the index says; where it lay is no matter."""
+    summary = {
+        "protocol": {"name": "x"},
+        "columns": {"psnr": {"heading": "PSNR", "better": "higher"}},
+        "step": 9,
+    }
+    summary |= {"missing": {}, "null_entries": [], "scenes_in_protocol": 1}
+    for name in ("a0", "a1", "b0", "b1"):
+        folder = tmp_path / name / "evaluation"
+        folder.mkdir(parents=True)
+        (folder / "summary.json").write_text(json.dumps(summary))
+        (folder / "protocol.json").write_text("{}")
+        row = f"s,0,1,{10.0 + ord(name[0])},"
+        text = f"scene,input_frames,target_frames,model_psnr,problem\n{row}\n"
+        (folder / "scenes.csv").write_text(text)
+        recipe = f"seed: {name[1]}\nmodel: {name[0]}\ntraining: {{steps: 9, seconds: null}}\n"
+        recipe += f"evaluation: {{index: /in/{name}.json}}\n"
+        (tmp_path / name / "recipe.yaml").write_text(recipe)
+    (pair,) = compare([read_results(folder) for folder in sorted(tmp_path.iterdir())]).pairs
+    assert [len(side.runs) for side in (pair.first, pair.second)] == [2, 2]
+    assert pair.differences[0].low is None
+    assert "one scene is too few for an interval" in [*pair.notes()]
+
+
 def test_seeds_of_one_recipe_alone_are_compared_with_each_other() -> None:
     pair = [training(name, "A", s, a=1.0 + s, b=2.0) for s, name in enumerate("xy")]
     (found,) = compare(pair).pairs
@@ -154,19 +187,57 @@ def test_t_quantiles_are_those_of_scipy() -> None:
         assert t_quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-4)
 
 
-@pytest.mark.parametrize("deviations", [(0.1, 0.3, 0.3), (0.3, 0.1, 0.1), (0.0, 0.3, 0.3)])
+VARIANCES = {"scenes": (0.1, 1.0, 0.1), "trainings": (1.0, 0.1, 0.1), "noise": (0.0, 0.0, 1.0)}
+"""Deviations of trainings, of scenes and of the rest, by which of them is the largest."""
+
+
+@cache
+def t_quantiles() -> tuple[np.ndarray, list[float]]:
+    """Degrees of freedom, and the quantile of each."""
+    grid = np.geomspace(1.0, 1e4, 200)
+    return grid, [t_quantile(freedom) for freedom in grid]
+
+
+@pytest.mark.parametrize("most", VARIANCES)
+@pytest.mark.parametrize(("trainings", "scenes"), [(3, 3), (3, 5), (3, 32), (5, 5)])
 def test_the_interval_over_trainings_and_scenes_holds_the_truth(
-    deviations: tuple[float, float, float],
+    trainings: int, scenes: int, most: str
 ) -> None:
-    """In 95 of 100 cases, whatever varies more; that over scenes alone fails with trainings."""
-    rng, hits, naive = np.random.default_rng(0), 0, 0
-    of_training, of_scene, rest = deviations
-    for _ in range(300):
-        values = rng.normal(0, of_training, (3, 1)) + rng.normal(0, of_scene, (1, 32))
-        values = values + rng.normal(0, rest, (3, 32))
-        low, high = crossed_interval(values) or (1, 0)
-        hits += low <= 0 <= high
-        error = 1.96 * values.mean(0).std(ddof=1) / 32**0.5
-        naive += abs(values.mean()) <= error
-    assert hits >= 270
-    assert naive < 200 or of_training < 0.3
+    """In 95 of 100 cases, whatever varies more, at few scenes too; and it is no wider than needed.
+
+    That over scenes alone does not, where trainings differ.
+    """
+    rng, count, shape = np.random.default_rng(0), 4000, (trainings, scenes)
+    of_training, of_scene, rest = VARIANCES[most]
+    values = rng.normal(0, of_training, (count, trainings, 1))
+    values = values + rng.normal(0, of_scene, (count, 1, scenes))
+    values = values + rng.normal(0, rest, (count, *shape))
+    error, freedom = crossed_error(values)
+    half = np.interp(freedom, *t_quantiles()) * error
+    for one, width in zip(values[:9], half, strict=False):
+        low, high = crossed_interval(one) or (0.0, 0.0)
+        assert high - low == pytest.approx(2 * width, rel=1e-2)
+    hits = np.abs(values.mean((1, 2))) <= half
+    assert 0.93 <= hits.mean() <= 0.985
+    truth = of_training**2 / trainings + of_scene**2 / scenes + rest**2 / (trainings * scenes)
+    least = t_quantile(min(trainings, scenes) - 1)
+    assert np.median(half) <= 1.25 * least * truth**0.5
+    if most == "trainings":
+        alone = values.mean(1).std(1, ddof=1) / scenes**0.5 * t_quantile(scenes - 1)
+        assert (np.abs(values.mean((1, 2))) <= alone).mean() < 0.7
+
+
+def test_scores_that_do_not_vary_leave_no_doubt_and_one_of_a_kind_says_nothing() -> None:
+    assert crossed_interval(np.full((3, 4), 2.0)) == (2.0, 2.0)
+    assert crossed_interval(np.ones((1, 4))) is None
+    assert crossed_interval(np.array([[0.0], [1.0], [2.0]])) is None
+
+
+def test_a_surer_interval_is_wider() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    assert t_quantile(2.0, 0.995) == pytest.approx(stats.t.ppf(0.9975, 2.0), rel=1e-4)
+    values = np.random.default_rng(0).normal(size=(3, 8))
+    usual, sure = crossed_interval(values), crossed_interval(values, 0.99)
+    assert usual
+    assert sure
+    assert sure[0] < usual[0] < usual[1] < sure[1]

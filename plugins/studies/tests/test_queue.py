@@ -1,6 +1,7 @@
 """Studies that run: queues on one folder, kills, what is added later. Trainings of seconds."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pytest
 from commands import run_qgs
 from qgs_studies.queue import Progress, _cell, last_record
 
+from qgs.threads import usable_cores
+
 RECIPES = Path(__file__).parents[3] / "recipes"
 
 
@@ -16,7 +19,7 @@ RECIPES = Path(__file__).parents[3] / "recipes"
 def study(tmp_path: Path) -> Path:
     text = kill_study.STUDY.format(recipes=RECIPES, steps=12)
     text = text.replace("seeds: [0, 1, 2]", "seeds: [0, 1]")
-    text = re.sub(r"  (free|tokengs):.*\n", "", text)
+    text = re.sub(r"  (free|tokengs):.*\n|differs:.*\n", "", text)
     text = re.sub(r"hypotheses:.*", "hypotheses: [flat < locus]", text)
     (tmp_path / "study.yaml").write_text(text)
     return tmp_path / "study.yaml"
@@ -55,8 +58,52 @@ def test_a_killed_study_has_the_table_of_a_quiet_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = ["kill_study.py", str(tmp_path / "out"), "--kills", "3", "--steps", "20"]
-    monkeypatch.setattr("sys.argv", command)
+    monkeypatch.setattr("sys.argv", [*command, "--ratio", "inf"])  # tests measure no times
     assert kill_study.main() == 0
+
+
+@pytest.mark.parametrize(
+    ("two", "table", "kills", "code"),
+    [
+        (5.0, "20.1", 3, 0),
+        (7.0, "20.1", 3, 1),  # too slow
+        (5.0, "20.2", 3, 1),  # another table
+        (5.0, None, 3, 1),  # no table
+        (5.0, "20.1", 2, 1),  # too few kills
+    ],
+)
+def test_the_tool_that_kills_fails_on_each_of_its_bars(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    two: float,
+    table: str | None,
+    kills: int,
+    code: int,
+) -> None:
+    def quiet(study: Path, out: Path, workers: int) -> float:
+        out.mkdir()
+        for name in kill_study.SAME:
+            (out / name).write_text("20.1")
+        return 10.0 if workers == 1 else two
+
+    def disturbed(study: Path, out: Path, *_: object) -> list[str]:
+        quiet(study, out, 2)
+        if table:
+            (out / "table.csv").write_text(table)
+        else:
+            (out / "table.csv").unlink()
+        return ["worker"] * kills
+
+    monkeypatch.setattr(kill_study, "quiet", quiet)
+    monkeypatch.setattr(kill_study, "disturbed", disturbed)
+    monkeypatch.setattr("sys.argv", ["kill_study.py", str(tmp_path / "out"), "--kills", "3"])
+    assert kill_study.main() == code
+
+
+def test_cores_are_counted_where_a_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    assert usable_cores() == os.cpu_count()
 
 
 def test_a_study_is_checked_and_given_to_slurm_without_training(study: Path) -> None:

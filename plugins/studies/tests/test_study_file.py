@@ -1,13 +1,24 @@
 """What a study may say, and what it is told otherwise: file, line, reason, remedy."""
 
+import json
+import re
+import shutil
 from pathlib import Path
 
 import pytest
+from commands import run_qgs
 from qgs_studies.hypotheses import parsed
-from qgs_studies.plan import composed
+from qgs_studies.plan import (
+    composed,
+    evaluation_file,
+    planned,
+    recipe_file,
+    run_of,
+    write_plan,
+)
 from qgs_studies.study import Study, read_study
 
-from qgs.composer import RecipeError
+from qgs.composer import RecipeError, resolve
 from qgs.contracts import OptionError
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -19,6 +30,7 @@ variants:
   tokengs: {RECIPES}/tiny/tokengs.yaml
 reference: full
 budget: {{steps: 200}}
+differs: [losses.anchor_visibility]
 hypotheses: [flat < full]
 """
 
@@ -53,7 +65,7 @@ def test_a_study_extends_another_and_replaces_variants_by_name(tmp_path: Path) -
     read(tmp_path, SOUND)
     (tmp_path / "small.yaml").write_text(
         "study: 1\nextends: study.yaml\nvariants: {tokengs: null, flat: {model: {width: 64}}}\n"
-        "overlay: {training: {batch_size: 1}}\nseeds: [7]\n"
+        "overlay: {training: {batch_size: 1}}\nseeds: [7]\ndiffers: []\n"
     )
     study = read_study(tmp_path / "small.yaml")
     recipes = composed(study)
@@ -79,7 +91,7 @@ WRONG = {
     ),
     "[flat < full]": (
         "[flat < fulll]",
-        ":9: hypotheses.0",
+        ":10: hypotheses.0",
         "there is no variant `fulll`",
         "did you mean `full`?",
     ),
@@ -104,11 +116,17 @@ WRONG = {
         "`views.inputs` is 3 in `flat` and 2 in the reference `full`",
         "or add `differs: [views.inputs]`",
     ),
-    "hypotheses:": (
-        "differs: [views.inputs]\nhypotheses:",
+    "differs: [": (
+        "differs: [views.inputs, ",
         "differs",
         "`views.inputs` differs in no variant",
         "remove it",
+    ),
+    "differs: [losses.anchor_visibility]": (
+        "",
+        ":6: variants.tokengs",
+        "`losses.anchor_visibility.type` is None in `tokengs`",
+        "or add `differs: [losses.anchor_visibility]`",
     ),
     "budget:": (
         "evaluations: {more: {model: {width: 8}}}\nbudget:",
@@ -134,10 +152,86 @@ def test_what_is_wrong_is_told_with_its_line_before_anything_trains(
     assert fix in text
 
 
+INDICES = """overlay: {evaluation: {index: 2views.json}}
+evaluations: {more: {evaluation: {index: 3views.json}}}
+"""
+
+
+def study_with_indices(folder: Path) -> Study:
+    folder.mkdir()
+    for name in ("2views.json", "3views.json"):
+        shutil.copy(RECIPES / "studies/rooms" / name, folder)
+    return read(folder, SOUND + INDICES)
+
+
+def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path: Path) -> None:
+    """Wherever the index lies now; another index is refused, also under the old name."""
+    out, old, new = (tmp_path / name for name in ("out", "old", "new"))
+    plan = planned(study_with_indices(old), out)
+    write_plan(plan)
+    for name in plan.evaluations:
+        results = run_of(out, "flat", 0).evaluation(name)
+        results.mkdir(parents=True)
+        index = json.loads((old / f"{3 if name else 2}views.json").read_text())
+        (results / "protocol.json").write_text(json.dumps({"views": {"index": index}}))
+    shutil.rmtree(old)
+    study = study_with_indices(new)
+    plan = planned(study, out)
+    write_plan(plan)
+    assert resolve(recipe_file(out, "flat")).evaluation.index == str(new / "2views.json")
+    assert str(new / "3views.json") in evaluation_file(out, "more").read_text()
+    for file, remedy in (("2views.json", "another --out"), ("3views.json", "`more` another name")):
+        text = (new / file).read_text()
+        index = json.loads(text)
+        index.pop(next(iter(index)))
+        (new / file).write_text(json.dumps(index))
+        with pytest.raises(
+            ValueError, match=f"judged on other scenes or frames .*{file}.*{remedy}"
+        ):
+            planned(study, out)
+        (new / file).write_text(text)
+    planned(study, out)
+
+
+def test_variants_judged_by_the_same_index_under_two_names_are_alike(tmp_path: Path) -> None:
+    shutil.copy(RECIPES / "studies/rooms/2views.json", tmp_path / "again.json")
+    whole = "{type: qgs/content}}}}"
+    for name, alike in (("2views.json", True), ("3views.json", False)):
+        ours = f"evaluation: {{index: {RECIPES}/studies/rooms/{name}}}"
+        text = SOUND.replace(whole, whole[:-1] + f", {ours}}}")
+        text = text.replace(
+            "  full:\n", f"  full: {{evaluation: {{index: {tmp_path}/again.json}}}}\n"
+        )
+        text = text.replace("[flat < full]", "[flat < full]\ndiffers: []")
+        text = re.sub(r"differs: \[loss.*\n|  tokengs:.*\n", "", text)
+        if alike:
+            composed(read(tmp_path, text))
+        else:
+            with pytest.raises(RecipeError, match=r"`evaluation.index` is"):
+                composed(read(tmp_path, text))
+
+
 def test_a_budget_that_the_optimiser_cannot_use_names_the_variant(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"warmup is 100") as caught:
         composed(read(tmp_path, SOUND.replace("200", "50")))
     assert caught.value.__notes__ == [f"in the variant `full`, {tmp_path / 'study.yaml'}:4"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "option"),
+    [
+        ("losses: {photometric: {l1_weight: 0.5}}", "losses.photometric"),
+        ("init_from: rooms/locus-64", "init_from"),
+    ],
+)
+def test_losses_and_the_start_are_alike_unless_the_study_says_otherwise(
+    tmp_path: Path, changed: str, option: str
+) -> None:
+    text = SOUND.replace("{type: qgs/content}}}}", "{type: qgs/content}}}, " + changed + "}")
+    with pytest.raises(RecipeError, match=f"`differs: \\[{option}\\]`"):
+        composed(read(tmp_path, text))
+    said = text.replace("differs: [", f"differs: [{option}, ")
+    assert [*composed(read(tmp_path, said))] == ["full", "flat", "tokengs"]
 
 
 def test_hypotheses_are_sums_that_weigh_alike() -> None:
@@ -155,3 +249,21 @@ def test_hypotheses_are_sums_that_weigh_alike() -> None:
     ):
         with pytest.raises(OptionError, match=reason):
             parsed(text, "abc", ["noisy"])
+
+
+@pytest.mark.parametrize("place", ["help", "README", "docs"])
+def test_the_studies_that_are_shown_can_be_copied(tmp_path: Path, place: str) -> None:
+    """As they are, but for the recipe that docs/studies.md calls the reader's own."""
+    if place == "help":
+        lines = [line.rstrip() for line in run_qgs("study", "--help").output.splitlines()]
+        text = "\n".join(lines) + "\n"
+        shown = re.findall(r"^ {5}study: 1\n(?: {5}.*\n)+", text, re.MULTILINE)
+        shown = [re.sub("^ {5}", "", text, flags=re.MULTILINE) for text in shown]
+    else:
+        file = {"README": "plugins/studies/README.md", "docs": "docs/studies.md"}[place]
+        page = (RECIPES.parent / file).read_text(encoding="utf-8")
+        shown = re.findall(r"```\w+\n(study: 1\n.*?)```", page, re.DOTALL)
+    (tmp_path / "mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nmodel: {width: 96}\n")
+    assert len(shown) == 1
+    found = planned(read(tmp_path, shown[0]), tmp_path / "out")
+    assert len(found.runs) == 3 * len(found.recipes) >= 6

@@ -48,21 +48,30 @@ def study(
     trained once, whatever was killed goes on, only what is missing runs.
     OUT/study.html has the answer, OUT/table.* the numbers.
 
-    Studies that come with qgs: studies/tiny/structural.yaml and others,
-    see docs/studies.md. One of your recipe mine.yaml against LocusGS:
+    A variant is `base` with or without changes, or a recipe file of its own.
+    One of yours against LocusGS, as mine_study.yaml:
 
     \b
         study: 1
         base: tiny/locus.yaml
         variants:
           locus:
-          mine: mine.yaml
-          wider: {model: {decoder: {cross_attention: {sigma0: 0.2}}}}
+          mine: {model: {decoder: {cross_attention: {sigma0: 0.2}}}}
         reference: locus
         seeds: [0, 1, 2]
-        budget: {steps: 2100}
+        budget: {steps: 2100}   # or seconds, or images
         hypotheses:
           - mine > locus
+
+    \b
+        qgs study mine_study.yaml --out studies/mine --workers 2
+
+    That is six runs of about five minutes on a core each; --runs 1 makes one.
+    In place of the changes, `mine: mine.yaml` names a recipe: begin one with
+    `qgs recipes tiny/locus.yaml --out .`; `qgs list NAME` has the options of
+    a component. The file's other keys are named when one is wrong, and told
+    in docs/studies.md of the project (differs, evaluations, published ...).
+    Studies that come with qgs: studies/tiny/structural.yaml and others.
     """
     from qgs_studies.plan import leftover_runs, planned, write_plan
     from qgs_studies.study import read_study
@@ -106,9 +115,10 @@ def _work(
     console: Console,
 ) -> tuple[str | None, int]:
     """The signal that ended the queue, and how many runs failed."""
+    from qgs.threads import usable_cores
     from qgs_studies.queue import Queue
 
-    threads = threads or max(len(os.sched_getaffinity(0)) // workers, 1)
+    threads = threads or max(usable_cores() // workers, 1)
     queue = Queue(plan, workers, threads, device, console, most, _gpus(device))
     return queue.work(), len(queue.failures)
 

@@ -1,12 +1,15 @@
 """Figures of a study: points of every seed with intervals, learning curves."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from qgs.drawing.figures import (
+    CATEGORICAL,
     INK,
     MUTED,
     categorical,
@@ -20,6 +23,7 @@ from qgs_studies.hypotheses import MAIN
 from qgs_studies.results import Results, Row
 
 _POINTS = 200  # of a learning curve
+_POINT: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 3.5}
 
 
 def write_figures(results: Results) -> None:
@@ -49,9 +53,9 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
         return None
     column, metric = results.column, results.metric
     unit = f", {column.unit}" if column.unit else ""
-    seeds = list(results.plan.study.settings.seeds)
+    seeds = _colors(results.plan.study.settings.seeds)
     with figure_style():
-        figure = Figure(figsize=(8.4, 0.9 + 0.32 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(8.4, 1.2 + 0.32 * len(rows)), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
         for place, row in enumerate(rows):
             _points(left, place, row.scores[metric].by_seed, seeds)
@@ -60,6 +64,12 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
         right.axvline(0, color=hex_color(MUTED), linewidth=0.9)
         left.set(yticks=range(len(rows)), yticklabels=[row.variant for row in rows])
         left.invert_yaxis()
+        for axes in (left, right):
+            axes.locator_params(axis="x", nbins=5)
+        if len(set(seeds.values())) > 1:
+            points = [Line2D([], [], color=color, **_POINT) for color in seeds.values()]
+            names = [f"seed {seed}" for seed in seeds]
+            figure.legend(points, names, loc="outside lower center", ncols=len(seeds))
         left.set(title=f"{column.heading}{unit}: one point a seed, mean")
         right.set(title=f"minus {results.plan.study.settings.reference}, 95 % interval")
         if evaluation:
@@ -67,15 +77,21 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
     return figure
 
 
-def _points(axes: Axes, place: int, values: Mapping[int, float], seeds: Sequence[int]) -> None:
+def _colors(seeds: Sequence[int]) -> dict[int, str]:
+    """A colour for each seed; one for all where there are not so many."""
+    apart = len(seeds) <= len(CATEGORICAL)
+    return {seed: hex_color(categorical(n * apart)) for n, seed in enumerate(seeds)}
+
+
+def _points(axes: Axes, place: int, values: Mapping[int, float], seeds: Mapping[int, str]) -> None:
     """A point for each seed, of its colour in all rows, a little apart."""
-    for seed, value in values.items():
-        number = seeds.index(seed)
-        shift = 0.22 * (number - (len(seeds) - 1) / 2) / max(len(seeds) - 1, 1)
-        axes.plot(value, place + shift, "o", color=hex_color(categorical(number)), markersize=3.5)
+    for number, (seed, color) in enumerate(seeds.items()):
+        if seed in values:
+            shift = 0.22 * (number - (len(seeds) - 1) / 2) / max(len(seeds) - 1, 1)
+            axes.plot(values[seed], place + shift, color=color, **_POINT)
 
 
-def _difference(axes: Axes, place: int, row: Row, metric: str, seeds: Sequence[int]) -> None:
+def _difference(axes: Axes, place: int, row: Row, metric: str, seeds: Mapping[int, str]) -> None:
     apart = row.differences.get(metric)
     if apart is None:
         return

@@ -30,14 +30,14 @@ def table_rows(results: Results, evaluation: str = MAIN) -> list[list[str]]:
             continue
         apart = row.differences.get(metric)
         means = [row.scores.get(name) for name in others]
-        paper = [f"{published[row.variant]:g}" if row.variant in published else "–"]
+        paper = [results.shown(published.get(row.variant), sign=False)]
         rows.append(
             [
                 row.variant,
                 results.shown(score.mean, sign=False),
                 results.shown(score.deviation, sign=False),
                 "reference"
-                if not row.differences
+                if row.variant == results.plan.study.settings.reference
                 else results.shown(apart.mean if apart else None),
                 results.interval(apart),
                 _ahead(results, apart),
@@ -58,10 +58,11 @@ def hypothesis_rows(results: Results) -> list[list[str]]:
     rows = [["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of", "note"]]
     for j in results.judgements():
         mean = results.shown(j.estimate.mean, j.metric) if j.estimate else "–"
+        column = results.columns.get(j.metric)
         interval = results.interval(j.estimate, j.metric) if j.estimate else "–"
         covers = j.estimate.covers if j.estimate else "–"
         verdict = f"{j.verdict} ({j.reason})" if j.reason else j.verdict
-        claim = [j.hypothesis.claim, results.columns[j.metric].heading]
+        claim = [j.hypothesis.claim, column.heading if column else j.metric]
         rows.append([*claim, mean, interval, verdict, covers, j.hypothesis.note])
     return rows
 
@@ -104,6 +105,7 @@ def record(results: Results) -> dict[str, Any]:
     return {
         "title": results.plan.study.title,
         "answer": results.answer(),
+        "answered_by": results.shared,
         "reference": settings.reference,
         "seeds": list(settings.seeds),
         "budget": settings.budget.model_dump(exclude_none=True),

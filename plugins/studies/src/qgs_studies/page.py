@@ -33,7 +33,7 @@ def study_html(results: Results) -> str:
         f"{len(settings.seeds)} seeds ({', '.join(map(str, settings.seeds))})",
         "budget": inline(settings.budget.model_dump(exclude_none=True)),
         "reference": settings.reference,
-        "may differ": ", ".join(settings.differs) or "nothing but the model and the optimiser",
+        "may differ": ", ".join(["the model", "its optimiser", *settings.differs]),
     }
     return environment.get_template("study.html").render(
         title=plan.study.title,

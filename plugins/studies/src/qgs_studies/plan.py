@@ -1,11 +1,14 @@
 """A study as it runs: every variant composed, checked against the others, and its folder."""
 
+import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from qgs.cli.train import with_absolute_path
 from qgs.composer import Recipe, RecipeError, resolve
@@ -15,7 +18,7 @@ from qgs.composer.nodes import Count, MapNode, Origin, from_plain
 from qgs.composer.recipe import annotated, flat
 from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import OptionError
-from qgs.data.evaluation import EvaluationPlan
+from qgs.data.evaluation import EvaluationIndex, EvaluationPlan, IndexEntry
 from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.engine.protocol import index_of
 from qgs.io.files import write_text
@@ -23,8 +26,17 @@ from qgs.wording import listed
 from qgs_studies.hypotheses import MAIN
 from qgs_studies.study import Study
 
-EQUAL = ("data", "views", "training", "evaluation", "metrics")
-"""Sections of recipes that are alike in all variants, but for what the study says differs."""
+EQUAL = (
+    *("data", "views", "training", "evaluation", "metrics"),
+    *("losses", "objective", "init_from"),
+)
+"""Sections of recipes that are alike in all variants, but for what the study says differs.
+
+All but the model and its optimiser.
+"""
+
+INDEX = "evaluation.index"
+"""A file that may lie elsewhere today: it is compared by what it holds."""
 
 _MOST = 12
 """Differences of a changed variant that the message names."""
@@ -200,20 +212,33 @@ def _check_alike(study: Study, recipes: Mapping[str, Recipe], problems: Problems
     allowed, used = settings.differs, set[str]()
     free = {"training.steps"} if settings.budget.images is not None else set()
     for name, recipe in recipes.items():
+        told = set[str]()
         for path, (ours, theirs) in differences(recipe, first).items():
             said = [a for a in allowed if f"{path}.".startswith(f"{a}.")]
             used.update(said)
-            if path.split(".")[0] not in EQUAL or said or path in free:
+            section, *names = path.split(".")
+            if section not in EQUAL or said or path in free or _same_index(path, recipe, first):
                 continue
+            # of a loss or metric that is another, or absent, its options are one difference
+            option = f"{section}.{names[0]}" if section in ("losses", "metrics") else path
+            if option in told:
+                continue
+            told.add(option)
             reason = (
                 f"`{path}` is {ours!r} in `{name}` and {theirs!r} in the reference "
                 f"`{settings.reference}` ({recipe.provenance.get(path, 'absent')})"
             )
-            fix = f"make them alike (`overlay` sets it for all), or add `differs: [{path}]`"
+            fix = f"make them alike (`overlay` sets it for all), or add `differs: [{option}]`"
             problems.add(study.origins[name], f"variants.{name}", reason, fix)
     for path in (path for path in allowed if path not in used):
         reason, at = f"`{path}` differs in no variant", Origin(str(study.file))
         problems.add(at, "differs", reason, f"remove it; sections are {', '.join(EQUAL)}")
+
+
+def _same_index(path: str, one: Recipe, other: Recipe) -> bool:
+    """Whether `path` is that of two indices that judge the same frames of the same scenes."""
+    written = one.evaluation.index, other.evaluation.index
+    return path == INDEX and all(written) and index_of(one) == index_of(other)
 
 
 def _judged_by(recipe: Recipe, node: MapNode, option: str, problems: Problems) -> None:
@@ -266,13 +291,17 @@ def _refuse_unknown_metrics(study: Study, recipe: Recipe) -> None:
 
 
 def _refuse_changed(plan: Plan) -> None:
-    """Raise ValueError where runs or results in the folder were made of something else."""
+    """Raise ValueError where runs or results in the folder were made of something else.
+
+    Where the evaluation index lies is no matter; what results were judged by is.
+    """
     for name, recipe in plan.recipes.items():
         file = recipe_file(plan.folder, name)
         runs = [run for run in _runs_in(plan.folder, name) if not RunFolder(run).is_new]
         if not runs or not file.is_file():
             continue
         changed = differences(resolve(file), recipe)
+        changed.pop(INDEX, None)
         if changed:
             told = [f"{path}: {old!r} then, {new!r} now" for path, (old, new) in changed.items()]
             raise ValueError(
@@ -283,11 +312,43 @@ def _refuse_changed(plan: Plan) -> None:
     for name, node in plan.study.evaluations.items():
         file = evaluation_file(plan.folder, name)
         judged = any(run.judged(name) for run in plan.runs)
-        if judged and file.is_file() and read_evaluation(file) != node:
+        if judged and file.is_file() and _moved(read_evaluation(file)) != _moved(node):
             raise ValueError(
                 f"{plan.study.file}: the evaluation `{name}` is not the one that there are results "
                 f"of in {plan.folder} ({file}); give the new one another name"
             )
+    for name in plan.evaluations:
+        for variant, recipe in plan.recipes.items():
+            runs = [run for run in plan.runs if run.variant == variant and run.judged(name)]
+            if runs:
+                node = plan.study.evaluations.get(name)
+                _refuse_other_index(plan, runs, name, judged_by(recipe, node) if node else recipe)
+
+
+def _refuse_other_index(plan: Plan, runs: Sequence[Run], name: str, recipe: Recipe) -> None:
+    now = index_of(recipe)
+    for folder in (run.evaluation(name) for run in runs):
+        if _judged_index(folder) != now:
+            what = f"the evaluation `{name}` another name" if name else "another --out"
+            raise ValueError(
+                f"{plan.study.file}: the results in {folder} were judged on other scenes or "
+                f"frames than evaluation.index names now ({recipe.evaluation.index}); give {what}"
+            )
+
+
+def _judged_index(results: Path) -> EvaluationIndex | None:
+    """The index by which results were made; raises ValueError for a file that is none."""
+    content = json.loads((results / "protocol.json").read_text(encoding="utf-8"))
+    index = content.get("views", {}).get("index")
+    return index and TypeAdapter(dict[str, IndexEntry | None]).validate_python(index)
+
+
+def _moved(node: MapNode) -> dict[str, Any]:
+    """An evaluation as plain values, whatever index it names."""
+    plain = _plain(node)
+    if "index" in plain.get("evaluation", {}):
+        plain["evaluation"]["index"] = bool(plain["evaluation"]["index"])
+    return plain
 
 
 def _runs_in(folder: Path, variant: str) -> Iterator[Path]:

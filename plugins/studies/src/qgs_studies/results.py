@@ -6,14 +6,15 @@ held against the same seed of the reference, which saw the same data in the same
 against the same scene.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from qgs.contracts import Column
-from qgs.engine.comparison import crossed_interval, paired_interval
+from qgs.engine.comparison import CONFIDENCE, CROSSED, crossed_interval, paired_interval
+from qgs.engine.evaluation import SECTIONS
 from qgs.engine.results import StoredResults, read_results
 from qgs.wording import listed
 from qgs_studies.hypotheses import MAIN, Contrast
@@ -23,19 +24,22 @@ from qgs_studies.study import Hypothesis
 Verdict: TypeAlias = Literal["seen", "contradicted", "undecided"]
 Terms: TypeAlias = Mapping[tuple[str, str], int]
 
+_RANKED = 5  # variants of which a rank correlation says anything
+
 
 @dataclass(frozen=True)
 class Estimate:
     """A mean, or a sum of means, over the seeds and scenes that all of its parts have.
 
-    by_seed: means over scenes. low, high: see the module; None without an interval. Of one seed
-    the interval covers scenes alone.
+    by_seed: means over scenes. low, high: see the module; None without an interval, as of one
+    scene. Of one seed the interval covers scenes alone.
     """
 
     by_seed: Mapping[int, float]
     scenes: int
     low: float | None
     high: float | None
+    confidence: float = CONFIDENCE
 
     @property
     def mean(self) -> float:
@@ -51,17 +55,18 @@ class Estimate:
     @property
     def covers(self) -> str:
         """What the interval is over."""
-        scenes = f"{self.scenes} scene{'s' * (self.scenes != 1)}"
-        if len(self.by_seed) == 1:
-            return f"1 seed x {scenes}: says nothing of training"
-        return f"{len(self.by_seed)} seeds x {scenes}"
+        seeds = len(self.by_seed)
+        text = f"{seeds} seed{'s' * (seeds != 1)} x {self.scenes} scene{'s' * (self.scenes != 1)}"
+        silent = ["training"] * (seeds == 1) + ["other scenes"] * (self.scenes == 1)
+        return f"{text}: says nothing of {' and '.join(silent)}" if silent else text
 
 
 @dataclass(frozen=True)
 class Row:
-    """One variant by one evaluation. scores: by metric. differences: to the reference, by metric.
+    """One variant by one evaluation. scores: by metric. steps: of its runs.
 
-    steps: of its runs.
+    differences: to the reference, by metric; none of the reference itself, and none where the two
+    were not judged by one protocol.
     """
 
     variant: str
@@ -111,9 +116,10 @@ class Results:
             by_seed = self._stored.get((variant, evaluation), {})
             if not by_seed:
                 continue
-            apart: Terms = {(variant, evaluation): 1, (reference, evaluation): -1}
+            apart = self._apart(variant, evaluation)
             scores = self._estimates({(variant, evaluation): 1})
-            differences = self._estimates(apart) if variant != reference else {}
+            compared = variant != reference and not self._unlike(apart)
+            differences = self._estimates(apart) if compared else {}
             steps = sorted({s.step for s in by_seed.values() if s.step is not None})
             rows.append(Row(variant, evaluation, scores, differences, steps))
         return rows
@@ -124,62 +130,76 @@ class Results:
         pairs = zip(settings.hypotheses, self.plan.study.contrasts, strict=True)
         return [self._judged(hypothesis, contrast) for hypothesis, contrast in pairs]
 
-    def estimate(self, terms: Terms, metric: str) -> Estimate | None:
+    @property
+    def shared(self) -> str | None:
+        """The first evaluation that judged all of its runs by one protocol; None without one."""
+        return next((n for n in self.plan.evaluations if len(self._protocols(n)) == 1), None)
+
+    def estimate(
+        self, terms: Terms, metric: str, confidence: float = CONFIDENCE
+    ) -> Estimate | None:
         """The sum of means that `terms` weigh; None where they share no seed or no scene."""
-        stored = [self._stored.get(term, {}) for term in terms]
-        seeds = [s for s in self.plan.study.settings.seeds if all(s in part for part in stored)]
-        value = f"model_{metric}"
-        every = [part[seed].scenes for part in stored for seed in seeds]
-        first = every[0] if every else {}
-        scenes = [name for name in first if all(value in part.get(name, ()) for part in every)]
+        seeds, scenes = self._common(terms, metric)
         if not scenes:
             return None
-        weights = [*terms.values()]
+        value = f"model_{metric}"
+        weighed = [(self._stored[term], weight) for term, weight in terms.items()]
         values = np.array(
             [
                 [
-                    sum(
-                        weight * part[seed].scenes[scene][value]
-                        for weight, part in zip(weights, stored, strict=True)
-                    )
+                    sum(w * part[seed].scenes[scene][value] for part, w in weighed)
                     for scene in scenes
                 ]
                 for seed in seeds
             ]
         )
-        low, high = crossed_interval(values) or paired_interval(values[0]) or (None, None)
+        crossed = crossed_interval(values, confidence)
+        low, high = crossed or paired_interval(values[0]) or (None, None)
         by_seed = dict(zip(seeds, map(float, values.mean(1)), strict=True))
-        return Estimate(by_seed, len(scenes), low, high)
+        return Estimate(by_seed, len(scenes), low, high, confidence if crossed else CONFIDENCE)
 
     def answer(self) -> str:
-        """Whether a variant is better than the reference, and how sure that is; one line."""
+        """Whether a variant is better than the reference, and how sure that is; one line.
+
+        By the first evaluation that judges all alike. Who is best of n is better where the
+        interval at 1 - 0.05 / n says so (Bonferroni): chance has n tries. That all are worse needs
+        no correction, as each must be (an intersection-union test).
+        """
         reference, column = self.plan.study.settings.reference, self._known_column()
         if column is None:
             return "Not known yet: no run is finished."
+        if (by := self.shared) is None:
+            return f"Not known: {self._why_unlike()}."
         sign = 1 if column.better == "higher" else -1
-        apart = {r.variant: e for r in self.rows() if (e := r.differences.get(self.metric))}
+        apart = {r.variant: e for r in self.rows(by) if (e := r.differences.get(self.metric))}
         if not apart:
             return f"Not known yet: {reference} and another variant share no finished seed."
-        best = max(apart, key=lambda name: sign * apart[name].mean)
-        lead, among = apart[best], f", the best of {len(apart)}," if len(apart) > 1 else ""
-        told = f"{column.heading} {self.shown(lead.mean)}{self._sureness(lead, sign)}"
-        if len(lead.by_seed) < 2:
-            return f"Not known: {best}{among} has {told}."
-        if lead.low is None or lead.high is None:
-            return f"Not known: {best}{among} has {told}, without an interval."
-        low = min(sign * lead.low, sign * lead.high)
-        if low > 0:
-            return f"Yes: {best}{among} is better than {reference}, {told}."
-        worse = [name for name, estimate in apart.items() if self._worse(estimate, sign)]
-        if len(worse) == len(apart):
-            which = f"all {len(apart)} are worse; the nearest, {best}," if among else f"{best}"
-            return f"No: {which} is worse than {reference}, {told}."
-        open_ = {name: estimate for name, estimate in apart.items() if name not in worse}
-        best = max(open_, key=lambda name: sign * open_[name].mean)
-        lead = open_[best]
-        told = f"{column.heading} {self.shown(lead.mean)}{self._sureness(lead, sign)}"
-        others = f"; {len(worse)} of {len(apart)} variants are worse" if worse else ""
-        return f"Undecided: {best} cannot be told from {reference}, {told}{others}."
+
+        def told(lead: Estimate) -> str:
+            where = f" in the evaluation `{by}`" if by else ""
+            return f"{column.heading}{where} {self.shown(lead.mean)}{self._sureness(lead, sign)}"
+
+        def best_of(names: Iterable[str]) -> str:
+            return max(names, key=lambda name: sign * apart[name].mean)
+
+        best, count = best_of(apart), len(apart)
+        among = f", the best of {count}," if count > 1 else ""
+        lead = apart[best]
+        if lead.low is None or len(lead.by_seed) < 2:
+            return f"Not known: {best}{among} has {told(lead)}."
+        level = 1 - (1 - CONFIDENCE) / count
+        sure = {n: self.estimate(self._apart(n, by), self.metric, level) or lead for n in apart}
+        if better := [name for name in sure if self._ahead(sure[name], sign)]:
+            among = among if best in better else f", of {count} variants,"
+            best = best_of(better)
+            return f"Yes: {best}{among} is better than {reference}, {told(sure[best])}."
+        worse = [name for name, estimate in apart.items() if self._ahead(estimate, -sign)]
+        if len(worse) == count:
+            which = f"all {count} are worse; the nearest, {best}," if among else f"{best}"
+            return f"No: {which} is worse than {reference}, {told(lead)}."
+        best = best_of(name for name in apart if name not in worse)
+        others = f"; {len(worse)} of {count} variants are worse, each at 95 %" if worse else ""
+        return f"Undecided: {best} cannot be told from {reference}, {told(sure[best])}{others}."
 
     def notes(self) -> list[str]:
         """What is to be known beside the table."""
@@ -188,13 +208,14 @@ class Results:
         if any(len(e.by_seed) > 1 for e in estimates):
             notes.append(
                 "intervals: 95 %, of the mean paired difference to the reference over trainings "
-                "and scenes, both random (two-way variance, t with the degrees of freedom of "
-                "Hillis 2007); sd: over seeds, of means over scenes"
+                f"and scenes, both random ({CROSSED}); sd: over seeds, of means over scenes"
             )
         if any(len(e.by_seed) == 1 for e in estimates):
             notes.append(
                 "one training a side: its interval covers scenes, says nothing of training"
             )
+        if any(e.scenes == 1 for e in estimates):
+            notes.append("one scene is too few for an interval")
         if len(settings.hypotheses) > 1:
             count = len(settings.hypotheses)
             notes.append(f"each of {count} verdicts is at 95 % on its own, not all together")
@@ -202,26 +223,40 @@ class Results:
             told = listed(self.missing)
             notes.append(f"{len(self.missing)} of {len(self.plan.runs)} runs are missing: {told}")
         if (rank := self.rank_correlation()) is not None:
-            notes.append(f"rank correlation with the published order (Spearman): {rank:+.2f}")
+            of = f"{len(self._published())} variants"
+            notes.append(f"rank correlation with the published order (Spearman, {of}): {rank:+.2f}")
         for name in self.plan.evaluations:
-            stored = [s for (_, n), p in self._stored.items() for s in p.values() if n == name]
-            if len({s.protocol.sha256 for s in stored}) > 1:
+            if len(self._protocols(name)) > 1:
+                found = [v for v in self.plan.recipes if self._unlike(self._apart(v, name))]
+                told = f"; no difference is shown of {listed(found)}" if found else ""
                 where = name or "the recipes' own evaluation"
-                notes.append(f"{where}: protocols differ between variants")
+                notes.append(f"{where}: protocols differ between variants{told}")
+            stored = [s for (_, n), p in self._stored.items() for s in p.values() if n == name]
             lacking = {scene for s in stored for scene in s.missing}
             if lacking:
                 notes.append(f"scenes without a score in some run: {listed(sorted(lacking))}")
         return notes
 
     def rank_correlation(self) -> float | None:
-        """Of our means with the published ones; None for fewer than three variants with both."""
-        published = self.plan.study.settings.published
-        ours = {r.variant: e.mean for r in self.rows() if (e := r.scores.get(self.metric))}
-        names = [name for name in published if name in ours]
-        if len(names) < 3:
+        """Of our means with the published ones, by `shared`; None for fewer than five variants.
+
+        Of three, one order in six is the published one by chance; of five, one in 120.
+        """
+        pairs = self._published()
+        if len(pairs) < _RANKED:
             return None
-        ranks = [_ranks([side[name] for name in names]) for side in (published, ours)]
+        ranks = [_ranks(side) for side in zip(*pairs, strict=True)]
         return float(np.corrcoef(np.stack(ranks))[0, 1])
+
+    def _published(self) -> list[tuple[float, float]]:
+        """Published value and ours, of every variant that has both."""
+        published = self.plan.study.settings.published
+        rows = [] if self.shared is None else self.rows(self.shared)
+        return [
+            (published[row.variant], row.scores[self.metric].mean)
+            for row in rows
+            if row.variant in published and self.metric in row.scores
+        ]
 
     def shown(self, value: float | None, metric: str | None = None, sign: bool = True) -> str:
         """A difference or a mean, one digit finer than evaluations show it."""
@@ -242,12 +277,58 @@ class Results:
     def _sureness(self, estimate: Estimate, sign: int) -> str:
         ahead = sum(sign * value > 0 for value in estimate.by_seed.values())
         seeds = f"better in {ahead} of {len(estimate.by_seed)} seeds"
-        return f" (95 % interval {self.interval(estimate)}, {estimate.covers}, {seeds})"
+        interval = f"{100 * estimate.confidence:.3g} % interval {self.interval(estimate)}"
+        tries = round((1 - CONFIDENCE) / (1 - estimate.confidence))
+        chosen = f", which makes 95 % for the best of {tries}" if tries > 1 else ""
+        told = "no interval" if estimate.low is None else f"{interval}{chosen}"
+        return f" ({told}, {estimate.covers}, {seeds})"
 
     @staticmethod
-    def _worse(estimate: Estimate, sign: int) -> bool:
+    def _ahead(estimate: Estimate, sign: int) -> bool:
+        """Whether the interval is over trainings and scenes, and all on the side of `sign`."""
         ends = estimate.low, estimate.high
-        return all(end is not None and sign * end < 0 for end in ends)
+        inside = all(end is not None and sign * end > 0 for end in ends)
+        return inside and len(estimate.by_seed) > 1
+
+    def _apart(self, variant: str, evaluation: str) -> Terms:
+        """The difference of a variant to the reference; nothing of the reference itself."""
+        reference = self.plan.study.settings.reference
+        if variant == reference:
+            return {}
+        return {(variant, evaluation): 1, (reference, evaluation): -1}
+
+    def _protocols(self, evaluation: str) -> set[str]:
+        """Hashes of all protocols by which `evaluation` judged."""
+        parts = [part for (_, name), part in self._stored.items() if name == evaluation]
+        return {stored.protocol.sha256 for part in parts for stored in part.values()}
+
+    def _unlike(self, terms: Terms) -> bool:
+        """Whether terms of one evaluation weigh numbers of unlike protocols against each other."""
+        sums: dict[tuple[str, frozenset[str]], int] = {}
+        for (variant, evaluation), weight in terms.items():
+            stored = self._stored.get((variant, evaluation), {}).values()
+            key = evaluation, frozenset(s.protocol.sha256 for s in stored)
+            sums[key] = sums.get(key, 0) + weight
+        several = [hashes for _, hashes in sums if len(hashes) > 1]
+        names = [evaluation for (evaluation, hashes), weight in sums.items() if weight and hashes]
+        return bool(several) or len(set(names)) < len(names)
+
+    def _why_unlike(self) -> str:
+        differs = self.plan.study.settings.differs
+        told = listed(path for path in differs if path.split(".")[0] in SECTIONS)
+        fix = f" that sets {told}" if told else ""
+        return (
+            "no evaluation judges all variants by one protocol, so that their numbers are not "
+            f"compared; add one{fix} to the study's `evaluations`"
+        )
+
+    def _common(self, terms: Terms, metric: str) -> tuple[list[int], list[str]]:
+        """Seeds that all `terms` have, and the scenes that have the metric in all of these runs."""
+        stored = [self._stored.get(term, {}) for term in terms]
+        seeds = [s for s in self.plan.study.settings.seeds if all(s in part for part in stored)]
+        every = [part[seed].scenes for part in stored for seed in seeds]
+        first, value = every[0] if every else {}, f"model_{metric}"
+        return seeds, [n for n in first if all(value in part.get(n, ()) for part in every)]
 
     def _estimates(self, terms: Terms) -> dict[str, Estimate]:
         found = {metric: self.estimate(terms, metric) for metric in self.columns}
@@ -256,14 +337,31 @@ class Results:
     def _judged(self, hypothesis: Hypothesis, contrast: Contrast) -> Judgement:
         metric = hypothesis.metric or self.metric
         estimate = self.estimate(contrast.terms, metric)
-        if estimate is None or estimate.low is None or estimate.high is None:
-            return Judgement(hypothesis, metric, estimate, "undecided", "runs are missing")
-        if len(estimate.by_seed) < 2:
-            return Judgement(hypothesis, metric, estimate, "undecided", "one training a side")
-        low, high = sorted((contrast.sign * estimate.low, contrast.sign * estimate.high))
-        verdict: Verdict = "seen" if low > 0 else "contradicted" if high < 0 else "undecided"
-        reason = "the interval holds 0" if verdict == "undecided" else ""
-        return Judgement(hypothesis, metric, estimate, verdict, reason)
+        if estimate is None or (lacking := self._lacking(estimate)):
+            reason = self._why_none(contrast.terms, metric) if estimate is None else lacking
+            return Judgement(hypothesis, metric, estimate, "undecided", reason)
+        verdict: Verdict = "undecided"
+        if self._ahead(estimate, contrast.sign):
+            verdict = "seen"
+        elif self._ahead(estimate, -contrast.sign):
+            verdict = "contradicted"
+        reasons = ["the interval holds 0"] * (verdict == "undecided")
+        reasons += ["judged by unlike protocols"] * self._unlike(contrast.terms)
+        return Judgement(hypothesis, metric, estimate, verdict, ", ".join(reasons))
+
+    @staticmethod
+    def _lacking(estimate: Estimate) -> str:
+        """Why there is no verdict on an estimate however clear it is; empty where there is one."""
+        lacking = ["one training a side"] * (len(estimate.by_seed) < 2)
+        return " and ".join([*lacking, *["one scene"] * (estimate.scenes < 2)])
+
+    def _why_none(self, terms: Terms, metric: str) -> str:
+        seeds, _ = self._common(terms, metric)
+        if not seeds:
+            return "no seed of which all its runs are finished"
+        if metric not in self.columns:
+            return f"the runs did not measure `{metric}`"
+        return f"no scene has `{metric}` in all its runs"
 
 
 def _ranks(values: Sequence[float]) -> np.ndarray:
