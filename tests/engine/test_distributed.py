@@ -73,6 +73,7 @@ NO_LAYERS = (
 )
 
 
+@pytest.mark.slow
 def test_two_processes_train_a_model_whose_keys_nothing_reads(tiny: Tiny, tmp_path: Path) -> None:
     train_in_two_processes(tiny("tokengs", *NO_LAYERS), tmp_path / "two")
 
@@ -104,9 +105,8 @@ def test_shards_continue_what_one_process_began(
     qgs.load(tmp_path / "shards" / "checkpoint.safetensors")
 
 
-@pytest.mark.parametrize(
-    "environment", [{}, pytest.param(FSDP, marks=pytest.mark.slow)], ids=["copies", "shards"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", [{}, FSDP], ids=["copies", "shards"])
 def test_two_processes_make_two_passes_as_one_does(
     tiny: Tiny, tmp_path: Path, two: None, environment: dict[str, str]
 ) -> None:
@@ -117,6 +117,7 @@ def test_two_processes_make_two_passes_as_one_does(
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path: Path) -> None:
     parts = ("training.batch_size=1", "training.render_views=1", "training.on_nonfinite=skip")
     judged = ("training.ema=0.9", "training.evaluate_every=2", "evaluation.scenes=1")

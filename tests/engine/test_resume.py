@@ -81,7 +81,11 @@ def change_counters(folder: Path, **values: Any) -> None:
 
 CASES = [
     ("locus", ()),
-    ("tokengs", ("training.accumulate=2", "training.batch_size=1", "views.mirror=0.5")),
+    pytest.param(
+        "tokengs",
+        ("training.accumulate=2", "training.batch_size=1", "views.mirror=0.5"),
+        marks=pytest.mark.slow,
+    ),
     ("locus", ("training.precision=bf16", "training.ema=0.9", "training.render_views=1")),
 ]
 

@@ -32,6 +32,7 @@ def test_shapes_alone_count_the_bytes_of_real_tensors(name: str) -> None:
     assert found.weights + found.moments < found.peak
 
 
+@pytest.mark.slow
 def test_bf16_keeps_less_and_a_forward_pass_keeps_nothing() -> None:
     recipe = resolve(RECIPES / "tiny/locus.yaml")
     work = Workload(2, 2, (64, 64), batch=4)
@@ -57,6 +58,7 @@ def test_what_cannot_be_counted_is_told() -> None:
         count(recipe, "step", Workload(views=2, targets=2, size=(15, 24)))
 
 
+@pytest.mark.slow
 def test_a_training_needs_more_than_a_step() -> None:
     plain = need_of(resolve(RECIPES / "tiny/tokengs.yaml", SMALL), MODEST)
     more = ["training.ema=0.99", "training.accumulate=3"]
