@@ -54,8 +54,8 @@ def by_evaluation(study: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw_lines(study: Path, file: Path) -> None:
-    """A panel for each WHAT of evaluations named WHAT_NUMBER: PSNR over the numbers."""
+def draw_lines(study: Path) -> Figure | None:
+    """A panel for each WHAT of evaluations named WHAT_NUMBER: PSNR over the numbers; or None."""
     found, panels = means(study), dict[str, list[str]]()
     for name in found:
         if match := re.fullmatch(r"(\w+)_(\d+)", name):
@@ -63,28 +63,32 @@ def draw_lines(study: Path, file: Path) -> None:
     if "exact" in found and "noise" in panels:
         found["noise_0"] = found["exact"]
         panels["noise"].insert(0, "noise_0")
+    if not panels:
+        return None
     with figure_style():
         figure = Figure(figsize=(7.6, 2.9), layout="constrained")
-        for axes, (what, names) in zip(
-            figure.subplots(1, len(panels), sharey=True), panels.items(), strict=True
-        ):
+        row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, (what, names) in zip(row, panels.items(), strict=True):
             at = [int(name.rpartition("_")[2]) for name in names]
             for place, variant in enumerate(found[names[0]]):
                 values, spread = zip(*(found[name][variant] for name in names), strict=True)
                 look = {"color": hex_color(categorical(place)), "marker": "o", "markersize": 3}
                 axes.errorbar(at, values, spread, label=variant, **look)
-            axes.set(xlabel=f"{UNITS[what]} in the test", xticks=at)
+            axes.set(xlabel=f"{UNITS.get(what, what)} in the test", xticks=at)
         figure.axes[0].set(title="PSNR, dB; bars: sd over seeds")
         figure.axes[0].legend(loc="center left")
-        write_webp(figure, file)
+    return figure
 
 
-def write_webp(figure: Figure, file: Path) -> None:
-    """The figure as a picture for the page."""
-    pixels = BytesIO()
-    figure.savefig(pixels, format="png", dpi=160)
+def write_figure(study: Path, file: Path) -> None:
+    """The study's figure as a picture for the page."""
+    pixels: BytesIO | Path = study / "figures" / "values.png"
+    quality = {}
+    if figure := draw_lines(study):
+        pixels, quality = BytesIO(), {"quality": 88}
+        figure.savefig(pixels, format="png", dpi=160)
     with replacing(file) as path:
-        Image.open(pixels).convert("RGB").save(path, "WEBP", quality=88)
+        Image.open(pixels).convert("RGB").save(path, "WEBP", **quality)
 
 
 def page_of(study: Path) -> str:
@@ -107,11 +111,7 @@ def main() -> None:
             print(f"{study} has no table.md: the page keeps what it has of {region[2]}")
             return region[0]
         image = PAGE.parent / "images" / f"evidence_{region[2]}.webp"
-        if means(study):
-            draw_lines(study, image)
-        else:
-            with replacing(image) as path:
-                Image.open(study / "figures" / "values.png").convert("RGB").save(path, "WEBP")
+        write_figure(study, image)
         shown = f"![{region[2]}: the figures of the table below](images/{image.name})"
         return f"{region[1]}\n{shown}\n\n{page_of(study)}\n{region[3]}"
 

@@ -95,6 +95,26 @@ class Comparison:
             scenes = f"{count} of {wanted} scenes{names}"
         return f"{first.name} against {second.name}, {scenes}"
 
+    @property
+    def _covers(self) -> str:
+        if (pairs := len(_trainings(self.first, self.second))) > 1:
+            return f"{pairs} trainings a side and scenes, both random ({CROSSED})"
+        first, second = (len(side.runs) or 1 for side in (self.first, self.second))
+        trainings = "one training a side"
+        if first + second > 2:
+            trainings = f"{first} against {second} trainings"
+        resampled = f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples)"
+        return f"{resampled}; {trainings}: says nothing of training"
+
+    def _unpaired(self) -> Iterator[str]:
+        """Trainings that no mean has, because the other side has none to pair them with."""
+        pairs = _trainings(self.first, self.second)
+        for number, side in enumerate((self.first, self.second)):
+            used = [id(pair[number]) for pair in pairs]
+            left = [run.seed for run in side.runs if id(run) not in used]
+            if len(pairs) > 1 and left:
+                yield f"{side.name}: seed {listed(left)} left out, nothing to pair with"
+
     def rows(self) -> list[list[str]]:
         """The table, headers first; one digit finer than an evaluation's."""
         names = short_names([self.first.name, self.second.name])
@@ -110,19 +130,14 @@ class Comparison:
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
         first, second, facts = self.first, self.second, self.record()
-        trainings = self.differences[0].trainings if self.differences else 1
-        covers = (
-            f"{trainings} trainings a side and scenes, both random ({CROSSED})"
-            if trainings > 1
-            else f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples); one training a "
-            "side: says nothing of training"
-        )
-        yield f"difference: {first.name} minus {second.name}, mean over scenes; interval: {covers}"
+        covered = f"mean over scenes; interval: {self._covers}"
+        yield f"difference: {first.name} minus {second.name}, {covered}"
         steps = [np.mean([r.step for r in s.runs or [s] if r.step] or [0]) for s in (first, second)]
         for side, mean in zip((first, second), steps, strict=True):
             seeds = listed(run.seed for run in side.runs or [side] if run.seed is not None)
             of = f" of a budget of {side.budget}, seed {seeds}" if side.budget else ""
             yield f"{side.name}: {f'{mean:,.0f} steps' if mean else 'steps not known'}{of}"
+        yield from self._unpaired()
         if min(steps) and max(steps) > 1.02 * min(steps):
             yield f"unequal training: {max(steps) / min(steps):.2f} times the steps of the other"
         if len(self.shared) == 1:

@@ -142,12 +142,21 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed() -> None:
     assert "interval: 2 trainings a side and scenes, both random" in text
     assert "r/a: 100 steps of a budget of 60 s, seed 0, 1, 2" in text
     assert "r/b: 190 steps of a budget of 60 s, seed 1, 0" in text
+    assert "r/a: seed 2 left out, nothing to pair with" in text
+    assert "r/b: seed" not in text
     assert "unequal training: 1.90 times the steps of the other" in text
 
 
 def test_one_training_a_side_says_nothing_of_training() -> None:
     pair = [training("x", "A", 0, a=1.0, b=2.5), training("y", "B", 0, a=2.0, b=2.0)]
     assert "one training a side: says nothing of training" in compare(pair).markdown()
+
+
+def test_several_trainings_against_one_say_nothing_of_training() -> None:
+    ours = [training(f"r/a/{s}", "A", s, a=10.0 + s, b=12.0 - s) for s in range(3)]
+    text = compare([*ours, training("r/b", "B", 0, a=9.0, b=11.0)]).markdown()
+    assert "3 against 1 trainings: says nothing of training" in text
+    assert "left out" not in text
 
 
 def test_seeds_whose_index_was_moved_between_them_are_one_side(tmp_path: Path) -> None:
