@@ -44,6 +44,25 @@ def test_a_claimed_run_is_free_again_when_it_was_released(run: Run) -> None:
     assert files(run) == ["seed-3.claim-2", "seed-3.claim-3"]
 
 
+def test_a_heart_goes_on_when_the_folder_was_away(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beaten = threading.Event()
+    tries = iter([OSError(116, "Stale file handle"), None])
+
+    def touch(path: Path) -> None:
+        if error := next(tries, None):
+            raise error
+        beaten.set()
+
+    monkeypatch.setattr(claims, "BEAT_SECONDS", 0.01)
+    monkeypatch.setattr(os, "utime", touch)
+    claim = take(run, never)
+    assert claim
+    assert beaten.wait(10)
+    claim.release()
+
+
 def test_of_many_at_once_one_has_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(claims, "BEAT_SECONDS", 60)
     for _ in range(20):

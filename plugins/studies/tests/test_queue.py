@@ -1,5 +1,6 @@
 """Studies that run: queues on one folder, kills, what is added later. Trainings of seconds."""
 
+import io
 import json
 import os
 import re
@@ -8,7 +9,10 @@ from pathlib import Path
 import kill_study
 import pytest
 from commands import run_qgs
-from qgs_studies.queue import Progress, _cell, last_record
+from qgs_studies.plan import Run, planned
+from qgs_studies.queue import Progress, Queue, _cell, last_record
+from qgs_studies.study import read_study
+from rich.console import Console
 
 from qgs.threads import usable_cores
 
@@ -51,6 +55,32 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study: Path) -> None:
     refused = run_qgs("study", study, "--out", out, "--workers", 0)
     assert "the variant `flat` is not the one that 2 runs in" in str(refused.exception)
     assert "give the new one another name" in str(refused.exception)
+
+
+def test_what_failed_comes_last_and_a_collapse_is_final(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = planned(read_study(study), study.parent / "out")
+    first, second, third, fourth = plan.runs
+    first.failure.parent.mkdir(parents=True)
+    second.failure.parent.mkdir(parents=True, exist_ok=True)
+    first.failure.write_text("CollapseError: training collapsed at step 7\n")
+    second.failure.write_text("OSError: no space left\n")
+    started: list[Run] = []
+
+    def start(queue: Queue, run: Run) -> None:
+        started.append(run)
+        queue._started += 1
+
+    monkeypatch.setattr(Queue, "_start", start)
+    for most in (1, 2, 3, 4):
+        started.clear()
+        queue = Queue(plan, 4, 1, "cpu", console := Console(file=io.StringIO()), most)
+        queue.work()
+        assert started == [third, fourth, second][:most]
+        assert queue.failures == {first: "CollapseError: training collapsed at step 7"}
+        told = console.file.getvalue()  # type: ignore[attr-defined]
+        assert "locus seed 0 is not trained again, it would end so each time" in told
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -105,6 +106,18 @@ def test_numbers_are_those_of_the_definition(tmp_path: Path) -> None:
     contrast = found.judgements()[2].estimate
     assert contrast
     assert contrast.mean == pytest.approx(-0.5, abs=0.15)
+
+
+def test_trainings_that_failed_are_in_the_answer(tmp_path: Path) -> None:
+    plan = results(tmp_path, simple).plan
+    for seed in range(3):
+        run = run_of(tmp_path, "other", seed)
+        shutil.rmtree(run.folder)
+        run.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
+    found = Results(plan)
+    assert found.answer().startswith("No: less is worse than full, PSNR ")
+    assert found.answer().endswith("Left out: 3 of 3 trainings of other failed (CollapseError).")
+    assert "other seed 0 failed: CollapseError: training collapsed at step 7: it" in found.notes()
 
 
 @pytest.mark.parametrize(
@@ -226,7 +239,7 @@ def test_the_best_of_several_is_better_when_chance_has_several_tries(tmp_path: P
     assert apart.low > 0
     assert found.answer().startswith("Undecided: other cannot be told from full, PSNR +0.5")
     assert "97.5 % interval [-" in found.answer()
-    assert "which makes 95 % for the best of 2" in found.answer()
+    assert "corrected for the best of 2" in found.answer()
     (tmp_path / "two").mkdir()
     alone = STUDY.replace(", other: x.yaml}", "}").replace("  - other > full\n", "")
     alone = alone.replace(", other: 22.0}", "}").replace("less", "other")

@@ -41,11 +41,15 @@ class Claim:
 
     def _beat(self) -> None:
         while not self._over.wait(BEAT_SECONDS):
-            newer = _numbered(self._path.parent, _stem(self._path))
-            if newer and newer[-1] != self._path:
-                self._lost()
-                return
-            os.utime(self._path)
+            try:
+                newer = _numbered(self._path.parent, _stem(self._path))
+                if not newer or newer[-1] == self._path:
+                    os.utime(self._path)
+                    continue
+            except OSError:  # a shared file system may be away for some seconds
+                continue
+            self._lost()
+            return
 
 
 def take(run: Run, lost: Callable[[], None]) -> Claim | None:

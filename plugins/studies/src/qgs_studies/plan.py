@@ -20,6 +20,7 @@ from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import OptionError
 from qgs.data.evaluation import EvaluationIndex, EvaluationPlan, IndexEntry
 from qgs.engine.folder import RunFolder, checkpoint_of
+from qgs.engine.guard import CollapseError, NonFiniteError
 from qgs.engine.protocol import index_of
 from qgs.io.files import write_text
 from qgs.wording import listed
@@ -37,6 +38,8 @@ All but the model and its optimiser.
 
 INDEX = "evaluation.index"
 """A file that may lie elsewhere today: it is compared by what it holds."""
+
+_ENDS = (CollapseError.__name__, NonFiniteError.__name__)
 
 _MOST = 12
 """Differences of a changed variant that the message names."""
@@ -62,6 +65,17 @@ class Run:
     def failure(self) -> Path:
         """Why it failed, where it did."""
         return self.folder.with_name(f"{self.folder.name}.failed")
+
+    @property
+    def failed(self) -> str:
+        """Why it failed, the first sentence; "" where it did not."""
+        text = self.failure.read_text(encoding="utf-8") if self.failure.is_file() else ""
+        return text.strip().split("\n")[0].partition(". ")[0]
+
+    @property
+    def ended(self) -> bool:
+        """Whether the training itself went wrong, as it would each time: it is not tried again."""
+        return self.failed.startswith(_ENDS)
 
     def evaluation(self, name: str) -> Path:
         """The folder of its results by one evaluation."""

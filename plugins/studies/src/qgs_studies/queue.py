@@ -74,6 +74,10 @@ class Queue:
         and not tried again by this call.
         """
         before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
+        for run in filter(self._ended, self.plan.runs):
+            self._failed[run] = run.failed
+            told = f"{run} is not trained again, it would end so each time: {run.failed}"
+            self._say(f"{told}; to train it again, delete {run.failure} and {run.folder}")
         shown, told = 0.0, dict.fromkeys(filter(self.plan.done, self.plan.runs), True)
         live = Live(console=self.console, auto_refresh=False, transient=True)
         try:
@@ -117,8 +121,9 @@ class Queue:
         if self._stopping:
             return False
         missing = [run for run in self.plan.runs if run not in self._failed]
-        missing = [run for run in missing if not self.plan.done(run)]
+        missing = [r for r in missing if not self.plan.done(r) and not self._ended(r)]
         free = [run for run in missing if run not in self._processes]
+        free.sort(key=lambda run: run.failure.is_file())  # so that one cannot use up all tries
         if time.monotonic() - self._looked > _LOOK_SECONDS:
             self._looked = time.monotonic()
             self._elsewhere = {run: who for run in free if (who := owner(run))}
@@ -130,6 +135,9 @@ class Queue:
         if self.most is not None:  # others are free to take what is left
             return bool(self._processes)
         return bool(missing)
+
+    def _ended(self, run: Run) -> bool:
+        return run.ended and not self.plan.done(run)
 
     def _start(self, run: Run) -> None:
         used = {slot for _, slot in self._processes.values()}
@@ -176,11 +184,11 @@ class Queue:
     def _fail(self, run: Run, code: int) -> None:
         why = f"its process {_ended(code)}"
         if code == FAILED and run.failure.is_file():
-            why = run.failure.read_text(encoding="utf-8").strip()
+            why = run.failed
         elif code < 0 or code > 128:
             why += f" {DEATHS} times without a save between; memory may be short"
         self._failed[run] = why
-        self._say(f"{run} failed: {why.splitlines()[0]} (see {run.log})")
+        self._say(f"{run} failed: {why} (see {run.log})")
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self._stopping = signal.Signals(number).name

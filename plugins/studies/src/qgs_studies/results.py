@@ -6,7 +6,7 @@ held against the same seed of the reference, which saw the same data in the same
 against the same scene.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -88,7 +88,10 @@ class Judgement:
 
 
 class Results:
-    """All results in the folder of `plan`. missing: runs that lack some of theirs."""
+    """All results in the folder of `plan`.
+
+    missing: runs that lack some of theirs. failed: those of them that failed.
+    """
 
     def __init__(self, plan: Plan) -> None:
         self.plan, self.metric = plan, plan.study.settings.metric
@@ -99,6 +102,7 @@ class Results:
                     found = read_results(run.evaluation(name))
                     self._stored.setdefault((run.variant, name), {})[run.seed] = found
         self.missing: list[Run] = [run for run in plan.runs if not plan.done(run)]
+        self.failed: list[Run] = [run for run in self.missing if run.failed]
         self.columns: dict[str, Column] = {}
         for by_seed in self._stored.values():
             for stored in by_seed.values():
@@ -159,7 +163,19 @@ class Results:
         return Estimate(by_seed, len(scenes), low, high, confidence if crossed else CONFIDENCE)
 
     def answer(self) -> str:
-        """Whether a variant is better than the reference, and how sure that is; one line.
+        """Whether a variant is better than the reference, and how sure that is; one line."""
+        return " ".join([self._answer(), *self._failures()])
+
+    def _failures(self) -> Iterator[str]:
+        """Of each variant, how many trainings failed: what survives says less."""
+        for variant in self.plan.recipes:
+            runs = [run for run in self.plan.runs if run.variant == variant]
+            if why := [run.failed.split(":")[0] for run in runs if run in self.failed]:
+                told = listed(dict.fromkeys(why))
+                yield f"Left out: {len(why)} of {len(runs)} trainings of {variant} failed ({told})."
+
+    def _answer(self) -> str:
+        """By scores alone.
 
         By the first evaluation that judges all alike. Who is best of n is better where the
         interval at 1 - 0.05 / n says so (Bonferroni): chance has n tries. That all are worse needs
@@ -188,7 +204,8 @@ class Results:
         if lead.low is None or len(lead.by_seed) < 2:
             return f"Not known: {best}{among} has {told(lead)}."
         level = 1 - (1 - CONFIDENCE) / count
-        sure = {n: self.estimate(self._apart(n, by), self.metric, level) or lead for n in apart}
+        tried = ((n, self.estimate(self._apart(n, by), self.metric, level)) for n in apart)
+        sure = {name: estimate for name, estimate in tried if estimate}
         if better := [name for name in sure if self._ahead(sure[name], sign)]:
             among = among if best in better else f", of {count} variants,"
             best = best_of(better)
@@ -222,6 +239,7 @@ class Results:
         if self.missing:
             told = listed(self.missing)
             notes.append(f"{len(self.missing)} of {len(self.plan.runs)} runs are missing: {told}")
+        notes += [f"{run} failed: {run.failed}" for run in self.failed]
         if (rank := self.rank_correlation()) is not None:
             of = f"{len(self._published())} variants"
             notes.append(f"rank correlation with the published order (Spearman, {of}): {rank:+.2f}")
@@ -279,7 +297,7 @@ class Results:
         seeds = f"better in {ahead} of {len(estimate.by_seed)} seeds"
         interval = f"{100 * estimate.confidence:.3g} % interval {self.interval(estimate)}"
         tries = round((1 - CONFIDENCE) / (1 - estimate.confidence))
-        chosen = f", which makes 95 % for the best of {tries}" if tries > 1 else ""
+        chosen = f", corrected for the best of {tries}" if tries > 1 else ""
         told = "no interval" if estimate.low is None else f"{interval}{chosen}"
         return f" ({told}, {estimate.covers}, {seeds})"
 
