@@ -43,6 +43,7 @@ hypotheses: [free < locus, tokengs@more - tokengs < locus@more - locus]
 """
 SAME = ("results.json", "table.csv", "runs.csv", "table.md", "table.tex")
 MOST_SECONDS = 3600
+RESTARTS = 5  # of queues, one after the other, that end with 1: a run died before its first save
 
 
 def started(study: Path, out: Path, workers: int) -> subprocess.Popen[bytes]:
@@ -76,13 +77,13 @@ def quiet(study: Path, out: Path, workers: int) -> float:
 
 def disturbed(study: Path, out: Path, kills: int, rng: random.Random) -> list[str]:
     """Run to the end through so many kills; what was killed."""
-    told, queue = [], started(study, out, 2)
-    while len(told) < kills:
+    told, queue, restarts = [], started(study, out, 2), 0
+    while len(told) < kills and restarts < RESTARTS:
         time.sleep(rng.uniform(1.0, 12.0))
         if queue.poll() is not None:
             if queue.returncode == 0:
                 break  # done before all kills came
-            queue = started(study, out, 2)
+            queue, restarts = started(study, out, 2), restarts + 1
             continue
         targets = [*workers_of(out), queue.pid]
         target = rng.choice(targets)
@@ -91,11 +92,13 @@ def disturbed(study: Path, out: Path, kills: int, rng: random.Random) -> list[st
         except ProcessLookupError:
             continue
         told.append("queue" if target == queue.pid else "worker")
+        restarts = 0
         if target == queue.pid:
             queue.wait()
             queue = started(study, out, 2)
     while (code := queue.wait(MOST_SECONDS)) != 0:
-        if code not in (1, -signal.SIGKILL):  # 1: one died too often before its first save
+        restarts += 1
+        if code not in (1, -signal.SIGKILL) or restarts > RESTARTS:
             raise RuntimeError(f"the study in {out} ended with {code}; see {out}.log")
         queue = started(study, out, 2)
     return told

@@ -22,6 +22,7 @@ import yaml
 from upath import UPath
 
 from qgs.data.chunk_files import list_scenes, load_chunk
+from qgs.engine.results import markdown_table
 from qgs.io.files import write_text
 
 STUDY = Path(__file__).parents[1] / "recipes" / "studies" / "photos" / "scene_left_out.yaml"
@@ -58,27 +59,49 @@ def write_fold(folder: Path, left_out: dict[str, Any], others: list[dict[str, An
     write_text(folder / "study.yaml", yaml.safe_dump(study))
 
 
-def print_table(out: Path) -> None:
-    """A row a scene: mean PSNR, over seeds and windows, of every variant and of the baselines."""
-    rows: dict[str, dict[str, list[float]]] = {}
-    for file in sorted(out.glob("*/study/runs/*/*/evaluation/scenes.csv")):
-        scene, variant = file.parts[-7], file.parts[-4]
-        row = rows.setdefault(scene, {})
-        with file.open(encoding="utf-8") as lines:
-            for window in csv.DictReader(lines):
-                row.setdefault(variant, []).append(float(window["model_psnr"]))
-                for baseline in ("nearest_input", "mean_colour"):
-                    row.setdefault(baseline, []).append(float(window[f"{baseline}_psnr"]))
-    names = sorted({name for row in rows.values() for name in row})
-    print("| scene left out |", " | ".join(names), "|\n|---|" + "--:|" * len(names))
-    whole = [row for row in rows.values() if row.keys() == {*names}]
-    rows["mean of rows without a gap"] = {n: [mean(row[n]) for row in whole] for n in names}
-    for scene, row in rows.items():
-        print(
-            f"| {scene} |",
-            " | ".join(f"{mean(row[n]):.2f}" if n in row else "" for n in names),
-            "|",
-        )
+def read_scores(results: Path) -> dict[str, float]:
+    """Mean PSNR over windows of the model and of the baselines.
+
+    Raises ValueError for a window without a score.
+    """
+    with (results / "scenes.csv").open(encoding="utf-8") as lines:
+        windows = [*csv.DictReader(lines)]
+    scores: dict[str, float] = {}
+    for name in ("model", "nearest_input", "mean_colour"):
+        values = [window[f"{name}_psnr"] for window in windows]
+        if "" in values:
+            raise ValueError(f"{results / 'scenes.csv'} has no {name}_psnr of some windows")
+        scores[name] = mean(map(float, values))
+    return scores
+
+
+def table_rows(out: Path) -> list[list[str]]:
+    """Headers; a row a scene: mean PSNR over windows and seeds of every variant, baselines.
+
+    Over the seeds that all variants of the scene have finished; one that has finished none has no
+    value, and is held against none.
+    """
+    found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for file in sorted(out.glob("*/study/runs/*/*/evaluation/protocol.json")):
+        scene, variant, seed = file.parts[-7], file.parts[-4], file.parts[-3]
+        by_seed = found.setdefault(scene, {}).setdefault(variant, {})
+        by_seed[seed] = read_scores(file.parent)
+    if not found:
+        raise ValueError(f"{out} has no finished study; run them first, see --help")
+    variants = sorted({variant for of_scene in found.values() for variant in of_scene})
+    names = [*variants, "nearest input", "mean colour"]
+    rows, whole = [], []
+    for scene, of_scene in found.items():
+        seeds = sorted(set.intersection(*(set(by_seed) for by_seed in of_scene.values())))
+        first = next(iter(of_scene.values()))
+        values = {v: [by_seed[s]["model"] for s in seeds] for v, by_seed in of_scene.items()}
+        values |= {n: [first[s][n.replace(" ", "_")] for s in seeds] for n in names[-2:]}
+        means = {name: mean(of_seeds) for name, of_seeds in values.items() if of_seeds}
+        rows.append([scene, *(f"{means[n]:.2f}" if n in means else "" for n in names)])
+        rows[-1].append(", ".join(seed.removeprefix("seed-") for seed in seeds))
+        whole += [means] * (means.keys() == {*names})
+    cells = [f"{mean(means[n] for means in whole):.2f}" if whole else "" for n in names]
+    return [["scene left out", *names, "seeds"], *rows, ["mean of full rows", *cells, ""]]
 
 
 def main() -> None:
@@ -88,7 +111,7 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="of the studies that are finished")
     options = parser.parse_args()
     if options.table:
-        print_table(options.out)
+        print(markdown_table(table_rows(options.out)))
         return
     entries = {}
     for part in ("train", "test"):

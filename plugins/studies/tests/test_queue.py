@@ -4,6 +4,7 @@ import io
 import json
 import os
 import re
+import subprocess
 from pathlib import Path
 
 import kill_study
@@ -11,6 +12,7 @@ import pytest
 from commands import run_qgs
 from qgs_studies.plan import Run, planned
 from qgs_studies.queue import Progress, Queue, _cell, last_record
+from qgs_studies.results import Results
 from qgs_studies.study import read_study
 from rich.console import Console
 
@@ -78,9 +80,44 @@ def test_what_failed_comes_last_and_a_collapse_is_final(
         queue = Queue(plan, 4, 1, "cpu", console := Console(file=io.StringIO()), most)
         queue.work()
         assert started == [third, fourth, second][:most]
-        assert queue.failures == {first: "CollapseError: training collapsed at step 7"}
+        assert queue.failures == {}, "what failed before is no failure of this call"
         told = console.file.getvalue()  # type: ignore[attr-defined]
         assert "locus seed 0 is not trained again, it would end so each time" in told
+        assert f"from the start, delete {first.failure} and {first.folder}" in told
+    result = run_qgs("study", study, "--out", plan.folder, "--slurm")
+    assert result.exit_code == 0
+    assert "#SBATCH --array=1-3" in (plan.folder / "slurm.sh").read_text()
+
+
+def test_a_run_with_numbers_that_are_not_finite_keeps_what_it_saved(study: Path) -> None:
+    plan = planned(read_study(study), study.parent / "out")
+    plan.runs[0].failure.parent.mkdir(parents=True)
+    plan.runs[0].failure.write_text("NonFiniteError: step 8 is not finite. To go on\n")
+    queue = Queue(plan, 1, 1, "cpu", console := Console(file=io.StringIO()), most=0)
+    queue.work()
+    told = console.file.getvalue()  # type: ignore[attr-defined]
+    assert f"delete {plan.runs[0].failure}: it goes on from its last save" in told
+    assert str(plan.runs[0].folder) + "\n" not in told
+
+
+def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = planned(read_study(study), study.parent / "out")
+
+    def start(queue: Queue, run: Run) -> None:
+        run.failure.parent.mkdir(parents=True, exist_ok=True)
+        queue._processes[run] = subprocess.Popen(["sh", "-c", "kill -9 $$"]), 0
+        queue._started += 1
+
+    monkeypatch.setattr(Queue, "_start", start)
+    queue = Queue(plan, 1, 1, "cpu", Console(file=io.StringIO()), most=1)
+    queue.work()
+    killed = plan.runs[0]
+    assert [*queue.failures] == [killed]
+    assert "SIGKILL 3 times without a save between" in killed.failed
+    assert not killed.ended
+    assert Results(plan).failed == [killed]
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from collections.abc import Callable, Mapping
 from itertools import pairwise
@@ -25,7 +26,7 @@ Score = Callable[[str, str, int, int], float]
 """Of a variant by an evaluation with a seed on a scene."""
 
 STUDY = """study: 1
-variants: {full: x.yaml, less: x.yaml, other: x.yaml}
+variants: {full: tiny/locus.yaml, less: tiny/locus.yaml, other: tiny/locus.yaml}
 reference: full
 seeds: [0, 1, 2]
 budget: {steps: 9}
@@ -39,10 +40,14 @@ published: {full: 24.0, less: 23.0, other: 22.0}
 COLUMNS = {"psnr": {"heading": "PSNR", "better": "higher", "digits": 2, "unit": "dB"}}
 
 
+NEAREST = 15.5
+"""PSNR of the nearest input in every scene."""
+
+
 def write_run(folder: Path, values: Mapping[str, float], step: int, views: str = "") -> None:
     folder.mkdir(parents=True)
-    rows = [f"{scene},0 3,1 2,{value!r}," for scene, value in values.items()]
-    head = "scene,input_frames,target_frames,model_psnr,problem"
+    rows = [f"{scene},0 3,1 2,{value!r},{NEAREST}," for scene, value in values.items()]
+    head = "scene,input_frames,target_frames,model_psnr,nearest_input_psnr,problem"
     (folder / "scenes.csv").write_text("\n".join([head, *rows]) + "\n")
     summary = {"protocol": {"name": "made up"}, "columns": COLUMNS, "step": step, "missing": {}}
     summary |= {"scenes_in_protocol": len(values), "null_entries": []}
@@ -87,7 +92,7 @@ def test_verdicts_and_the_answer(tmp_path: Path) -> None:
     verdicts = [j.verdict for j in found.judgements()]
     assert verdicts == ["seen", "undecided", "seen"]
     assert found.answer().startswith("Undecided: other cannot be told from full, PSNR ")
-    assert "1 of 2 variants are worse" in found.answer()
+    assert "; worse, each at 95 %: less." in found.answer()
     assert found.rank_correlation() is None, "of three variants any order is likely"
 
 
@@ -118,6 +123,20 @@ def test_trainings_that_failed_are_in_the_answer(tmp_path: Path) -> None:
     assert found.answer().startswith("No: less is worse than full, PSNR ")
     assert found.answer().endswith("Left out: 3 of 3 trainings of other failed (CollapseError).")
     assert "other seed 0 failed: CollapseError: training collapsed at step 7: it" in found.notes()
+
+
+def test_variants_that_a_copied_photo_beats_are_in_the_answer(tmp_path: Path) -> None:
+    def score(variant: str, evaluation: str, seed: int, scene: int) -> float:
+        return simple(variant, evaluation, seed, scene) - 8.0  # means of 15.5, and 14.5 of `less`
+
+    found = results(tmp_path, score)
+    means = {row.variant: row.scores["psnr"].mean for row in found.rows()}
+    worse = ", ".join(name for name, mean in means.items() if mean < NEAREST)
+    assert "less" in worse
+    told = f" Worse than the nearest input photo, copied (PSNR 15.500): {worse}."
+    assert found.answer().endswith(told)
+    dashes = ["–"] * 5
+    assert table_rows(found)[-1] == ["nearest input", "15.500", *dashes, "–", "–"]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +234,8 @@ def test_without_an_evaluation_that_all_share_there_is_no_answer(tmp_path: Path)
     found = results(tmp_path, simple, views=lambda variant, evaluation: variant, text=text)
     assert found.answer() == (
         "Not known: no evaluation judges all variants by one protocol, so that their numbers are "
-        "not compared; add one that sets views.inputs to the study's `evaluations`."
+        "not compared; add one that sets views.inputs to the study's `evaluations`. Verdicts on "
+        "its hypotheses: 2 seen, 1 undecided."
     )
     assert found.rank_correlation() is None
     assert {row["difference"] for row in csv_rows(found)} == {""}
@@ -241,11 +261,32 @@ def test_the_best_of_several_is_better_when_chance_has_several_tries(tmp_path: P
     assert "97.5 % interval [-" in found.answer()
     assert "corrected for the best of 2" in found.answer()
     (tmp_path / "two").mkdir()
-    alone = STUDY.replace(", other: x.yaml}", "}").replace("  - other > full\n", "")
+    alone = STUDY.replace(", other: tiny/locus.yaml}", "}").replace("  - other > full\n", "")
     alone = alone.replace(", other: 22.0}", "}").replace("less", "other")
     two = results(tmp_path / "two", lead(0.5, 0.18), text=alone)
     assert two.answer().startswith("Yes: other is better than full, PSNR +0.")
     assert "(95 % interval [+" in two.answer()
+
+
+def test_a_variant_with_one_seed_so_far_does_not_hide_what_is_known(tmp_path: Path) -> None:
+    plan = results(tmp_path, lead(5.0, 0.1)).plan
+    for seed in (1, 2):
+        shutil.rmtree(run_of(tmp_path, "other", seed).folder)
+    answer = Results(plan).answer()
+    assert answer.startswith("No: less is worse than full, PSNR ")
+    assert answer.endswith("2 of 9 runs are missing.")
+
+
+def test_a_variant_without_the_metric_is_a_row_of_dashes(tmp_path: Path) -> None:
+    plan = results(tmp_path, simple).plan
+    for seed in range(3):
+        file = run_of(tmp_path, "less", seed).folder / "evaluation" / "scenes.csv"
+        file.write_text(re.sub(r"(,1 2),[^,]*", r"\1,", file.read_text()))
+    found = Results(plan)
+    row = next(row for row in table_rows(found) if row[0] == "less")
+    assert row[1:6] == ["–"] * 5
+    write_files(found)
+    assert "\n,less,0,\n" in (tmp_path / "runs.csv").read_text()
 
 
 def test_a_sure_lead_counts_beside_a_larger_one_that_is_not(tmp_path: Path) -> None:
@@ -284,8 +325,10 @@ def test_a_metric_that_runs_lack_is_told(tmp_path: Path) -> None:
 
 def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path: Path) -> None:
     names = ("full", "less", "other", "four", "five")
-    recipes = ", ".join(f"{name}: x.yaml" for name in names)
-    text = STUDY.replace("full: x.yaml, less: x.yaml, other: x.yaml", recipes)
+    recipes = ", ".join(f"{name}: tiny/locus.yaml" for name in names)
+    text = STUDY.replace(
+        "full: tiny/locus.yaml, less: tiny/locus.yaml, other: tiny/locus.yaml", recipes
+    )
     published = ", ".join(f"{name}: {24 - place / 2}" for place, name in enumerate(names))
     text = text.replace("full: 24.0, less: 23.0, other: 22.0", published)
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import leave_one_scene_out
 import pytest
 from qgs_studies.plan import composed, differences, planned
 from qgs_studies.study import read_study
@@ -48,3 +49,31 @@ def test_the_ablations_of_published_size_are_the_recipes_of_the_tables() -> None
             table = resolve(RECIPES / "ablations" / f"{prefix}{names[name]}.yaml")
             paths = differences(recipe, table)
             assert {path.split(".")[0] for path in paths} <= {"data", "evaluation"}, paths
+
+
+def test_the_table_of_scenes_left_out_compares_the_same_seeds(tmp_path: Path) -> None:
+    """LocusGS has a third seed, a lucky one, and of the second scene alone there are results."""
+
+    def judge(run: str, psnr: str) -> None:
+        folder = tmp_path / run.replace("/", "/study/runs/", 1) / "evaluation"
+        folder.mkdir(parents=True)
+        head = "scene,model_psnr,nearest_input_psnr,mean_colour_psnr"
+        (folder / "scenes.csv").write_text(f"{head}\nw0,{psnr},9.0,7.0\n")
+        (folder / "protocol.json").write_text("{}")
+
+    with pytest.raises(ValueError, match="has no finished study"):
+        leave_one_scene_out.table_rows(tmp_path)
+    scores = {"locus": ("10.0", "12.0", "20.0"), "tokengs": ("11.0", "13.0")}
+    for variant, values in scores.items():
+        for seed, value in enumerate(values):
+            judge(f"desk/{variant}/seed-{seed}", value)
+    judge("walk/locus/seed-0", "14.0")
+    assert leave_one_scene_out.table_rows(tmp_path) == [
+        ["scene left out", "locus", "tokengs", "nearest input", "mean colour", "seeds"],
+        ["desk", "11.00", "12.00", "9.00", "7.00", "0, 1"],
+        ["walk", "14.00", "", "9.00", "7.00", "0"],
+        ["mean of full rows", "11.00", "12.00", "9.00", "7.00", ""],
+    ]
+    judge("walk/tokengs/seed-0", "")
+    with pytest.raises(ValueError, match="has no model_psnr of some windows"):
+        leave_one_scene_out.table_rows(tmp_path)

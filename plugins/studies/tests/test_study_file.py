@@ -106,9 +106,21 @@ WRONG = {
     "  tokengs:": ("  ../up:", ":6: variants.../up", "the name of a folder", "use letters"),
     "tiny/tokengs.yaml\n": (
         "tiny/tokens.yaml\n",
-        ":6: variants.tokengs: extends",
-        "does not exist",
-        "tokengs.yaml",
+        ":6: variants.tokengs",
+        "there is no recipe ",
+        "did you mean `tiny/tokengs.yaml`?",
+    ),
+    f"base: {RECIPES}/tiny/locus.yaml": (
+        "base: tiny/locuss.yaml",
+        ":2: base",
+        "there is no recipe ",
+        "did you mean `tiny/locus.yaml`?",
+    ),
+    "flat: {model: {decoder: {cross_attention: {type: qgs/content}}}}": (
+        "flat: tiny/locus.yaml",
+        ":5: variants.flat",
+        "`flat` is the same model as `full`",
+        "change an option",
     ),
     "{model: {decoder: {cross_attention: {type: qgs/content}}}}": (
         "{views: {inputs: 3}}",
@@ -232,6 +244,12 @@ def test_losses_and_the_start_are_alike_unless_the_study_says_otherwise(
         composed(read(tmp_path, text))
     said = text.replace("differs: [", f"differs: [{option}, ")
     assert [*composed(read(tmp_path, said))] == ["full", "flat", "tokengs"]
+
+
+def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_path: Path) -> None:
+    text = SOUND + "metric: lpips\noverlay: {metrics: {lpips: {type: qgs/lpips}}}\n"
+    with pytest.raises(OptionError, match="`lpips` cannot be measured here: "):
+        planned(read(tmp_path, text), tmp_path / "out")
 
 
 def test_hypotheses_are_sums_that_weigh_alike() -> None:

@@ -67,12 +67,13 @@ def study(
         qgs study mine_study.yaml --out studies/mine --workers 2
 
     That is six runs of about five minutes on a core each; --runs 1 makes one.
-    In place of the changes, `mine: mine.yaml` names a recipe: begin one with
-    `qgs recipes tiny/locus.yaml --out .`; `qgs list NAME` has the options of
-    a component. The file's other keys are named when one is wrong, and told
-    in docs/studies.md of the project (differs, evaluations, published ...).
+    In place of the changes, `mine: mine/tiny/locus.yaml` names a recipe: begin
+    one with `qgs recipes tiny/locus.yaml --out mine`. `qgs compose RECIPE` has
+    all options as they are, `qgs list NAME` those of a component. Other keys of
+    a study are told in docs/studies.md (differs, evaluations, published ...).
     Studies that come with qgs: studies/tiny/structural.yaml and others.
     """
+    from qgs.wording import counted
     from qgs_studies.plan import leftover_runs, planned, write_plan
     from qgs_studies.study import read_study
 
@@ -84,15 +85,14 @@ def study(
         for warning in recipe.warnings:
             console.print(f"warning: {name}: {warning}", highlight=False, soft_wrap=True)
     missing = [run for run in plan.runs if not plan.done(run)]
-    seeds = plan.study.settings.seeds
-    told = f"{len(plan.recipes)} variants x {len(seeds)} seeds: {len(plan.runs)} runs"
-    console.print(f"{told}, {len(missing)} of them missing", highlight=False)
+    told = f"{plan.size}: {counted(len(plan.runs), 'run')}, {len(missing)} of them missing"
+    console.print(told, highlight=False)
     if left := leftover_runs(plan):
         console.print(f"{len(left)} runs in {out} are not in this study: kept, not shown")
     if slurm:
         from qgs_studies.slurm import write_script
 
-        script = write_script(plan, file, len(missing), threads or 1, device)
+        script = write_script(plan, file, len(missing) - len(plan.ended), threads or 1, device)
         console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
         return
     stopped, failed = None, 0

@@ -102,7 +102,10 @@ def _difference(axes: Axes, place: int, row: Row, metric: str, seeds: Mapping[in
 
 
 def curves_figure(results: Results) -> Figure | None:
-    """PSNR of the training views by step: mean over seeds, and from the lowest to the highest."""
+    """PSNR of the training views by step: mean over seeds, and from the lowest to the highest.
+
+    Of runs that are done; of a variant that has none, of those that go on.
+    """
     curves = {name: _curves(results, name) for name in results.plan.recipes}
     known = {name: found for name, found in curves.items() if found}
     if not known:
@@ -117,20 +120,21 @@ def curves_figure(results: Results) -> Figure | None:
             color, style = hex_color(categorical(number)), ("-", "--", ":")[number // 6 % 3]
             axes.plot(at, every.mean(0), style, color=color, label=name)
             axes.fill_between(at, every.min(0), every.max(0), color=color, alpha=0.12, linewidth=0)
-        unit = Psnr.column.unit
-        axes.set(title=f"{Psnr.column.heading} of the training views, {unit}", xlabel="steps")
+        title = f"{Psnr.column.heading} of the training views, {Psnr.column.unit}"
+        title += "; without trainings that failed" * bool(results.failed)
+        axes.set(title=title, xlabel="steps")
         figure.legend(loc="outside right center")
     return figure
 
 
 def _curves(results: Results, variant: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Steps and running means of every run of `variant` that has begun."""
-    found = []
-    for run in results.plan.runs:
-        if run.variant == variant:
-            records = read_records(run.folder / "history.jsonl")
-            pairs = [(r["step"], r["psnr"]) for r in records if "psnr" in r]
-            if len(pairs) > 1:
-                steps, values = np.array(pairs, float).T
-                found.append((steps, running_mean(values)))
+    """Steps and running means of runs of `variant`, see `curves_figure`."""
+    runs = [run for run in results.plan.runs if run.variant == variant and not run.failed]
+    done, found = [run for run in runs if results.plan.done(run)], []
+    for run in done or runs:
+        records = read_records(run.folder / "history.jsonl")
+        pairs = [(r["step"], r["psnr"]) for r in records if "psnr" in r]
+        if len(pairs) > 1:
+            steps, values = np.array(pairs, float).T
+            found.append((steps, running_mean(values)))
     return found

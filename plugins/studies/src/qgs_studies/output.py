@@ -26,16 +26,14 @@ def table_rows(results: Results, evaluation: str = MAIN) -> list[list[str]]:
     head = ["variant", results.column.title, "sd", "difference", "95 % interval", "better in"]
     rows = [[*head, *["published"] * bool(published), *titles, "seeds", "steps"]]
     for row in results.rows(evaluation):
-        if (score := row.scores.get(metric)) is None:
-            continue
-        apart = row.differences.get(metric)
+        score, apart = row.scores.get(metric), row.differences.get(metric)
         means = [row.scores.get(name) for name in others]
         paper = [results.shown(published.get(row.variant), sign=False)]
         rows.append(
             [
                 row.variant,
-                results.shown(score.mean, sign=False),
-                results.shown(score.deviation, sign=False),
+                results.shown(score.mean if score else None, sign=False),
+                results.shown(score.deviation if score else None, sign=False),
                 "reference"
                 if row.variant == results.plan.study.settings.reference
                 else results.shown(apart.mean if apart else None),
@@ -46,16 +44,23 @@ def table_rows(results: Results, evaluation: str = MAIN) -> list[list[str]]:
                     results.shown(e.mean if e else None, name, sign=False)
                     for name, e in zip(others, means, strict=True)
                 ),
-                str(len(score.by_seed)),
+                str(len(row.seeds)),
                 steps_shown(row.steps),
             ]
         )
+    for name, values in results.baselines(evaluation).items() if len(rows) > 1 else ():
+        shown = {m: results.shown(values.get(m), m, sign=False) for m in (metric, *others)}
+        dashes = ["–"] * (4 + bool(published))
+        shown_others = [shown[name] for name in others]
+        rows.append([name.replace("_", " "), shown[metric], *dashes, *shown_others, "–", "–"])
     return rows
 
 
 def hypothesis_rows(results: Results) -> list[list[str]]:
     """The verdicts, headers first."""
-    rows = [["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of", "note"]]
+    notes = any(hypothesis.note for hypothesis in results.plan.study.settings.hypotheses)
+    head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of"]
+    rows = [[*head, *["note"] * notes]]
     for j in results.judgements():
         mean = results.shown(j.estimate.mean, j.metric) if j.estimate else "–"
         column = results.columns.get(j.metric)
@@ -63,7 +68,7 @@ def hypothesis_rows(results: Results) -> list[list[str]]:
         covers = j.estimate.covers if j.estimate else "–"
         verdict = f"{j.verdict} ({j.reason})" if j.reason else j.verdict
         claim = [j.hypothesis.claim, column.heading if column else j.metric]
-        rows.append([*claim, mean, interval, verdict, covers, j.hypothesis.note])
+        rows.append([*claim, mean, interval, verdict, covers, *[j.hypothesis.note] * notes])
     return rows
 
 
@@ -206,7 +211,7 @@ def _run_records(results: Results) -> list[dict[str, Any]]:
         }
         for name in results.plan.evaluations
         for row in results.rows(name)
-        for seed in row.scores[results.metric].by_seed
+        for seed in row.seeds
     ]
 
 

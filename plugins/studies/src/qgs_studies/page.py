@@ -4,7 +4,8 @@ import json
 from typing import Any
 
 from qgs.analysis.report import page_environment
-from qgs.composer.yaml_text import inline
+from qgs.analysis.shown import parameter_counts
+from qgs.composer import Recipe
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import data_uri
 from qgs_studies.figures import curves_figure, values_figure
@@ -26,12 +27,12 @@ def study_html(results: Results) -> str:
             rows = table_rows(results, name)
             picture = figure_picture(figure, dpi=_DPI)
             sections.append({"name": name, "rows": rows, "picture": picture})
-    curves = curves_figure(results)
+    curves, budget = curves_figure(results), settings.budget.model_dump(exclude_none=True)
     done = len(plan.runs) - len(results.missing)
     facts = {
-        "runs": f"{done} of {len(plan.runs)}: {len(plan.recipes)} variants x "
-        f"{len(settings.seeds)} seeds ({', '.join(map(str, settings.seeds))})",
-        "budget": inline(settings.budget.model_dump(exclude_none=True)),
+        "runs": f"{done} of {len(plan.runs)}: {plan.size}",
+        "seeds": ", ".join(map(str, settings.seeds)),
+        "budget": ", ".join(f"{n:,} {unit}" for unit, n in budget.items()),
         "reference": settings.reference,
         "may differ": ", ".join(["the model", "its optimiser", *settings.differs]),
     }
@@ -45,7 +46,17 @@ def study_html(results: Results) -> str:
         notes=results.notes(),
         facts=facts,
         changes=_changes(results),
+        sizes={name: _size(recipe) for name, recipe in plan.recipes.items()},
     )
+
+
+def _size(recipe: Recipe) -> str:
+    """What a model has to work with; Gaussians where queries make them, not pixels."""
+    model = recipe.build_model("meta")
+    found = f"{sum(parameter_counts(model).values()) / 1e6:.2f} M parameters"
+    if not model.queries.count:
+        return found
+    return f"{found}, {model.queries.count * model.head.gaussians_per_query:,} Gaussians"
 
 
 def _changes(results: Results) -> dict[str, list[tuple[str, str, str]]]:

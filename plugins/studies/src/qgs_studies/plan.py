@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from qgs.engine.folder import RunFolder, checkpoint_of
 from qgs.engine.guard import CollapseError, NonFiniteError
 from qgs.engine.protocol import index_of
 from qgs.io.files import write_text
-from qgs.wording import listed
+from qgs.wording import counted, listed
 from qgs_studies.hypotheses import MAIN
 from qgs_studies.study import Study
 
@@ -105,6 +105,17 @@ class Plan:
         seeds, names = self.study.settings.seeds, self.recipes
         return [run_of(self.folder, name, seed) for seed in seeds for name in names]
 
+    @property
+    def size(self) -> str:
+        """Such as "4 variants x 3 seeds"."""
+        variants = counted(len(self.recipes), "variant")
+        return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
+
+    @property
+    def ended(self) -> list[Run]:
+        """Runs that are not tried again, without results."""
+        return [run for run in self.runs if run.ended and not self.done(run)]
+
     def done(self, run: Run) -> bool:
         """Whether nothing of `run` is missing."""
         return all(map(run.judged, self.evaluations))
@@ -155,6 +166,7 @@ def composed(study: Study) -> dict[str, Recipe]:
                 problems.add(at, option, found.reason, found.fix, found.cause)
     if len(recipes) == len(study.variants):
         _check_alike(study, recipes, problems)
+        _check_distinct(study, recipes, problems)
         for name, recipe in recipes.items():
             for label, node in study.evaluations.items():
                 _judged_by(recipe, node, f"evaluations.{label}, of {name}", problems)
@@ -249,6 +261,15 @@ def _check_alike(study: Study, recipes: Mapping[str, Recipe], problems: Problems
         problems.add(at, "differs", reason, f"remove it; sections are {', '.join(EQUAL)}")
 
 
+def _check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
+    """Report variants that are one, such as a changed copy of a file that is read elsewhere."""
+    for (a, one), (b, other) in combinations(recipes.items(), 2):
+        if not differences(one, other):
+            fix = "change an option of it, or leave one of them out"
+            at = study.origins[b]
+            problems.add(at, f"variants.{b}", f"`{b}` is the same model as `{a}`", fix)
+
+
 def _same_index(path: str, one: Recipe, other: Recipe) -> bool:
     """Whether `path` is that of two indices that judge the same frames of the same scenes."""
     written = one.evaluation.index, other.evaluation.index
@@ -295,13 +316,20 @@ def _check_data(study: Study, recipes: Mapping[str, Recipe]) -> None:
 def _refuse_unknown_metrics(study: Study, recipe: Recipe) -> None:
     from qgs.engine.evaluation import Measures
 
-    columns = Measures(recipe).columns
+    measures = Measures(recipe)
+    columns, unavailable = measures.columns, measures.incomplete([])
     asked = [study.settings.metric, *(h.metric for h in study.settings.hypotheses)]
-    if missing := [name for name in asked if name and name not in columns]:
-        raise OptionError(
-            f"{study.file}: the recipes measure no `{missing[0]}`",
-            f"choose one of {', '.join(columns)}, or add it to `overlay.metrics`",
-        )
+    for name in filter(None, asked):
+        if name not in columns:
+            raise OptionError(
+                f"{study.file}: the recipes measure no `{name}`",
+                f"choose one of {', '.join(columns)}, or add it to `overlay.metrics`",
+            )
+        if name in unavailable:
+            raise OptionError(
+                f"{study.file}: `{name}` cannot be measured here: {unavailable[name]}",
+                f"mend that, or choose one of {', '.join({**columns}.keys() - unavailable)}",
+            )
 
 
 def _refuse_changed(plan: Plan) -> None:
@@ -378,7 +406,5 @@ def _plain(node: Any) -> Any:
 def leftover_runs(plan: Plan) -> list[Path]:
     """Runs in the folder that the study no longer names; they are kept."""
     named = {run.folder for run in plan.runs}
-    folders = reduce(
-        list.__add__, ([*p.glob("seed-*")] for p in (plan.folder / "runs").glob("*")), []
-    )
+    folders = (plan.folder / "runs").glob("*/seed-*")
     return sorted(path for path in folders if path.is_dir() and path not in named)

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -18,6 +18,8 @@ from rich.live import Live
 from rich.table import Table
 
 from qgs.contracts import TrainingConfig
+from qgs.engine.guard import CollapseError
+from qgs.io.files import write_text
 from qgs.wording import listed
 from qgs_studies.claims import owner
 from qgs_studies.plan import Plan, Run
@@ -74,10 +76,8 @@ class Queue:
         and not tried again by this call.
         """
         before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
-        for run in filter(self._ended, self.plan.runs):
-            self._failed[run] = run.failed
-            told = f"{run} is not trained again, it would end so each time: {run.failed}"
-            self._say(f"{told}; to train it again, delete {run.failure} and {run.folder}")
+        for run in self.plan.ended:
+            self._say(_not_again(run))
         shown, told = 0.0, dict.fromkeys(filter(self.plan.done, self.plan.runs), True)
         live = Live(console=self.console, auto_refresh=False, transient=True)
         try:
@@ -86,9 +86,9 @@ class Queue:
                     if self.console.is_terminal and time.monotonic() - shown > _SHOW_SECONDS:
                         shown = time.monotonic()
                         live.update(self._table(), refresh=True)
-                    for run in self._newly_done(told):
-                        self._say(f"{run} is done, {self._left()}")
+                    self._tell_done(told)
                     time.sleep(_POLL_SECONDS)
+                self._tell_done(told)
         finally:
             for process, _ in self._processes.values():
                 process.terminate()
@@ -120,8 +120,8 @@ class Queue:
                 self._fail(run, code)
         if self._stopping:
             return False
-        missing = [run for run in self.plan.runs if run not in self._failed]
-        missing = [r for r in missing if not self.plan.done(r) and not self._ended(r)]
+        over = {*self._failed, *self.plan.ended}
+        missing = [r for r in self.plan.runs if r not in over and not self.plan.done(r)]
         free = [run for run in missing if run not in self._processes]
         free.sort(key=lambda run: run.failure.is_file())  # so that one cannot use up all tries
         if time.monotonic() - self._looked > _LOOK_SECONDS:
@@ -135,9 +135,6 @@ class Queue:
         if self.most is not None:  # others are free to take what is left
             return bool(self._processes)
         return bool(missing)
-
-    def _ended(self, run: Run) -> bool:
-        return run.ended and not self.plan.done(run)
 
     def _start(self, run: Run) -> None:
         used = {slot for _, slot in self._processes.values()}
@@ -177,27 +174,28 @@ class Queue:
         self._deaths[run] = saved, (times + 1 if saved == before else 1)
         if self._deaths[run][1] >= DEATHS:
             return False
-        self._say(f"{run}: its process {_ended(code)}; it goes on from where it was saved")
+        self._say(f"{run}: its process {_end(code)}; it goes on from where it was saved")
         self._started -= 1
         return True
 
     def _fail(self, run: Run, code: int) -> None:
-        why = f"its process {_ended(code)}"
+        why = f"its process {_end(code)}"
         if code == FAILED and run.failure.is_file():
             why = run.failed
         elif code < 0 or code > 128:
             why += f" {DEATHS} times without a save between; memory may be short"
+            write_text(run.failure, f"{why}\n")  # which it could not do itself
         self._failed[run] = why
         self._say(f"{run} failed: {why} (see {run.log})")
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self._stopping = signal.Signals(number).name
 
-    def _newly_done(self, told: dict[Run, bool]) -> Iterator[Run]:
+    def _tell_done(self, told: dict[Run, bool]) -> None:
         for run in self.plan.runs:
             if run not in told and self.plan.done(run):
                 told[run] = True
-                yield run
+                self._say(f"{run} is done, {self._left()}")
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True, markup=False)
@@ -211,7 +209,8 @@ class Queue:
             return Progress("done", 1.0, seconds, step)
         state: State = "running" if run in self._processes else "waiting"
         state = "elsewhere" if run in self._elsewhere else state
-        return Progress("failed" if run in self._failed else state, used, seconds, step)
+        over = run in self._failed or run.ended
+        return Progress("failed" if over else state, used, seconds, step)
 
     def _left(self) -> str:
         """How many runs are done, and about how long the others take."""
@@ -242,7 +241,15 @@ class Queue:
         return table
 
 
-def _ended(code: int) -> str:
+def _not_again(run: Run) -> str:
+    """Why a run that ended badly is left as it is, and what would train it again."""
+    told = f"{run} is not trained again, it would end so each time: {run.failed}"
+    if run.failed.startswith(CollapseError.__name__):
+        return f"{told}; to train it from the start, delete {run.failure} and {run.folder}"
+    return f"{told}; when the cause is gone, delete {run.failure}: it goes on from its last save"
+
+
+def _end(code: int) -> str:
     """How a process ended, by its exit code."""
     if code < 0 or code > 128:
         return f"was ended by {signal.Signals(-code if code < 0 else code - 128).name}"

@@ -6,6 +6,7 @@ held against the same seed of the reference, which saw the same data in the same
 against the same scene.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -16,6 +17,7 @@ from qgs.contracts import Column
 from qgs.engine.comparison import CONFIDENCE, CROSSED, crossed_interval, paired_interval
 from qgs.engine.evaluation import SECTIONS
 from qgs.engine.results import StoredResults, read_results
+from qgs.metrics.baselines import BASELINES
 from qgs.wording import listed
 from qgs_studies.hypotheses import MAIN, Contrast
 from qgs_studies.plan import Plan, Run
@@ -63,7 +65,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Row:
-    """One variant by one evaluation. scores: by metric. steps: of its runs.
+    """One variant by one evaluation. seeds: of its runs. scores: by metric. steps: of its runs.
 
     differences: to the reference, by metric; none of the reference itself, and none where the two
     were not judged by one protocol.
@@ -71,6 +73,7 @@ class Row:
 
     variant: str
     evaluation: str
+    seeds: Sequence[int]
     scores: Mapping[str, Estimate]
     differences: Mapping[str, Estimate]
     steps: Sequence[int]
@@ -125,8 +128,24 @@ class Results:
             compared = variant != reference and not self._unlike(apart)
             differences = self._estimates(apart) if compared else {}
             steps = sorted({s.step for s in by_seed.values() if s.step is not None})
-            rows.append(Row(variant, evaluation, scores, differences, steps))
+            rows.append(Row(variant, evaluation, sorted(by_seed), scores, differences, steps))
         return rows
+
+    def baselines(self, evaluation: str = MAIN) -> dict[str, dict[str, float]]:
+        """Means over scenes of what needs no model, by name and metric.
+
+        None where an evaluation has several protocols, which have baselines each.
+        """
+        parts = [part for (_, name), part in self._stored.items() if name == evaluation]
+        if len(self._protocols(evaluation)) != 1:
+            return {}
+        scenes = next(iter(parts[0].values())).scenes.values()
+        found: dict[str, dict[str, float]] = {name: {} for name in BASELINES}
+        for name, means in found.items():
+            for metric in self.columns:
+                values = [s[value] for s in scenes if (value := f"{name}_{metric}") in s]
+                means |= {metric: float(np.mean(values))} if values else {}
+        return {name: means for name, means in found.items() if means}
 
     def judgements(self) -> list[Judgement]:
         """The hypotheses in their order."""
@@ -164,15 +183,30 @@ class Results:
 
     def answer(self) -> str:
         """Whether a variant is better than the reference, and how sure that is; one line."""
-        return " ".join([self._answer(), *self._failures()])
+        return " ".join([self._answer(), *self._left_out(), *self._below_nearest()])
 
-    def _failures(self) -> Iterator[str]:
-        """Of each variant, how many trainings failed: what survives says less."""
+    def _left_out(self) -> Iterator[str]:
+        """Of each variant, how many trainings failed: what survives says less; what is missing."""
         for variant in self.plan.recipes:
             runs = [run for run in self.plan.runs if run.variant == variant]
             if why := [run.failed.split(":")[0] for run in runs if run in self.failed]:
                 told = listed(dict.fromkeys(why))
                 yield f"Left out: {len(why)} of {len(runs)} trainings of {variant} failed ({told})."
+        if waiting := len(self.missing) - len(self.failed):
+            yield f"{waiting} of {len(self.plan.runs)} runs are missing."
+
+    def _below_nearest(self) -> Iterator[str]:
+        """Which variants a copy of the nearest input photo beats: their order says little."""
+        by, column = self.shared, self._known_column()
+        if by is None or column is None:
+            return
+        nearest = self.baselines(by).get("nearest_input", {}).get(self.metric)
+        scores = {row.variant: row.scores.get(self.metric) for row in self.rows(by)}
+        means = {variant: score.mean for variant, score in scores.items() if score}
+        worse = [v for v, m in means.items() if nearest and column.best((m, nearest)) != m]
+        if worse:
+            told = f"{column.heading} {self.shown(nearest, sign=False)}"
+            yield f"Worse than the nearest input photo, copied ({told}): {listed(worse)}."
 
     def _answer(self) -> str:
         """By scores alone.
@@ -185,7 +219,7 @@ class Results:
         if column is None:
             return "Not known yet: no run is finished."
         if (by := self.shared) is None:
-            return f"Not known: {self._why_unlike()}."
+            return f"Not known: {self._why_unlike()}.{self._verdicts()}"
         sign = 1 if column.better == "higher" else -1
         apart = {r.variant: e for r in self.rows(by) if (e := r.differences.get(self.metric))}
         if not apart:
@@ -198,11 +232,13 @@ class Results:
         def best_of(names: Iterable[str]) -> str:
             return max(names, key=lambda name: sign * apart[name].mean)
 
-        best, count = best_of(apart), len(apart)
+        judged = {n: e for n, e in apart.items() if e.low is not None and len(e.by_seed) > 1}
+        best, count = best_of(judged or apart), len(judged or apart)
         among = f", the best of {count}," if count > 1 else ""
         lead = apart[best]
-        if lead.low is None or len(lead.by_seed) < 2:
+        if not judged:
             return f"Not known: {best}{among} has {told(lead)}."
+        apart = judged
         level = 1 - (1 - CONFIDENCE) / count
         tried = ((n, self.estimate(self._apart(n, by), self.metric, level)) for n in apart)
         sure = {name: estimate for name, estimate in tried if estimate}
@@ -215,8 +251,14 @@ class Results:
             which = f"all {count} are worse; the nearest, {best}," if among else f"{best}"
             return f"No: {which} is worse than {reference}, {told(lead)}."
         best = best_of(name for name in apart if name not in worse)
-        others = f"; {len(worse)} of {count} variants are worse, each at 95 %" if worse else ""
+        others = f"; worse, each at 95 %: {listed(worse)}" if worse else ""
         return f"Undecided: {best} cannot be told from {reference}, {told(sure[best])}{others}."
+
+    def _verdicts(self) -> str:
+        """How many hypotheses have which verdict, a sentence; "" without any."""
+        verdicts = Counter(judgement.verdict for judgement in self.judgements())
+        told = ", ".join(f"{number} {verdict}" for verdict, number in verdicts.items())
+        return f" Verdicts on its hypotheses: {told}." if told else ""
 
     def notes(self) -> list[str]:
         """What is to be known beside the table."""

@@ -9,8 +9,8 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from qgs.composer.decode import decode_config
-from qgs.composer.errors import Problems, did_you_mean
-from qgs.composer.files import MAX_BYTES, found_recipe, merge
+from qgs.composer.errors import Problems, did_you_mean, nearest
+from qgs.composer.files import MAX_BYTES, found_recipe, merge, recipe_folder
 from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
 from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import ComponentConfig, OptionError
@@ -144,8 +144,9 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
         text = written.decode()
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
-        fix = "give the path of a study, or one of recipes/studies"
-        problems.stop(origin, "extends" if chain else "", f"{file} cannot be read: {why}", fix)
+        fix = _meant(str(file), "studies/*/*.yaml", "studies/tiny/structural.yaml")
+        option = "extends" if chain else "study"
+        problems.stop(origin, option, f"{file} cannot be read: {why}", fix)
         return MapNode(origin)
     tree = _absolute(load_mapping(text, str(file), problems), file.parent, problems)
     base = tree.get("extends")
@@ -158,6 +159,15 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
         return tree
     under = _read(found_recipe(file.parent / base, base), problems, (*chain, file))
     return _laid(under, tree.without("extends"))
+
+
+def _meant(name: str, pattern: str, example: str) -> str:
+    """What to do where there is no file `name`: those that come with qgs match `pattern`."""
+    home = recipe_folder()
+    shipped = [file.relative_to(home) for file in home.glob(pattern)]
+    stem = nearest(Path(name).stem, (file.stem for file in shipped))
+    near = nearest(name, (file.as_posix() for file in shipped if file.stem == stem))
+    return f"did you mean `{near}`?" if near else f"check the path, or take one such as {example}"
 
 
 def _laid(base: MapNode, over: MapNode) -> MapNode:
@@ -192,7 +202,11 @@ def _absolute(tree: MapNode, folder: Path, problems: Problems) -> MapNode:
         found = []
         for item, at in zip(items, items.origins, strict=True):
             if isinstance(item, str):
-                found.append((str(found_recipe(folder / item, item).resolve()), at))
+                file = found_recipe(folder / item, item).resolve()
+                found.append((str(file), at))
+                if not file.exists():
+                    fix = _meant(item, "*/*.yaml", "tiny/locus.yaml (`qgs recipes` has all)")
+                    problems.stop(at, option, f"there is no recipe {file}", fix)
             else:
                 reason = f"`{option}` names recipe files, this is {kind_of(item)}"
                 problems.stop(at, option, reason, f"write `{option}: FILE.yaml`")
