@@ -166,7 +166,8 @@ def _meant(name: str, pattern: str, example: str) -> str:
     home = recipe_folder()
     shipped = [file.relative_to(home) for file in home.glob(pattern)]
     stem = nearest(Path(name).stem, (file.stem for file in shipped))
-    near = nearest(name, (file.as_posix() for file in shipped if file.stem == stem))
+    end = "/".join(Path(name).parts[-pattern.count("/") - 1 :])  # whatever folder that lies in
+    near = nearest(end, (file.as_posix() for file in shipped if file.stem == stem))
     return f"did you mean `{near}`?" if near else f"check the path, or take one such as {example}"
 
 
