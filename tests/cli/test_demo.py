@@ -77,16 +77,22 @@ def test_budget_and_seed_are_those_asked_for(recipes):
         assert recipe.tree["seed"] == 3
 
 
+@pytest.fixture(scope="module")
+def domain():
+    """What the views of RECIPE are like: it takes a second."""
+    recipe = resolve(RECIPE)
+    return trained_domain(recipe.build_data(), recipe.views, recipe.seed).text
+
+
 @pytest.fixture
-def models(tmp_path, monkeypatch):
+def models(tmp_path, monkeypatch, domain):
     """Two stand-ins for trained models that know on what views they were trained."""
     monkeypatch.chdir(tmp_path)
     files = []
     for name, queries in (("few", 8), ("more", 12)):
         recipe = resolve(RECIPE, [f"model.queries.count={queries}"])
-        domain = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
         file = tmp_path / "models" / f"{name}.safetensors"
-        qgs.save(recipe.build_model(), file, extra={KEY: domain.text, "step": "7000"})
+        qgs.save(recipe.build_model(), file, extra={KEY: domain, "step": "7000"})
         files += ["--model", f"models/{name}.safetensors"]
     return files
 

@@ -68,12 +68,16 @@ def _pairs(combination: tuple[int, ...]) -> frozenset[tuple[tuple[int, int], ...
     return frozenset(combinations(enumerate(combination), 2))
 
 
+LABELS = {
+    id(config): f"{kind} {Case(config).label.partition('(')[2]}".rstrip(" )")
+    for choices in CHOICES.values()
+    for kind, _, config in choices
+}
+"""Of each choice, by its options: made once, for they name thousands of tests."""
+
+
 def _names(parts: tuple[Choice, ...]) -> str:
-    return "-".join(map(_name, parts))
-
-
-def _name(choice: Choice) -> str:
-    return f"{choice[0]} {Case(choice[2]).label.partition('(')[2]}".rstrip(" )")
+    return "-".join(LABELS[id(config)] for *_, config in parts)
 
 
 def _recipe(chosen: dict[str, Choice]) -> dict[str, Any]:
