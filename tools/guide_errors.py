@@ -22,6 +22,7 @@ from guide_reference import PLUGINS
 
 import qgs
 from qgs.contracts import MissingExtraError
+from qgs.contracts.plugin import ENTRY_POINT_GROUP
 from qgs.io.files import write_text
 
 PAGE = Path(__file__).parents[1] / "docs/errors.md"
@@ -98,14 +99,14 @@ def _plugins_of(folder: Path, but: str = "") -> Iterator[None]:
     Afterwards `sys.path` and the imported plugins are as before; nothing goes to standard error.
     """
 
-    def found(group: str) -> list[EntryPoint]:
-        there = [entry for entry in entry_points(group=group) if entry.name != but]
+    def found(_: object) -> list[EntryPoint]:
+        there = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name != but]
         return [e for e in there if e.name in PLUGINS or (folder / e.module).is_dir()]
 
     modules = set(sys.modules)
     try:
         with (
-            patch("qgs.composer.registry.entry_points", found),
+            patch("qgs.composer.registry._offered", found),
             patch.object(sys, "path", [*sys.path]),
             redirect_stderr(StringIO()),
         ):
