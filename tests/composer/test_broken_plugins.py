@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from qgs.cli import app
 from qgs.composer.recipe import resolve
-from qgs.composer.registry import load_sound_plugins
+from qgs.composer.registry import available_plugins, load_sound_plugins
 
 CHAIN = """
 from qgs.contracts import CrossAttention, FieldSpec, Plugin, LearnedQueries, Refinement
@@ -223,3 +223,16 @@ def test_one_fault_of_a_plugin_does_not_hide_the_others_of_an_installation(insta
     assert "qgs-raises 1.2 cannot be imported" in result.output
     assert "qgs/latent" in result.output
     assert CliRunner().invoke(app, ["schema"]).exit_code == 0
+
+
+def test_a_plugin_that_comes_to_a_folder_or_leaves_it_is_noticed(tmp_path, monkeypatch):
+    """Though what is installed is read once for as long as nothing changes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "late" not in available_plugins()
+    info = tmp_path / "late-1.0.dist-info"
+    info.mkdir()
+    (info / "entry_points.txt").write_text("[qgs.plugins]\nlate = late:plugin\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
+    assert "late" in available_plugins()
+    info.rename(tmp_path / "gone")
+    assert "late" not in available_plugins()
