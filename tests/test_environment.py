@@ -69,3 +69,17 @@ def test_files_and_markers_are_run_in_one_process(
         "1 -m pytest -n auto --maxprocesses 8 --dist worksteal" if processes else "all -m pytest"
     )
     assert done.stdout == f"{first} {arguments}".rstrip() + "\n"
+
+
+def test_plugins_alone_are_installed(tmp_path: Path) -> None:
+    """Beside them lies what Python compiled there."""
+    for name in ("locus", "__pycache__"):
+        (tmp_path / "plugins" / name).mkdir(parents=True)
+    pip = tmp_path / "venv/bin/python"
+    pip.parent.mkdir(parents=True)
+    pip.write_text('#!/bin/sh\necho "$@"\n')
+    pip.chmod(0o755)
+    script = f'source "{ENVIRONMENT}"; root="{tmp_path}"; install "{tmp_path}/venv" cpu'
+    result = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert f"--editable {tmp_path}[cpu] --editable {tmp_path}/plugins/locus/\n" in result.stdout

@@ -63,7 +63,7 @@ install() {
             "Add it with: $environment/bin/python -m ensurepip"
     echo "qgs: installing query-gaussians[$extras] and the plugins into $environment" >&2
     local plugin plugins=()
-    for plugin in "$root"/plugins/*/; do
+    for plugin in "$root"/plugins/[a-z]*/; do
         plugins+=(--editable "$plugin")
     done
     # Modules are compiled when first imported: most of them never are.

@@ -31,7 +31,7 @@ out=$(cd "$out" && pwd)
 environment=$out/environment
 "$python" -m venv --system-site-packages "$environment" || exit 1
 plugins=()
-for plugin in "$root"/plugins/*/; do
+for plugin in "$root"/plugins/[a-z]*/; do
     plugins+=(--editable "$plugin")
 done
 # torch stays the machine's: wheels of it in WHEELS are not looked at.

@@ -15,7 +15,7 @@ from qgs.renderers import TorchRenderer
 for file in sorted(Path(sound.__file__).parent.glob("*.py")):
     import_module(f"contract_mutants.{file.stem}")
 
-SLOW = {"loops_over_queries", "loops_over_views"}
+SLOW = {"loops_over_queries", "loops_over_tokens"}
 
 
 def _parameters() -> list:

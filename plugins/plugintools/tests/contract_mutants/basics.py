@@ -102,9 +102,9 @@ class LoopsOverQueries(MlpFeedForward):
 
 
 @mutant("compiles", "3 more graphs are compiled")
-class LoopsOverViews(ContentCrossAttention):
+class LoopsOverTokens(ContentCrossAttention):
     def forward(self, state, memory):
-        values = memory.values.chunk(memory.grid[0], 2)
+        values = memory.values.split(4, 2)
         return self.core(state.features, memory.keys, torch.cat([1.0 * x for x in values], 2))
 
 
