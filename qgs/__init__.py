@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from query_gaussians import refuse_other_qgs
 
 if TYPE_CHECKING:
     from qgs.analysis.reconstruction import Reconstruction
@@ -44,7 +43,13 @@ DISTRIBUTIONS = {
 }
 """This repository's other distributions, by entry point; messages name those that are missing."""
 
-refuse_other_qgs(__file__)
+# PyPI's distribution `qgs`, a climate model, installs a package of the same name: in one folder the
+# files of both would mix. Looked up by file name: importlib.metadata would double the import time.
+for _other in Path(__file__).resolve().parents[1].glob("qgs-[0-9]*-info"):
+    raise ImportError(
+        f"the climate model `qgs` ({_other}) is installed over query-gaussians. Run "
+        "`pip uninstall qgs`, then reinstall query-gaussians"
+    )
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 """PyTorch's CPU allocator then asks for huge pages for large tensors, if qgs is imported before it

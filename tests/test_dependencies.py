@@ -151,7 +151,7 @@ def plugin(name: str) -> Source:
 
 
 SOURCES = {
-    "query-gaussians": source(ROOT / "pyproject.toml", ROOT / "qgs", ROOT / "query_gaussians.py"),
+    "query-gaussians": source(ROOT / "pyproject.toml", ROOT / "qgs"),
     **{f"query-gaussians-{name}": plugin(name) for name in PLUGINS},
     "a new plugin": template("src"),
 }

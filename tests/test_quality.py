@@ -13,10 +13,6 @@ SOURCES = ("qgs", "plugins", "tests", "tools")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 23_300, 200
-FORMER_NAME = re.compile(
-    r"\bqgs-(locus|ellipsoid|c3g|gslrm|globalsplat|rooms|datatools|viewer|studies|bench|plugintools)\b"
-    r"|pip install (qgs)\b|\bqgs\["
-)
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
@@ -76,7 +72,3 @@ def lines_with(pattern: re.Pattern[str]) -> list[str]:
 
 def test_no_path_of_one_machine() -> None:
     assert lines_with(MACHINE_PATH) == []
-
-
-def test_distributions_go_by_their_present_names() -> None:
-    assert lines_with(FORMER_NAME) == []
