@@ -106,7 +106,7 @@ def _plugins_of(folder: Path, but: str = "") -> Iterator[None]:
     modules = set(sys.modules)
     try:
         with (
-            patch("qgs.composer.registry._offered", found),
+            patch("qgs.extensions.installed", found),
             patch.object(sys, "path", [*sys.path]),
             redirect_stderr(StringIO()),
         ):

@@ -2,14 +2,13 @@
 
 import inspect
 import json
-import os
 import re
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import qgs.data
 import qgs.losses
 import qgs.metrics
 import qgs.renderers
+from qgs import extensions
 from qgs.composer.errors import Problems
 from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
 from qgs.composer.slots import SLOTS
@@ -119,22 +119,9 @@ def builtin() -> InstalledPlugin:
 def available_plugins() -> dict[str, list[EntryPoint]]:
     """Name to entry points of every installed plugin, by metadata alone."""
     found: dict[str, list[EntryPoint]] = {}
-    for entry in _offered(tuple((path, _changed_at(path)) for path in sys.path)):
+    for entry in extensions.installed(ENTRY_POINT_GROUP):
         found.setdefault(entry.name, []).append(entry)
     return found
-
-
-@lru_cache(maxsize=1)
-def _offered(searched: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
-    """What is offered in `searched`, all of sys.path: read anew when a folder of it has changed."""
-    return tuple(entry_points(group=ENTRY_POINT_GROUP))
-
-
-def _changed_at(path: str) -> int:
-    try:
-        return os.stat(path or ".").st_mtime_ns
-    except OSError:
-        return 0  # a folder that is not there offers nothing
 
 
 def load_registry(names: Iterable[str]) -> Registry:
