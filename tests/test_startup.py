@@ -1,4 +1,4 @@
-"""What starting up may import. Seconds are measured by tools/bench_startup.py."""
+"""What starting up may import."""
 
 import subprocess
 import sys

@@ -1,20 +1,22 @@
 """LocusGS and ellipsoid against TokenGS, in turn, in one run: forward, and forward and backward.
 
-    python tools/bench_models.py [--size first|small] [--also bf16|compile] [--rounds 9]
+    python tools/bench_models.py [--size first|small] [--precision bf16] [--rounds 9]
 
 Two sizes: "first" has width 384, 6 heads, 3 + 12 layers, 1,024 queries and 4 photos of 256 x 256;
 "small" has width 256, 8 heads, 3 + 6 layers, 512 queries and 4 photos of 128 x 128. Gradients go to
 all parameters from the Gaussians of the supervised layers, without renderer or losses: of the last
 layer, or with --layers 2 of the half and the last, as the recipes of LocusGS have it.
-With --also, TokenGS and LocusGS alone, each also under autocast to bfloat16 or compiled.
 Prints medians, and medians of the ratios to TokenGS round by round.
 """
 
 import argparse
+import statistics
+from collections.abc import Callable
 from functools import partial
+from operator import truediv
 
 import torch
-from bench_ray_bias import compare
+from qgs_bench.run import in_turn
 from qgs_bench.work import posed_photos
 from torch import Tensor
 
@@ -69,10 +71,19 @@ def backward(model: QueryGaussianModel, photos: Views, bf16: bool = False) -> No
     total.backward()
 
 
+def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
+    """Time every run in turn, once a round; print medians and ratios to the first run."""
+    columns = in_turn([*runs.values()], rounds, warmup=1)
+    for name, samples in zip(runs, columns, strict=True):
+        median = statistics.median(samples)
+        ratio = statistics.median(map(truediv, samples, columns[0]))
+        print(f"  {name:18} {1e3 * median:8.2f} ms   {ratio:6.3f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="LocusGS and ellipsoid against TokenGS.")
     parser.add_argument("--size", choices=[*SIZES], action="append")
-    parser.add_argument("--also", choices=["bf16", "compile"])
+    parser.add_argument("--precision", choices=["float32", "bf16"], default="float32")
     parser.add_argument("--layers", type=int, choices=[1, 2], default=1, help="supervised")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, default=2)
@@ -80,13 +91,8 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     for size in options.size or SIZES:
         photos = posed_photos(1, 4, SIZES[size][1], 0)
-        names = ["tokengs", "locus"] if options.also else [*MODELS]
-        runs = {name: (build(name, size, options.layers), photos, False) for name in names}
-        for name in names if options.also else ():
-            model = build(name, size, options.layers)
-            if options.also == "compile":
-                model.compile()
-            runs[f"{name}, {options.also}"] = model, photos, options.also == "bf16"
+        bf16 = options.precision == "bf16"
+        runs = {name: (build(name, size, options.layers), photos, bf16) for name in MODELS}
         print(f"{size}, {options.threads} threads; forward", flush=True)
         with torch.inference_mode():
             compare({n: partial(forward, *run) for n, run in runs.items()}, options.rounds)

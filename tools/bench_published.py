@@ -19,9 +19,8 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import torch
-from bench_models import SIZES
+from bench_models import SIZES, compare
 from bench_models import build as published_size
-from bench_ray_bias import compare
 from qgs_bench.work import posed_photos
 from torch import Tensor, nn
 

@@ -1,4 +1,4 @@
-"""The guide says what the code does: its recipes, code, messages, references and tables."""
+"""The guide says what the code does: its recipes, code, references and tables."""
 
 import re
 import sys
@@ -7,7 +7,6 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-import guide_errors
 import guide_reference
 import pytest
 import torch
@@ -20,56 +19,6 @@ from qgs.composer.registry import load_registry
 from qgs.composer.slots import SLOTS
 from qgs.contracts import ComponentConfig, ModelDims
 from qgs.types import QueryState
-
-
-def test_messages_are_those_that_are_raised() -> None:
-    page = text_of("errors.md")
-    assert guide_errors.updated(page) == page, "run `python tools/guide_errors.py`"
-
-
-MESSAGES = (
-    "there is no key `",
-    "there is no option `",
-    "must be a valid integer, got",
-    "there is no component `",
-    "belongs in the slot `",
-    "names no plugin",
-    "is an import path",
-    "is already given at",
-    "matches no place",
-    "which nothing before it provides",
-    "reads anchor.raw_radius as",
-    "has no effect",
-    "do not divide",
-    "which this recipe does not use",
-    "no installed distribution offers a plugin `",
-    "its recipe fails here; install",
-    "cannot be imported from",
-    "No module named 'a_package_that_is_missing'",
-    "has no attribute 'plugin'",
-    "was written for contract version",
-    "calls itself `",
-    "several distributions offer a plugin `",
-    "registers `latent` twice",
-    "which leaves forward abstract",
-    "whose Config is no ComponentConfig",
-    "fails: `__init__` of `",
-    "says that it provides",
-    "needs numba, which is not installed",
-    "must have shape (",
-    "must be floating-point numbers in [0, 1]",
-)
-"""Of every kind of message that the page is to show, a part of its own."""
-
-
-def test_the_page_of_errors_shows_every_kind_of_message_below_a_heading_of_its_own() -> None:
-    texts = blocks("errors.md", "text").values()
-    assert [part for part in MESSAGES if not any(part in text for text in texts)] == []
-    sections = re.split(r"^###? ", text_of("errors.md"), flags=re.MULTILINE)[1:]
-    headings = [section.partition("\n")[0] for section in sections]
-    assert len(set(headings)) == len(headings)
-    for section in sections:
-        assert section.count("```text") <= 2, "one kind of message below a heading"
 
 
 def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

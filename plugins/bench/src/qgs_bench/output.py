@@ -1,5 +1,8 @@
-"""Tables of what was measured, grown or predicted, and the files of a sweep."""
+"""Tables of what was measured, and the files of a report."""
 
+import csv
+import io
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,10 +12,10 @@ from rich.markup import escape
 
 from qgs.engine.results import as_json, print_lines, print_table
 from qgs.io.files import replacing, write_text
-from qgs.memory import in_words
 from qgs.wording import counted, short_names
 from qgs_bench.figure import sweep_figure
-from qgs_bench.sweep import as_csv
+from qgs_bench.run import KIND
+from qgs_bench.sweep import series_of
 
 MEBIBYTE = 2**20
 TITLES = {
@@ -26,10 +29,9 @@ SUFFIXES = (".csv", ".png", ".pdf")
 
 def show(report: dict[str, Any], console: Console) -> None:
     """The models, then one table for each thing that was measured of them."""
-    recipes, machine = report["recipes"], report["machine"]
-    base = recipes[0]
-    told = _told(machine, report)
-    console.print(f"{base['precision']}, {told}, ratios to the first recipe", markup=False)
+    recipes = report["recipes"]
+    base, conditions = recipes[0], _conditions(report)
+    console.print(f"{base['precision']}, {conditions}, ratios to the first recipe", markup=False)
     names = [escape(name) for name in short_names([recipe["recipe"] for recipe in recipes])]
 
     def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -70,39 +72,36 @@ def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
     return median, f"{lower} .. {upper}"
 
 
-def _told(machine: Mapping[str, Any], report: Mapping[str, Any]) -> str:
-    """Machine and rounds, in words."""
-    device = machine["device"]
-    threads = "" if device == "cuda" else f", {counted(machine['threads'], 'thread')}"
+def _conditions(report: Mapping[str, Any]) -> str:
+    """Machine and rounds."""
+    machine = report["machine"]
+    threads = "" if machine["device"] == "cuda" else f", {counted(machine['threads'], 'thread')}"
     return (
-        f"{device} ({machine['processor']}{threads}), torch {machine['torch']}; "
+        f"{machine['device']} ({machine['processor']}{threads}), torch {machine['torch']}; "
         f"{report['rounds']} rounds after {report['warmup']} of warm-up"
     )
 
 
 def show_sweep(report: Mapping[str, Any], console: Console) -> None:
-    """A table for each series, its exponents, and what was left out or failed."""
-    console.print(_told(report["machine"], report), markup=False)
-    names = short_names([*dict.fromkeys(s["recipe"] for s in report["series"])])
-    short = dict(zip(dict.fromkeys(s["recipe"] for s in report["series"]), names, strict=True))
-    for series in report["series"]:
-        rows = [[series["axis"], "median, ms", "quartiles", "tensors, MiB", "process, MiB"]]
-        for point in series["points"]:
-            memory, seconds = point["memory"], point["seconds"]
-            own = memory["peak_bytes"] - memory["idle_bytes"]
-            sizes = [f"{size / MEBIBYTE:,.1f}" for size in (point["counted_bytes"], own)]
-            rows.append([str(point["value"]), *_cells(seconds, 1000.0), *sizes])
-        title = f"{short[series['recipe']]}: {TITLES[series['operation']]}, by {series['axis']}"
+    """A table for each recipe, axis and operation, its exponents, and what failed."""
+    console.print(_conditions(report), markup=False)
+    series = series_of(report["points"])
+    recipes = [*dict.fromkeys(recipe for recipe, _, _ in series)]
+    short = dict(zip(recipes, short_names(recipes), strict=True)) if recipes else {}
+    for fits, points in zip(report["fits"], series.values(), strict=True):
+        rows = [[fits["axis"], "median, ms", "quartiles", "process, MiB"]]
+        for point in points:
+            own = point["memory"]["peak_bytes"] - point["memory"]["idle_bytes"]
+            times = _cells(point["seconds"], 1000.0)
+            rows.append([str(point["value"]), *times, f"{own / MEBIBYTE:,.1f}"])
+        title = f"{short[fits['recipe']]}: {TITLES[fits['operation']]}, by {fits['axis']}"
         print_table(console, title, rows)
-        fits = series["fits"]
-        words = {"seconds": "time", "counted_bytes": "tensors", "peak_bytes": "process"}
-        told = [f"{words[k]} {_exponent(fits[k])}" for k in words if fits[k]]
-        missing = [
-            f"{kind.replace('_', ' ')}: {series['axis']} {m['value']} {m['reason']}"
-            for kind in ("left_out", "failed")
-            for m in series[kind]
-        ]
-        print_lines(console, [f"exponents: {'; '.join(told)}"] * bool(told) + missing)
+        words = {"seconds": "time", "bytes": "memory"}
+        found = [f"{words[k]} {_exponent(fits[k])}" for k in words if fits[k]]
+        print_lines(console, [f"exponents: {'; '.join(found)}"] * bool(found))
+    for one in report["failed"]:
+        what = f"{one['recipe']}, {one['operation']}, {one['axis']} {one['value']}"
+        print_lines(console, [f"failed: {what}: {one['reason']}"])
 
 
 def _exponent(fit: Mapping[str, Any]) -> str:
@@ -110,41 +109,40 @@ def _exponent(fit: Mapping[str, Any]) -> str:
     return f"{fit['exponent']:.2f}{error} (last doubling {fit['last']:.2f})"
 
 
-def refuse_other_files(path: Path) -> None:
-    """Raise FileExistsError where a file stands beside a sweep's report that is not its own."""
-    beside = [path.with_suffix(suffix) for suffix in SUFFIXES]
-    taken = [file.name for file in beside if file.exists()]
-    if taken and not path.exists():
+def refuse_other_file(path: Path) -> None:
+    """Raise FileExistsError when `path` holds anything but an earlier report."""
+    if not path.exists():
+        return
+    try:
+        is_report = json.loads(path.read_text(encoding="utf-8"))["report"] == KIND
+    except (OSError, ValueError, TypeError, KeyError):
+        is_report = False
+    if not is_report:
         raise FileExistsError(
-            f"{', '.join(taken)} in {path.parent} would be written beside {path.name} and are of "
-            "no earlier report; choose another name for the report"
+            f"{path} exists and is no report of `{KIND}`; choose another name for the report"
         )
+
+
+def write(report: Mapping[str, Any], path: Path) -> Path:
+    """Write the report as JSON."""
+    write_text(path, as_json(report))
+    return path
 
 
 def write_sweep(report: Mapping[str, Any], path: Path) -> list[Path]:
     """The report as JSON at `path`, and beside it as CSV, PNG and PDF."""
-    files = [path, *(path.with_suffix(suffix) for suffix in SUFFIXES)]
-    write_text(path, as_json(report))
-    write_text(files[1], as_csv(report))
+    files = [write(report, path), *(path.with_suffix(suffix) for suffix in SUFFIXES)]
+    text = io.StringIO()
+    names = ("recipe", "axis", "value", "operation")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow((*names, "seconds", "peak_bytes", "idle_bytes"))
+    for point in report["points"]:
+        costs = point["seconds"]["median"], *point["memory"].values()
+        writer.writerow((*(point[name] for name in names), *costs))
+    write_text(files[1], text.getvalue())
     figure = sweep_figure(report)
     for file in files[2:]:
         metadata = {"CreationDate": None} if file.suffix == ".pdf" else None
         with replacing(file) as place:
             figure.savefig(place, format=file.suffix[1:], dpi=160, metadata=metadata)
     return files
-
-
-def show_prediction(found: Mapping[str, Any], limit: int, console: Console) -> None:
-    """What a training takes, by what for, whether it fits into `limit` bytes, and which batch."""
-    rows = [["", "bytes"]]
-    rows += [[what, in_words(n)] for what, n in (*found["step"].items(), *found["besides"].items())]
-    rows.append(["all", in_words(found["total_bytes"])])
-    size = " x ".join(map(str, (found["batch"], found["views"], *found["size"])))
-    device, precision = found["device"], found["precision"]
-    title = f"{found['recipe']}: training, B x V x H x W {size}, {precision}, on {device}"
-    print_table(console, title, rows)
-    kept = [f"{what} {in_words(size)}" for what, size in found["kept"].items() if size]
-    lines = [f"kept for the backward pass: {', '.join(kept)}"] if kept else []
-    fits, most = "fits" if found["fits"] else "does not fit", found["largest_batch"]
-    batches = f"the largest batch that does is {most}" if most else "not even a batch of 1 does"
-    print_lines(console, [*lines, f"{fits} into {in_words(limit)} on {device}; {batches}"])

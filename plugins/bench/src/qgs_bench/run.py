@@ -1,10 +1,9 @@
 """Measuring recipes: memory first, in processes of their own, then seconds, all in turn."""
 
-import json
 import os
 import platform
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from operator import truediv
 from pathlib import Path
 from typing import Any
@@ -14,38 +13,16 @@ import torch
 from torch.utils.benchmark import timer
 
 import qgs
-from qgs.composer import Recipe
+from qgs.composer import resolve
 from qgs_bench.memory import Peak, peak_memory
-from qgs_bench.work import Operation, Task, Workload, make_task
+from qgs_bench.work import Operation, Task, make_task, workload_of
 
 KIND = "qgs bench"
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A recipe to measure. name: in the report."""
-
-    name: str
-    recipe: Recipe
-    workload: Workload
-
-
-def refuse_other_file(path: Path, kind: str = KIND) -> None:
-    """Raise FileExistsError when `path` holds anything but an earlier report of that kind."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return
-    except (OSError, ValueError):
-        found = None
-    if not isinstance(found, dict) or found.get("report") != kind:
-        raise FileExistsError(
-            f"{path} exists and is no report of `{kind}`; choose another name for the report"
-        )
-
-
-def bench(
-    subjects: Sequence[Subject],
+def measure_recipes(
+    names: Sequence[str],
+    work: Mapping[str, Any],
     *,
     step: bool = False,
     memory: bool = False,
@@ -55,69 +32,81 @@ def bench(
     overrides: Sequence[str] = (),
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure size and forward latency of all `subjects`, which share device and precision.
+    """Measure size and forward latency of all recipes, with initial weights.
 
-    All models, with initial weights, are in memory while latencies are measured, so that each round
-    has all of them. step, memory, renderer: what is measured besides. rounds: samples of each
-    latency. warmup: calls before the first sample. overrides: what the report says of them. say:
-    called with what is measured next. Returns the report, plain values for JSON: seconds with every
-    sample, bytes, and ratios to the first subject, those of latencies round by round.
-    Raises ValueError as the models, losses and renderers do, ChildProcessError as `peak_memory`.
+    All models are in memory while latencies are measured, so that each round has all of them.
+
+    Args:
+        names: recipes, as `resolve` takes them.
+        work: fields of the workload, as `workload_of` takes them.
+        step, memory, renderer: what is measured too.
+        rounds: samples of each latency, after `warmup` calls.
+        overrides: of all recipes.
+        say: called with what is measured next.
+
+    Returns:
+        The report, plain values for JSON: seconds with every sample, bytes, and ratios to the first
+        recipe, those of latencies round by round.
+
+    Raises:
+        ValueError: as the models, losses and renderers do.
+        ChildProcessError: as `peak_memory` does.
     """
-    threads = torch.get_num_threads()
+    recipes = [resolve(name, overrides) for name in names]
+    works = [workload_of(recipe, **work) for recipe in recipes]
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
-    peaks: list[dict[Operation, Peak]] = [{} for _ in subjects]
-    for s, found in zip(subjects, peaks, strict=True):
+    peaks: list[dict[Operation, Peak]] = [{} for _ in names]
+    for name, recipe, workload, found in zip(names, recipes, works, peaks, strict=True):
         for operation in operations if memory else ():
-            say(f"{s.name}: memory of the {operation}")
-            found[operation] = peak_memory(s.recipe, operation, s.workload, threads)
+            say(f"{name}: memory of the {operation}")
+            found[operation] = peak_memory(recipe, operation, workload, torch.get_num_threads())
     if renderer:
         operations.insert(1, "render")  # the step is last, because it changes weights
-    models = [subject.recipe.build_model(subject.workload.device) for subject in subjects]
-    times: list[dict[Operation, list[float]]] = [{} for _ in subjects]
+    models = [recipe.build_model(work["device"]) for recipe in recipes]
+    times: list[dict[Operation, list[float]]] = [{} for _ in names]
     for operation in operations:
-        pairs = zip(subjects, models, strict=True)
-        tasks = [make_task(operation, s.recipe, model, s.workload) for s, model in pairs]
+        tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
         columns = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
         for found, column in zip(times, columns, strict=True):
             found[operation] = column
-    counts = [sum(p.numel() for p in model.parameters()) for model in models]
-    weights = [sum(t.nbytes for t in model.state_dict().values()) for model in models]
-    recipes = [
-        {
-            "recipe": subject.name,
-            **asdict(subject.workload),
-            "queries": (queries := model.queries.count),
-            "gaussians": queries and queries * model.head.gaussians_per_query,
-            "parameters": {"count": count, "weight_bytes": size, "ratio": count / counts[0]},
-            "seconds": {
-                operation: {
-                    **quartiles(samples),
-                    "samples": samples,
-                    "ratio": quartiles(list(map(truediv, samples, times[0][operation]))),
-                }
-                for operation, samples in seconds.items()
-            },
-            "memory": {
-                o: {**asdict(peak), "ratio": peak.peak_bytes / peaks[0][o].peak_bytes}
-                for o, peak in found.items()
-            },
+    entries = []
+    for name, workload, model, seconds, found in zip(
+        names, works, models, times, peaks, strict=True
+    ):
+        entry: dict[str, Any] = {"recipe": name, **asdict(workload)}
+        queries = model.queries.count
+        entry |= {"queries": queries, "gaussians": None}
+        if queries:  # otherwise the views decide
+            entry["gaussians"] = queries * model.head.gaussians_per_query
+        entry["parameters"] = {
+            "count": sum(p.numel() for p in model.parameters()),
+            "weight_bytes": sum(t.nbytes for t in model.state_dict().values()),
         }
-        for subject, model, count, size, seconds, found in zip(
-            subjects, models, counts, weights, times, peaks, strict=True
-        )
-    ]
+        entry["seconds"] = {
+            operation: {
+                **quartiles(samples),
+                "samples": samples,
+                "ratio": quartiles(list(map(truediv, samples, times[0][operation]))),
+            }
+            for operation, samples in seconds.items()
+        }
+        entry["memory"] = {
+            operation: {
+                **asdict(peak),
+                "ratio": peak.peak_bytes / peaks[0][operation].peak_bytes,
+            }
+            for operation, peak in found.items()
+        }
+        entries.append(entry)
+    for entry in entries:
+        parameters = entry["parameters"]
+        parameters["ratio"] = parameters["count"] / entries[0]["parameters"]["count"]
     settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
-    return {
-        "report": KIND,
-        "machine": machine(subjects[0].workload.device),
-        **settings,
-        "recipes": recipes,
-    }
+    return {"report": KIND, "machine": machine(work["device"]), **settings, "recipes": entries}
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What was measured on, for the report."""
+    """Processor, threads and versions, for the report."""
     return {
         "device": device,
         "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
