@@ -152,14 +152,14 @@ def worst_error(kernel: Any, dtype: torch.dtype) -> float:
             *given, bias = drawn(kind, queries, 1031, 2, lowest)
             *leaves, out = (x.to(dtype) for x in given)
             ours = [x.clone().requires_grad_() for x in leaves]
-            found = biased_attention(*ours, bias, kernel)
+            found = biased_attention(ours[0], ours[1], ours[2], bias, kernel)
             found.backward(out)
             truth = [x.double().requires_grad_() for x in leaves]
             scores = truth[0] @ truth[1].mT / 8 + bias.dense().double()[:, None]
             true = scores.softmax(-1) @ truth[2]
             true.backward(out.double())
             pairs = [(found, true), *((a.grad, b.grad) for a, b in zip(ours, truth, strict=True))]
-            errors += [float((a.double() - b).abs().max() / b.abs().max()) for a, b in pairs]
+            errors += [((a.double() - b).abs().max() / b.abs().max()).item() for a, b in pairs]
     return math.inf if any(map(math.isnan, errors)) else max(errors)
 
 
