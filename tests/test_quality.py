@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("qgs", "plugins", "tests", "tools")
+SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 23_300, 200

@@ -1,0 +1,300 @@
+"""All of LocusGS in one file of plain PyTorch: posed photos in, 3D Gaussians and a loss out.
+
+    python docs/examples/nano_locus.py 500
+
+trains a tiny model on scenes of random blobs. The weights are one dictionary `p`, named as in the
+framework: the tensors of a checkpoint of recipes/tiny/locus.yaml fit as they are, and a test holds
+every output against the framework's. A heading names the place of each part in the framework.
+
+Axes: B scenes, V views, M image tokens (the patches of all views), N queries, K Gaussians a query,
+D width, h heads. World: the frame of the first input camera. Cameras: c2w (B, V, 4, 4) in OpenCV
+axes (x right, y down, z forward), intrinsics (B, V, 4) fx, fy, cx, cy in pixels.
+"""
+
+import math
+import sys
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+# The sizes of recipes/tiny/locus.yaml; those of the paper: 768, 12, 8, 3, 1024, 12, 64.
+WIDTH, HEADS, PATCH, ENCODER_DEPTH, QUERIES, DEPTH, PER_QUERY = 128, 4, 8, 1, 256, 4, 8
+SCALE_CAP = 0.15  # largest standard deviation of a Gaussian, world units
+OPACITY_BIAS = -1.0
+LAYER_WEIGHTS = {2: 1 / 3, 4: 2 / 3}  # decoder layers that the loss sees, and how much
+NEAR, FAR, BACKGROUND = 0.025, 125.0, 0.5
+Gaussians = dict[str, Tensor]
+
+
+# ---- Blocks: qgs/components/blocks.py ----
+class Weights(dict[str, Tensor]):
+    """Parameters by name. One that is missing is made where it is first used."""
+
+    def need(self, name: str, shape: tuple[int, ...], low: float, high: float) -> Tensor:
+        if name not in self:  # uniform from low to high, as torch's own layers start
+            self[name] = torch.empty(shape).uniform_(low, high).requires_grad_()
+        return self[name]
+
+
+def linear(p: Weights, name: str, x: Tensor, outputs: int) -> Tensor:
+    bound = x.shape[-1] ** -0.5
+    weight = p.need(f"{name}.weight", (outputs, x.shape[-1]), -bound, bound)
+    return F.linear(x, weight, p.need(f"{name}.bias", (outputs,), 0, 0))
+
+
+def norm(p: Weights, name: str, x: Tensor) -> Tensor:
+    weight = p.need(f"{name}.weight", x.shape[-1:], 1, 1)
+    return F.layer_norm(x, x.shape[-1:], weight, p.need(f"{name}.bias", x.shape[-1:], 0, 0))
+
+
+def scaled(p: Weights, name: str, update: Tensor) -> Tensor:  # LayerScale
+    return p.need(f"{name}.gamma", update.shape[-1:], 0.3, 0.3) * update
+
+
+def mlp(p: Weights, name: str, x: Tensor, hidden: int, outputs: int) -> Tensor:
+    return linear(p, f"{name}.fc2", F.gelu(linear(p, f"{name}.fc1", x, hidden)), outputs)
+
+
+def split(x: Tensor) -> Tensor:  # (B, T, D) -> (B, h, T, D/h)
+    return x.unflatten(-1, (HEADS, -1)).transpose(1, 2)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, bias: Tensor | None = None) -> Tensor:
+    return F.scaled_dot_product_attention(q, k, v, bias).transpose(1, 2).flatten(2)  # (B, T, D)
+
+
+def self_attention(p: Weights, name: str, x: Tensor) -> Tensor:
+    """Multi-head attention with LayerNorm on the queries and keys of each head."""
+    q, k, v = (split(part) for part in linear(p, f"{name}.qkv", x, 3 * WIDTH).chunk(3, -1))
+    read = attend(norm(p, f"{name}.q_norm", q), norm(p, f"{name}.k_norm", k), v)
+    return linear(p, f"{name}.proj", read, WIDTH)
+
+
+# ---- Rays and encoder: qgs/geometry/rays.py, qgs/components/encoder.py ----
+def plucker_map(c2w: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """Moment o x d and unit direction d of the ray through each pixel: (B, V, 6, H, W)."""
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    fx, fy, cx, cy = (intrinsics[..., i, None, None] for i in range(4))
+    x, y = (u - cx) / fx, (v - cy) / fy
+    in_camera = F.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
+    d = in_camera @ c2w[..., None, :3, :3].transpose(-1, -2)
+    o = c2w[..., None, None, :3, 3].expand_as(d)
+    return torch.cat([torch.linalg.cross(o, d, dim=-1), d], -1).movedim(-1, -3)
+
+
+def patches(p: Weights, name: str, images: Tensor) -> Tensor:  # (B*V, C, H, W) -> (B*V, M/V, D)
+    shape = (WIDTH, images.shape[1], PATCH, PATCH)
+    bound = math.prod(shape[1:]) ** -0.5
+    kernel = p.need(f"{name}.proj.weight", shape, -bound, bound)
+    x = F.conv2d(images, kernel, p.need(f"{name}.proj.bias", (WIDTH,), 0, 0), stride=PATCH)
+    return norm(p, f"{name}.norm", x.flatten(2).transpose(1, 2))
+
+
+def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Sequence[Tensor]:
+    """A ViT over the patches of all views together; its keys and values serve all decoder layers.
+
+    images (B, V, 3, H, W) in [0, 1] -> keys and values (B, h, M, D/h), patch rays (B, M, 6).
+    """
+    plucker = plucker_map(c2w, intrinsics, *images.shape[-2:]).flatten(0, 1)
+    mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])[..., None, None]
+    x = patches(p, "encoder.rgb_embedding", ((images - mean) / std).flatten(0, 1))
+    x = x + patches(p, "encoder.ray_embedding", plucker)
+    x = x.reshape(len(images), -1, WIDTH)
+    for i in range(ENCODER_DEPTH):
+        at = f"encoder.blocks.{i}"
+        update = self_attention(p, f"{at}.attention", norm(p, f"{at}.norm1", x))
+        x = x + scaled(p, f"{at}.scale1", update)
+        update = mlp(p, f"{at}.mlp", norm(p, f"{at}.norm2", x), 4 * WIDTH, WIDTH)
+        x = x + scaled(p, f"{at}.scale2", update)
+    k, v = linear(p, "encoder.kv_proj", norm(p, "encoder.norm", x), 2 * WIDTH).chunk(2, -1)
+    rays = F.avg_pool2d(plucker, PATCH).flatten(2).transpose(1, 2)
+    return norm(p, "encoder.k_norm", split(k)), split(v), rays.reshape(len(images), -1, 6)
+
+
+# ---- Decoder layer: qgs/components/decoder.py, and of qgs_locus the files of the same names ----
+def support_radius(rho: Tensor) -> Tensor:
+    # The floor keeps all Gaussians of an anchor from falling on one point, where none has a slope.
+    return F.softplus(rho).clamp_min(1e-3)
+
+
+def ray_bias(mu: Tensor, rho: Tensor, rays: Tensor) -> Tensor:
+    """b (B, N, M) = -1/2 (D / sigma)^2, D the distance of the centre to the ray of a patch."""
+    m, d = rays.split(3, -1)
+    length = d.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # a mean of unit directions is shorter
+    m, d = (m / length)[:, None], (d / length)[:, None]
+    distance = (torch.linalg.cross(mu[:, :, None], d, dim=-1) - m).norm(dim=-1)
+    sigma = (0.1 * support_radius(rho)).clamp_min(math.sqrt(1e-3))
+    # The lower bound leaves every token in reach: softmax weights below exp(-20 gamma) would be 0,
+    # and an anchor that starts in the wrong place could not see where it belongs.
+    return (-0.5 * (distance / sigma).square()).clamp_min(-20)
+
+
+def cross_attention(p: Weights, name: str, x: Tensor, b: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """softmax(q k / sqrt(d) + gamma b) v, with one gamma for each layer."""
+    q = split(linear(p, f"{name}.core.q_proj", norm(p, f"{name}.core.norm", x), WIDTH))
+    bias = F.softplus(p.need(f"{name}.raw_gamma", (), 0.54, 0.54)) * b[:, None]
+    read = attend(norm(p, f"{name}.core.q_norm", q), k, v, bias)
+    return linear(p, f"{name}.core.out_proj", read, WIDTH)
+
+
+def anchor_aware(p: Weights, name: str, x: Tensor, mu: Tensor) -> Tensor:
+    """Self-attention over x + MLP(PE(mu)); the residual stream does not keep the sum."""
+    divisor = 10_000 ** (2 * torch.arange(64) / 128) + 1e-6
+    angle = ((torch.tanh(mu) + 1) * math.pi)[..., None] / divisor  # tanh: centres have no bounds
+    sines = torch.stack([angle.sin(), angle.cos()], -1).flatten(2)
+    position = mlp(p, f"{name}.position_mlp", sines, WIDTH, WIDTH)
+    return self_attention(p, f"{name}.attention", norm(p, f"{name}.norm", x + position))
+
+
+def posact(t: Tensor) -> Tensor:
+    """sign(t) (exp|t| - 1), at most 1000: fine steps near 0, and everything in reach."""
+    t = t.clamp(-math.log1p(1000), math.log1p(1000))  # before exp, which would overflow
+    return torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
+
+
+def decode(p: Weights, x: Tensor, mu: Tensor, rho: Tensor) -> Gaussians:
+    """N*K Gaussians: means at offsets from the anchor that are multiples of its radius."""
+    raw = linear(p, "head.linear", x, PER_QUERY * 14).unflatten(-1, (PER_QUERY, 14))
+    offset, rgb, scale, quat, opacity = raw.split((3, 3, 3, 4, 1), -1)
+    parts = {
+        "means": mu[:, :, None] + support_radius(rho)[:, :, None] * posact(offset),
+        "scales": (scale.clamp(-10, 10) - 1).exp().mul(SCALE_CAP).clamp_max(SCALE_CAP),
+        "quats": F.normalize(quat, dim=-1, eps=1e-4),
+        "opacities": torch.sigmoid(opacity[..., 0] + OPACITY_BIAS),
+        "colors": (torch.tanh(rgb) + 1) / 2,
+    }
+    return {name: part.flatten(1, 2) for name, part in parts.items()}
+
+
+def forward(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> dict[int, Gaussians]:
+    """After each layer (1 is the first): anchors "mu" (B, N, 3), "rho" (B, N, 1), Gaussians."""
+    k, v, rays = encode(p, images, c2w, intrinsics)
+    features = p.need("queries.features", (QUERIES, WIDTH), -0.5, 0.5)
+    if "queries.center" not in p:  # in the first camera's frustum, uniform in log depth
+        z = 0.3 * (2.5 / 0.3) ** torch.rand(QUERIES, 1)
+        p["queries.center"] = torch.cat([(2 * torch.rand(QUERIES, 2) - 1) * 0.6 * z, z], -1)
+        p["queries.center"].requires_grad_()
+    radius = p.need("queries.raw_radius", (QUERIES, 1), -1.05, -1.05)  # softplus: 0.3
+    x, mu, rho = (y.expand(len(images), -1, -1) for y in (features, p["queries.center"], radius))
+    layers = {}
+    for i in range(DEPTH):
+        at = f"decoder.{i}"
+        bias = ray_bias(mu, rho, rays)
+        update = cross_attention(p, f"{at}.cross_attention", x, bias, k, v)
+        x = x + scaled(p, f"{at}.cross_scale", update)
+        x = x + scaled(p, f"{at}.self_scale", anchor_aware(p, f"{at}.self_attention", x, mu))
+        normed = norm(p, f"{at}.feed_forward.norm", x)
+        update = mlp(p, f"{at}.feed_forward.mlp", normed, 4 * WIDTH, WIDTH)
+        x = x + scaled(p, f"{at}.feed_forward_scale", update)
+        mu = mu + posact(mlp(p, "refinements.0.center_mlp", x, WIDTH, 3))  # of all layers
+        rho = rho + mlp(p, "refinements.0.radius_mlp", x, WIDTH, 1)
+        layers[i + 1] = {"mu": mu, "rho": rho, **decode(p, x, mu, rho)}
+    return layers
+
+
+# ---- Renderer: qgs/renderers/reference.py ----
+def rotation(quats: Tensor) -> Tensor:  # (..., 4) w x y z -> (..., 3, 3)
+    w, v = quats[..., :1, None], quats[..., None, 1:].expand(*quats.shape[:-1], 3, 3)
+    cross = torch.linalg.cross(v, torch.eye(3).expand_as(v), dim=-1).mT  # the matrix of v x .
+    return torch.eye(3) + 2 * (w * cross + cross @ cross)
+
+
+def render(g: Gaussians, b: int, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """RGB (3, H, W) of the Gaussians of scene b from one camera: EWA splatting, front to back."""
+    turn, (fx, fy, cx, cy), (height, width) = c2w[:3, :3].T, intrinsics, size
+    at = (g["means"][b] - c2w[:3, 3]) @ turn.T
+    seen = ((at[:, 2] >= NEAR) & (at[:, 2] <= FAR)).nonzero()[:, 0]
+    i = seen[at[seen, 2].argsort(stable=True)]
+    x, y, z = at[i].unbind(-1)
+    u, v = fx * x / z + cx, fy * y / z + cy
+    # Outside the image the projection's slope is held: there it would grow without bound.
+    x = (x / z).clamp((-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
+    y = (y / z).clamp((-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
+    jacobian = torch.stack([fx / z, 0 * z, -fx / z * x, 0 * z, fy / z, -fy / z * y], -1)
+    spread = jacobian.unflatten(-1, (2, 3)) @ turn @ rotation(g["quats"][b, i])
+    spread = spread * g["scales"][b, i, None]
+    inverse = (spread @ spread.mT + 0.3 * torch.eye(2)).inverse()  # 0.3 pixel^2: no aliasing
+    du = (torch.arange(width) + 0.5 - u[:, None])[:, None]  # (G, 1, W)
+    dv = (torch.arange(height) + 0.5 - v[:, None])[..., None]  # (G, H, 1)
+    (xx, xy), (_, yy) = (row.unbind(1) for row in inverse[..., None, None].unbind(1))
+    power = -0.5 * (xx * du * du + yy * dv * dv) - xy * du * dv
+    alpha = g["opacities"][b, i, None, None] * power.clamp_max(0).exp()
+    alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.999), 0.0)
+    after = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
+    weight = torch.where(after > 1e-4, alpha * before, 0.0)
+    rgb = torch.einsum("gc,ghw->chw", g["colors"][b, i], weight)
+    return rgb + BACKGROUND * (1 - weight.sum(0))
+
+
+# ---- Losses: qgs/losses, qgs_locus/visibility.py ----
+def ssim(x: Tensor, y: Tensor) -> Tensor:
+    """Mean structural similarity of (X, 3, H, W), Gaussian windows of 11 pixels, zero padding."""
+    line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
+    window = torch.outer(line / line.sum(), line / line.sum()).expand(15, 1, 11, 11)
+    moments = torch.cat([x, y, x * x, y * y, x * y], 1)
+    mx, my, xx, yy, xy = F.conv2d(moments, window, padding=5, groups=15).chunk(5, 1)
+    alike = (2 * mx * my + 0.01**2) * (2 * (xy - mx * my) + 0.03**2)
+    energy = mx**2 + my**2
+    return (alike / ((energy + 0.01**2) * (xx + yy - energy + 0.03**2))).mean()
+
+
+def visibility(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """Mean distance of points (B, P, 3) to the image of the nearest view, in halves of a side."""
+    at = (points[:, None] - c2w[..., None, :3, 3]) @ c2w[..., :3, :3]  # (B, V, P, 3)
+    z = torch.where(at[..., 2:].abs() < 1e-3, 1e-3, at[..., 2:])
+    pixel = intrinsics[..., None, :2] * at[..., :2] / z + intrinsics[..., None, 2:]
+    outside = (2 * pixel / torch.tensor([size[1], size[0]]) - 1).abs().sub(1).relu().sum(-1)
+    outside = torch.where(at[..., 2] <= NEAR, torch.inf, outside)  # behind: not seen
+    return outside.amin(1).clamp_max(1).mean()
+
+
+def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Tensor:
+    """inputs and targets: images (B, V, 3, H, W), c2w, intrinsics."""
+    truth, c2w, intrinsics = targets
+    size, total = (truth.shape[-2], truth.shape[-1]), torch.zeros(())
+    views = [(b, v) for b in range(truth.shape[0]) for v in range(truth.shape[1])]
+    layers = forward(p, *inputs)
+    for number, weight in LAYER_WEIGHTS.items():
+        g = layers[number]
+        rgb = torch.stack([render(g, b, c2w[b, v], intrinsics[b, v], size) for b, v in views])
+        y = truth.flatten(0, 1)
+        term = F.mse_loss(rgb, y) + 0.2 * (1 - ssim(rgb, y)) / 2
+        for name, factor in (("means", 0.1), ("mu", 0.01)):
+            term = term + factor * visibility(g[name], c2w, intrinsics, size)
+        total = total + weight * term
+    return total
+
+
+# ---- Data and the loop: qgs/data/sampling.py, qgs/engine/training.py ----
+def blobs(views: int, size: int = 32) -> tuple[Tensor, Tensor, Tensor]:
+    """A scene of 40 random blobs from cameras side by side; the first is the world's frame."""
+    g = {"means": torch.rand(1, 40, 3) * 1.6 + torch.tensor([-0.8, -0.8, 1])}
+    g |= {"scales": torch.rand(1, 40, 3) * 0.15 + 0.03, "opacities": torch.ones(1, 40)}
+    g |= {"quats": F.normalize(torch.randn(1, 40, 4), dim=-1), "colors": torch.rand(1, 40, 3)}
+    c2w = torch.eye(4).repeat(1, views, 1, 1)
+    c2w[0, 1:, :2, 3] = torch.rand(views - 1, 2) * 0.6 - 0.3
+    intrinsics = torch.tensor([size, size, size / 2, size / 2]).float().expand(1, views, 4)
+    images = [render(g, 0, c2w[0, v], intrinsics[0, v], (size, size)) for v in range(views)]
+    return torch.stack(images)[None], c2w, intrinsics
+
+
+def main(steps: int) -> None:
+    torch.manual_seed(0)
+    p, optimizer = Weights(), None
+    for step in range(steps):
+        scene = blobs(views=4)
+        value = loss(p, [x[:, :2] for x in scene], [x[:, 2:] for x in scene])
+        if optimizer is None:  # now all weights exist
+            optimizer = torch.optim.AdamW(p.values(), lr=1e-3, betas=(0.9, 0.95), weight_decay=0.05)
+        optimizer.zero_grad()
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(p.values(), 1.0)
+        optimizer.step()
+        print(f"step {step:4}  loss {value.item():.4f}", flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if sys.argv[1:] else 500)

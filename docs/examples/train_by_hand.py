@@ -1,0 +1,81 @@
+"""Train a model without the framework's engine, and save a scene that it reconstructs.
+
+    python docs/examples/train_by_hand.py recipes/tiny/locus.yaml --steps 200 --out scene.ply
+
+The recipe gives the model, the data and the losses; the loop is plain PyTorch, to copy and change.
+`qgs train` adds: resuming, several processes, mixed precision, schedules, evaluation, and a watch
+for steps that are not finite.
+"""
+
+import argparse
+from itertools import islice
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import qgs
+from qgs.composer import Recipe, resolve
+from qgs.contracts import Loss
+from qgs.data.sampling import Batch
+from qgs.data.stream import training_batches
+
+
+def loss_of(model: qgs.QueryGaussianModel, losses: dict[str, Loss], batch: Batch) -> Tensor:
+    """The recipe's losses, summed over the supervised layers with their weights."""
+    # In training mode the model decodes Gaussians after every supervised layer, not the last only.
+    prediction = model(batch.inputs)
+    total = torch.zeros(())
+    for number, weight in model.supervision.weights().items():
+        layer = prediction.layers[number]
+        rendering = model.render(layer.gaussians, batch.targets.cameras)
+        for loss in losses.values():
+            terms = loss(layer, rendering, batch.targets, batch.inputs)
+            total = total + weight * torch.stack([*terms.values()]).sum()
+    return total
+
+
+def train(recipe: Recipe, steps: int) -> qgs.QueryGaussianModel:
+    """`steps` of AdamW at a constant rate after a short warm-up."""
+    torch.manual_seed(recipe.seed)
+    model, losses = recipe.build_model().train(), recipe.build_losses()
+    decayed = [p for p in model.parameters() if p.ndim != 1]  # neither biases nor norms
+    others = [p for p in model.parameters() if p.ndim == 1]
+    groups = [{"params": decayed, "weight_decay": 0.05}, {"params": others, "weight_decay": 0.0}]
+    optimizer = torch.optim.AdamW(groups, lr=1e-3, betas=(0.9, 0.95))
+    warmup = torch.optim.lr_scheduler.LinearLR(optimizer, 0.01, total_iters=20)
+    # Batches are endless; batch k depends on the seed and k alone.
+    batches = training_batches(recipe.build_data(), recipe.views, batch_size=2, seed=recipe.seed)
+    for step, batch in enumerate(islice(batches, steps)):
+        loss = loss_of(model, losses, batch)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        warmup.step()
+        if step % 10 == 0:
+            print(f"step {step:5}  loss {loss.item():.4f}", flush=True)
+    batches.close()
+    return model.eval()
+
+
+def main() -> None:
+    """Train, reconstruct the first test scene, write its Gaussians and the model's checkpoint."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recipe", nargs="?", default="recipes/tiny/locus.yaml")
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--out", type=Path, default=Path("scene.ply"))
+    options = parser.parse_args()
+    recipe = resolve(options.recipe)
+    model = train(recipe, options.steps)
+    scene = recipe.build_data().scenes("test")[0]
+    frames = list(range(recipe.views.inputs))
+    photos = qgs.Views(scene.images(frames)[None], scene.cameras[frames][None])
+    result = model.reconstruct(photos)  # normalises the poses as in training
+    qgs.save_ply(result.in_photos_world, options.out)
+    qgs.save(model, options.out.with_suffix(".safetensors"))
+    print(f"{result.in_photos_world.count} Gaussians in {options.out}")
+
+
+if __name__ == "__main__":
+    main()
