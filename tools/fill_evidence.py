@@ -26,9 +26,24 @@ UNITS = {"noise": "degrees of noise", "views": "input views"}
 REGION = re.compile(r"(<!-- study: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
+REPEATED = re.compile(
+    r" \(the interval holds 0\)|^- (?:intervals: 95 %|each of \d+ verdicts).*\n?", re.M
+)
+"""What the page says once, in "How it was measured"."""
+
+
 def table(text: str) -> str:
-    """A table.md without padding in its cells, which would make long lines longer."""
-    lines = [re.sub(r" *\| *", " | ", line).strip() for line in text.splitlines()]
+    """A table.md without padding in its cells and without what the page says once."""
+    lines, skipped = [], None
+    for line in REPEATED.sub("", text).splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if "verdict" in cells:  # a table of hypotheses, all of the same seeds and scenes
+            skipped = cells.index("of")
+        elif len(cells) == 1:
+            skipped = None
+        if skipped is not None:
+            del cells[skipped]
+        lines.append(" | ".join(cells).strip())
     return "\n".join(re.sub(r"\|( :?)-+(:?) (?=\|)", r"|\1---\2 ", line) for line in lines) + "\n"
 
 
