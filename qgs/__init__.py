@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from qgs.analysis.trace import trace
     from qgs.composer import compose
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
-    from qgs.engine.refining import refine
+    from qgs.extensions import refine
     from qgs.io.checkpoint import load, save
     from qgs.io.ply import load_ply, save_ply
     from qgs.model import QueryGaussianModel
@@ -40,6 +40,7 @@ DISTRIBUTIONS = {
     }
     | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
+    "qgs.refiners": dict.fromkeys(("gaussians", "reconstruction"), "query-gaussians-refine"),
 }
 """This repository's other distributions, by entry point; messages name those that are missing."""
 
@@ -64,7 +65,7 @@ _ELSEWHERE = {
     "load": "qgs.io.checkpoint",
     "load_ply": "qgs.io.ply",
     "read_photos": "qgs.analysis.scenes",
-    "refine": "qgs.engine.refining",
+    "refine": "qgs.extensions",
     "save": "qgs.io.checkpoint",
     "save_ply": "qgs.io.ply",
     "trace": "qgs.analysis.trace",

@@ -1,10 +1,17 @@
 """Objects that installed distributions offer under an entry point group, found by metadata."""
 
+from __future__ import annotations
+
 import os
 import sys
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from qgs import DISTRIBUTIONS
+
+if TYPE_CHECKING:  # types import torch, which `qgs --help` does without
+    from qgs.types import Gaussians, Views
 
 T = TypeVar("T")
 
@@ -31,6 +38,27 @@ def load(entry: EntryPoint, base: type[T]) -> type[T]:
     if not (isinstance(offered, type) and issubclass(offered, base)):
         raise ExtensionError(f"{where} is no subclass of {base.__name__}: update it")
     return offered
+
+
+def function(group: str, name: str) -> Any:
+    """The function that entry point `name` of `group` offers.
+
+    Raises ExtensionError with the distribution to install where none does.
+    """
+    for entry in installed(group):
+        if entry.name == name:
+            return entry.load()
+    missing = DISTRIBUTIONS[group][name]
+    raise ExtensionError(f"this needs {missing}: run `pip install {missing}`")
+
+
+def refine(gaussians: Gaussians, views: Views, seconds: float, **options: Any) -> Any:
+    """Optimise Gaussians (1, G) of one scene on its photos `views` (1, V) for some seconds.
+
+    Returns a `qgs_refine.RefinedScene`, whose `gaussians` are the result; `options` as in
+    `qgs_refine.refine`. Raises ExtensionError where query-gaussians-refine is not installed.
+    """
+    return function("qgs.refiners", "gaussians")(gaussians, views, seconds, **options)
 
 
 @lru_cache(maxsize=16)

@@ -31,6 +31,7 @@ PLUGINS = (
     "datatools",
     "viewer",
     "studies",
+    "refine",
     "bench",
     "plugintools",
 )

@@ -21,8 +21,6 @@ from qgs.data.sampling import (
     moments,
     own_world,
     spread,
-    training_frames,
-    views_in,
 )
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import (
@@ -45,7 +43,7 @@ from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
 from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Gaussians, Prediction, Rendering, Views
+from qgs.types import Cameras, Gaussians, Prediction, Rendering
 from qgs.wording import listed, numbered
 
 ORBIT_FRAMES = 48
@@ -298,22 +296,6 @@ def remarks_on(
         result.worse_than_nearest,
     )
     return [*filter(None, said)]
-
-
-def refinement_photos(
-    scene: Scene, start: Reconstruction, inputs_only: bool
-) -> tuple[Sample, Views, list[int]]:
-    """The sample of `start` at the size of `scene`, and the photos to refine on with their frames.
-
-    These are the inputs, or all photos that are neither compared with nor held out of training.
-    """
-    inputs, targets = start.sample.input_frames, start.sample.target_frames
-    usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs} - {*targets}
-    frames = sorted(usable)
-    every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
-    photos, compared = every.select(slice(len(frames))), every.select(slice(len(frames), None))
-    own = photos.select([frames.index(frame) for frame in inputs])
-    return replace(start.sample, inputs=own, targets=compared), photos, frames
 
 
 def _cameras(sample: Sample) -> Cameras:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from qgs.cli.options import SET_HELP, Checkpoint, Device, Size, Tune, parse_size, tuning_settings
+from qgs.extensions import function
 from qgs.wording import listed, numbered
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.contracts import Scene
     from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
     from qgs.types import Gaussians
@@ -90,6 +90,7 @@ def reconstruct(
         refine,
         {"--refine-size": fine, "--refine-inputs": refine_inputs or None, "--gaussians": gaussians},
     )
+    refiner = function("qgs.refiners", "reconstruction") if refine else None
 
     from rich.console import Console
 
@@ -98,10 +99,8 @@ def reconstruct(
     from qgs.analysis.scenes import chosen_scene, frame_list
     from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
-    from qgs.engine.growth import refuse_too_many
     from qgs.io.checkpoint import load
 
-    refuse_too_many(gaussians or 0)
     console = Console()
     model = load(checkpoint, choose_device(device))
     chosen = tuning_settings(tune)
@@ -116,10 +115,13 @@ def reconstruct(
     result = replace(result, remarks=remarks_on(result, scene, model, recipe.views))
     show(result, "feed-forward" if refine else "", console)
     paths = write_reconstruction(model, result, out)
-    if refine:
+    if refiner:
         if fine is not None:
             scene, seen = chosen_scene(recipe, photos, fine, scene_name)
-        better = refined(model, scene, result, refine, gaussians, refine_inputs, seen, console)
+        better = refiner(
+            result, scene, refine, count=gaussians, inputs_only=refine_inputs, seen=seen,
+            console=console,
+        )  # fmt: skip
         show(better, "refined", console)
         paths += write_reconstruction(model, better, out / "refined")
     for path in paths:
@@ -152,35 +154,6 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
     """Print the scores and the remarks of `result`."""
     console.print(score_table(result, what))
     console.print("\n".join(result.remarks), soft_wrap=True, highlight=False, markup=False)
-
-
-def refined(
-    model: QueryGaussianModel, scene: Scene, start: Reconstruction, seconds: float,
-    count: int | None, inputs_only: bool, seen: Sequence[int], console: Console,
-) -> Reconstruction:  # fmt: skip
-    """The reconstruction `start`, refined on photos of `scene` at its size; see `qgs.refine`."""
-    from qgs.analysis.reconstruction import reconstruct, refinement_photos
-    from qgs.engine.refining import refine
-
-    sample, photos, frames = refinement_photos(scene, start, inputs_only)
-    before = start.gaussians
-    compared = sample.targets if sample.target_frames else None
-    result = refine(
-        before, photos, seconds, count=count, compared=compared,
-        renderer=model.renderer, console=console,
-    )  # fmt: skip
-    ended = f", ended by {result.stopped_by}" if result.stopped_by else ""
-    height, width = photos.cameras.size
-    console.print(
-        f"refined for {result.seconds:.1f} s{ended}: {result.steps} steps on {len(frames)} photos "
-        f"of {width} x {height} pixels, {before.count:,} -> {result.gaussians.count:,} Gaussians",
-        highlight=False,
-    )
-    record = {"seconds": result.seconds, "steps": result.steps, "frames": frames}
-    record |= {"photos": [scene.frame_name(frame) for frame in frames]}
-    record |= {"stopped_by": result.stopped_by, "curve": [asdict(p) for p in result.curve]}
-    found = reconstruct(model, sample, start.world, seen, result.gaussians, start.tuning, record)
-    return replace(found, remarks=[*filter(None, [found.worse_than_nearest])])
 
 
 def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:

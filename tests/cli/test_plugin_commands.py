@@ -12,6 +12,7 @@ from commands import run_qgs
 from qgs import DISTRIBUTIONS
 from qgs.cli import COMMANDS
 from qgs.cli.plugin_commands import GROUP, HELP
+from qgs.extensions import ExtensionError, function
 
 Offer = Callable[..., None]
 APP = """
@@ -111,3 +112,9 @@ def test_a_command_of_this_repository_names_its_distribution(
     assert "run `pip install query-gaussians-bench`" in str(result.exception)
     assert run_qgs("nothing").exit_code == 2
     assert DISTRIBUTIONS[GROUP].keys().isdisjoint(COMMANDS)
+
+
+def test_a_function_of_a_missing_distribution_says_what_to_install(monkeypatch) -> None:
+    monkeypatch.setattr("qgs.extensions.installed", lambda group: ())
+    with pytest.raises(ExtensionError, match="pip install query-gaussians-refine"):
+        function("qgs.refiners", "gaussians")

@@ -1,4 +1,4 @@
-"""Gaussians on what photos show, at depths where other photos show the same: a plane sweep.
+"""Gaussians at pixels of photos, at the depth that other photos confirm: a plane sweep.
 
 Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with patches along rays.
 """
@@ -11,22 +11,22 @@ from torch import Tensor
 
 from qgs.types import Cameras, Gaussians, Views
 
-_DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0  # how many are tried, and between which, of the size
-_OTHERS = 6  # photos that a pixel is compared with; of these, the half that fits best counts
-_APART, _TURNED = 0.06, 10.0  # best distance of their cameras, of the size; weight of 1 - cosine
-_PATCH = 1  # pixels about a pixel that are compared too
-_MOST_ODD = 0.3  # of a difference of colours, at most; half of it where a photo does not see it
-_NO_EVIDENCE = 1e-4  # per e-fold of depth away from the size: decides where no photo does
+_DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0  # number of hypotheses; their range over the size
+_OTHERS = 6  # photos that a pixel is compared with; the better half counts, for occlusions
+_APART, _TURNED = 0.06, 10.0  # best baseline over the size; weight of 1 - cosine of the axes
+_PATCH = 1  # radius in pixels of the compared patch
+_MAX_COST = 0.3  # truncation of a difference of colours; half of it outside a photo
+_NO_EVIDENCE = 1e-4  # cost per e-fold of depth away from the size: breaks ties only
 _AT_ONCE = 1024  # pixels, so that memory stays within 0.3 GB
-_OPACITY, _PIXELS = 0.5, 2.0  # of the Gaussians; their standard deviation in pixels
+_OPACITY, _PIXELS = 0.5, 2.0  # opacity of the Gaussians; standard deviation in pixels
 
 
 @torch.no_grad()
 def swept(views: Views, count: int, size: float, generator: torch.Generator) -> Gaussians:
-    """Gaussians (1, count) at pixels drawn from the photos `views` (1, V), of their colours.
+    """Gaussians (1, count) at random pixels of the photos `views` (1, V), with their colours.
 
-    size: about the distance of the scene from the cameras, and the depth of a pixel that no other
-    photo shows.
+    size: approximate distance of the scene from the cameras; also the depth of pixels that no
+    other photo shows.
     """
     (height, width), device = views.cameras.size, views.images.device
     of_photo = height * width
@@ -45,7 +45,7 @@ def swept(views: Views, count: int, size: float, generator: torch.Generator) -> 
 def _on_photo(
     views: Views, photo: int, pixels: Tensor, size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, scales and colors (n, 3) at `pixels` (n,), counted by rows, of one photo."""
+    """Means, scales and colors (n, 3) at `pixels` (n,) of one photo, in row-major order."""
     cameras, width = views.cameras, views.cameras.size[1]
     rows, columns = pixels // width, pixels % width
     pose = cameras.c2w[0, photo]
@@ -57,14 +57,14 @@ def _on_photo(
 
 
 def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
-    """World directions (..., 3) of pixels (...), of depth 1 before the camera."""
+    """World directions (..., 3) of pixels (...), scaled to depth 1 in the camera."""
     fx, fy, cx, cy = cameras.intrinsics[0, photo]
     x, y = (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy
     return torch.stack([x, y, torch.ones_like(x)], -1) @ cameras.c2w[0, photo, :3, :3].T
 
 
 def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
-    """Depth (n,) of pixels (n,) of one photo at which the others look most alike."""
+    """Depth (n,) of pixels (n,) of one photo, of least cost against the other photos."""
     cameras, (height, width) = views.cameras, views.cameras.size
     logs = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _DEPTHS, device=rows.device)
     tried, others = size * logs.exp(), _others(cameras, photo, size)
@@ -84,14 +84,14 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
         seen = (z >= ahead) & (at.abs() < 1).all(-1)
         flat = at.flatten(0, 1)[None]
         found = F.grid_sample(views.images[:, other], flat, "bilinear", "border", False)
-        odd = (found.view(*own.shape, _DEPTHS) - own[..., None]).abs().mean(0).clamp_max(_MOST_ODD)
-        costs.append(torch.where(seen, odd, _MOST_ODD / 2).mean(1))
+        cost = (found.view(*own.shape, _DEPTHS) - own[..., None]).abs().mean(0)
+        costs.append(torch.where(seen, cost.clamp_max(_MAX_COST), _MAX_COST / 2).mean(1))
     best = torch.stack(costs).topk((len(costs) + 1) // 2, 0, largest=False).values.mean(0)
     return tried[(best + _NO_EVIDENCE * logs.abs()).argmin(-1)]
 
 
 def _others(cameras: Cameras, photo: int, size: float) -> list[int]:
-    """Photos that see what `photo` sees, from a little beside it; itself where it is alone."""
+    """Photos with the best baseline and direction for matching `photo`; itself if alone."""
     eyes, axes = cameras.c2w[0, :, :3, 3], cameras.c2w[0, :, :3, 2]
     apart = (eyes - eyes[photo]).norm(dim=-1) / size
     unlike = (apart.clamp_min(1e-6) / _APART).log().abs() + _TURNED * (1 - axes @ axes[photo])

@@ -1,7 +1,7 @@
-"""Growth of optimised Gaussians: live ones split, dead ones move to where they are of use.
+"""Growth of optimised Gaussians: opaque ones are split, dead ones become copies of them.
 
-Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), without its
-noise: copies of a Gaussian lie a part of its size beside it, so that they can part.
+Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). In place of its
+noise, a copy is displaced by a fraction of its parent's size, so that the two can separate.
 """
 
 from collections.abc import Mapping
@@ -11,35 +11,21 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.memory import refuse_beyond_memory
 from qgs.types import Gaussians
 
 DEAD = 0.005
-"""Opacity below which a Gaussian moves, as in the paper. More would take away what is seen: of
-fog that stands before an object every single one is faint."""
-_BESIDE = 0.2  # of a parent's scales: how far a copy lies from it
+"""Opacity below which a Gaussian is relocated, as in the paper. A higher threshold deletes
+semi-transparent fog, whose single Gaussians are all faint."""
+_BESIDE = 0.2  # displacement of a copy over its parent's scales
 _MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
 
 
-def refuse_too_many(count: int, gaussians: Gaussians | None = None) -> None:
-    """Raise TooLargeError when memory does not hold `count` Gaussians while they are optimised.
+class FreeGaussians:
+    """Gaussians (1, G) as unbounded parameters (G, ...), with Adam.
 
-    gaussians: (1, G), what they are like; None for those without harmonics and features.
-    """
-    given = [] if gaussians is None else [gaussians.sh, gaussians.features]
-    more = sum(x[0, :1].numel() for x in given if x is not None)
-    numbers = (14 + more) * 4  # of a Gaussian; each with its gradient and two moments
-    refuse_beyond_memory(
-        "a refinement", {f"{count} Gaussians": 4 * numbers * count}, "Take fewer (--gaussians)."
-    )
-
-
-class Leaves:
-    """Gaussians (1, G) as tensors (G, ...) without bounds, and Adam on them.
-
-    values: means, log_scales, quats, opacity_logits, color_logits (beside sh, which allow any
-    colour, colors as they are), and sh and features if there are, by name.
+    values: by name, means, log_scales, quats, opacity_logits, color_logits, and sh and features if
+    given. With sh, which allow any colour, `colors` takes the place of color_logits.
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
@@ -63,7 +49,7 @@ class Leaves:
 
     @property
     def count(self) -> int:
-        """Gaussians at present."""
+        """Number of Gaussians."""
         return len(self.values["means"])
 
     def gaussians(self) -> Gaussians:
@@ -76,10 +62,10 @@ class Leaves:
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:
-        """Relocate the dead, and add Gaussians up to `count`; those drawn by opacity are split.
+        """Relocate dead Gaussians and add new ones up to `count`, as copies of others.
 
-        Parents and copies share the parent's opacity and shrink, so that the rendering stays.
-        Moments of all of them start anew. Where all are faint, none is dead.
+        Parents are drawn by opacity. Parent and copies share its opacity and shrink, so that the
+        rendering stays the same, and their moments restart at 0. If all are faint, none is dead.
         """
         opacities = self.values["opacity_logits"].sigmoid()
         faint = (opacities < DEAD) & (opacities >= DEAD).any()
@@ -105,7 +91,7 @@ class Leaves:
             self.optimizer.state[leaf] = state
 
     def _split(self, parents: Tensor) -> None:
-        """Give every parent the opacity and the size that it shares with its copies."""
+        """Set opacity and scale of every parent to the values that its copies get too."""
         shares = torch.bincount(parents, minlength=self.count) + 1
         chosen = (shares > 1).nonzero()[:, 0]
         logits = self.values["opacity_logits"]
@@ -114,7 +100,7 @@ class Leaves:
         self.values["log_scales"][chosen] += shrink.log()[:, None]
 
     def _places_in(self, parents: Tensor, generator: torch.Generator) -> Tensor:
-        """A point (n, 3) drawn about the centre of each of `parents`."""
+        """Points (n, 3), each drawn around the centre of one of `parents` (n,)."""
         values = self.values
         turns = quat_to_matrix(F.normalize(values["quats"][parents], dim=-1))
         drawn = torch.randn(len(parents), 3, 1, generator=generator).to(turns)
@@ -123,10 +109,11 @@ class Leaves:
 
 
 def shared(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity of each of `shares` equal Gaussians in place of one, and the factor of its scales.
+    """Opacity and scale factor of N equal Gaussians that together look like one.
 
-    opacities: (n,). shares: (n,) integers, counted as _MOST_COPIES where they are more.
-    Equation 9 of the paper: the sum over k of C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1), in float64.
+    opacities: (n,), of the one. shares: (n,) integers N, at most _MOST_COPIES of which count.
+    Equation 9 of the paper: the sum over k of C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1). In float64,
+    because terms of alternating sign cancel.
     """
     shares = shares.clamp_max(_MOST_COPIES).double()
     old = opacities.double()

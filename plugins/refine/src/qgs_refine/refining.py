@@ -1,8 +1,8 @@
 """Refinement: Gaussians of one scene, optimised on its photos as 3D Gaussian splatting does.
 
-Half of them make room for Gaussians on what the photos show, whose depth is found by matching. A
-model that does not know such scenes puts things where there is nothing, and nothing where there are
-things; steps of an optimiser are too short to bring them there.
+Half of the predicted Gaussians are replaced by Gaussians on surfaces that the photos show, whose
+depth is found by matching. On unfamiliar scenes a model leaves floaters and holes that gradient
+steps, which are short, cannot repair.
 """
 
 import math
@@ -16,22 +16,24 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from qgs.engine.distributed import StopRequest, stop_requests
-from qgs.engine.growth import Leaves, refuse_too_many
-from qgs.engine.sweeping import swept
 from qgs.engine.tracking import TrainingProgress
 from qgs.losses.photometric import mean_squared_error, mean_ssim
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views, concatenated, map_tensors, named_tensors
+from qgs_refine.growth import FreeGaussians
+from qgs_refine.sweeping import swept
 
 _RATES = {"means": 3.5e-3, "log_scales": 2e-2, "quats": 5e-3}  # of means: of the scene's size
 _RATES |= {"opacity_logits": 0.05, "color_logits": 2.5e-2}
 _RATES |= {"colors": 6e-3}  # beside `sh`: as the logits move a colour of one half
-_RATES |= {"sh": 1.25e-3, "features": 0.0}  # a twentieth of the logits', as 3DGS; no photo has any
-_LAST, _LAST_OF_MEANS = 0.1, 0.01  # of the rates, at the end
+_RATES |= {"sh": 1.25e-3, "features": 0.0}  # a twentieth of the logits', as 3DGS; kept as they are
+_LAST, _LAST_OF_MEANS = 0.1, 0.01  # final learning rates over the first
 _SSIM = 0.25  # weight beside the mean squared error
-_SMALL, _SMALL_OF_FEW = 0.06, 0.4  # weight of mean opacity and mean scale; the second over photos
-_GROWN, _SETTLED = 0.6, 0.8  # of the budget: the wanted number is there; none is moved any more
+# Weight of mean opacity and mean scale: at least the first, else the second over the number of
+# photos, because few photos leave more freedom to fill space with fog.
+_SMALL, _SMALL_OF_FEW = 0.06, 0.4
+_GROWN, _SETTLED = 0.6, 0.8  # parts of the budget: growth is complete; relocation ends
 _STEPS_BETWEEN_GROWTHS = 40
 _LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))  # part of the resolution, up to this part of the budget
 _LEAST_SIDE = 64  # pixels: no level is smaller
@@ -40,7 +42,7 @@ _POINTS = 12  # of the curve
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """How far a refinement was. psnr: dB, mean over the photos that it is compared with."""
+    """State of a refinement. psnr: dB, mean over the `compared` photos."""
 
     seconds: float
     step: int
@@ -49,10 +51,10 @@ class CurvePoint:
 
 
 @dataclass(frozen=True)
-class Refinement:
+class RefinedScene:
     """Refined Gaussians (1, G). curve: from the start on; empty without photos to compare with.
 
-    seconds: on the clock, evaluations left out. stopped_by: name of the signal that ended it early.
+    seconds: of optimisation, without evaluations. stopped_by: the signal that ended it early.
     """
 
     gaussians: Gaussians
@@ -71,31 +73,29 @@ def refine(
     compared: Views | None = None,
     renderer: nn.Module | None = None,
     console: Console | None = None,
-) -> Refinement:
-    """Go on from `gaussians` (1, G) by optimising them on the photos `views` (1, V).
+) -> RefinedScene:
+    """Optimise `gaussians` (1, G) on the photos `views` (1, V) of their scene.
 
     seconds: of optimisation, counted after the first step, in which kernels compile. count:
-    Gaussians wanted at the end, as many as given by default; more grow within the first part of the
-    time. Half of those at the start are the most opaque of the given ones; the others stand where
-    the photos agree, and finding them counts. compared: photos (1, W) for the curve, never
-    optimised on. renderer: `qgs/auto` by default. console: where progress is shown; nowhere by
-    default. The first Ctrl-C finishes the step and returns what there is. Any world will do: its
-    size is measured by the distance of the Gaussians from the cameras.
+    Gaussians at the end, by default as many as given; they grow in the first part of the time.
+    The optimisation starts from the most opaque half of the given Gaussians and as many at pixels,
+    where the photos agree on a depth. compared: photos (1, W) for the curve, never optimised on.
+    renderer: `qgs/auto` by default. console: where progress is shown; nowhere by default. The first
+    Ctrl-C finishes the step and returns the result so far. Works in any world: its size is measured
+    by the distance of the Gaussians from the cameras.
 
-    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite;
-    TooLargeError for more of them than memory holds.
+    Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
     """
     wanted = gaussians.count if count is None else count
     _refuse_unusable(gaussians, views, seconds, wanted)
-    refuse_too_many(wanted, gaussians)
     quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
     with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
         renderer = renderer or AutoRenderer(AutoRenderer.Config())
         run = _Run(gaussians, views, seconds, wanted, renderer)
         curve = list(run.curve(compared, progress, stop))
         name = stop.signal.name if stop.signal else None
-        refined = map_tensors(Tensor.detach, run.leaves.gaussians())
-        return Refinement(refined, curve, run.step, run.spent, name)
+        refined = map_tensors(Tensor.detach, run.free.gaussians())
+        return RefinedScene(refined, curve, run.step, run.spent, name)
 
 
 class _Run:
@@ -113,7 +113,7 @@ class _Run:
         gaussians = half_swept(gaussians, self.levels[0][0], self.start, self.generator)
         self.size = distance(gaussians, views)
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
-        self.leaves = Leaves(gaussians, self.rates)
+        self.free = FreeGaussians(gaussians, self.rates)
         self.seconds, self.step, self.grown = seconds, 0, 0
         self.spent = perf_counter() - began
         self.order: list[int] = []
@@ -121,7 +121,7 @@ class _Run:
     def curve(
         self, compared: Views | None, progress: TrainingProgress, stop: StopRequest
     ) -> Iterator[CurvePoint]:
-        """Optimise until the time is used or a stop is asked for; points of the curve between."""
+        """Optimise until the time is used or a stop is requested; yield points of the curve."""
         if compared is not None:
             quality = mean_psnr(self.given, compared, self.renderer)
             yield CurvePoint(0.0, 0, self.given.count, quality)
@@ -136,55 +136,55 @@ class _Run:
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
             progress.update(self.step, loss, quality, self.step, self.spent, used)
-        if not stop and self.leaves.count < self.wanted:  # a budget of a few steps
-            self.leaves.grow(self.wanted, self.generator)
+        if not stop and self.free.count < self.wanted:  # the budget was a few steps
+            self.free.grow(self.wanted, self.generator)
         if compared is not None:
             yield self._point(compared)
 
     def _point(self, compared: Views) -> CurvePoint:
-        quality = mean_psnr(self.leaves.gaussians(), compared, self.renderer)
-        return CurvePoint(self.spent, self.step, self.leaves.count, quality)
+        quality = mean_psnr(self.free.gaussians(), compared, self.renderer)
+        return CurvePoint(self.spent, self.step, self.free.count, quality)
 
     def _optimise(self) -> tuple[float, float]:
-        """One step on one photo, and growth where it is due; the loss and PSNR before it."""
+        """One step on one photo, then growth if it is due; the loss and PSNR before the step."""
         used = min(self.spent / self.seconds, 1.0)
-        for group in self.leaves.optimizer.param_groups:
+        for group in self.free.optimizer.param_groups:
             name = group["name"]
             group["lr"] = self.rates[name] * (_LAST_OF_MEANS if name == "means" else _LAST) ** used
         views = next(views for views, end in self.levels if used < end or end == 1)
         if not self.order:
             self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
         photo = views.select([self.order.pop()])
-        gaussians = self.leaves.gaussians()
+        gaussians = self.free.gaussians()
         rgb = self.renderer(replace(gaussians, features=None), photo.cameras).rgb
         error = mean_squared_error(rgb, photo.images)
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
         loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread
-        self.leaves.optimizer.zero_grad()
+        self.free.optimizer.zero_grad()
         loss.backward()
-        self.leaves.optimizer.step()
+        self.free.optimizer.step()
         self.step += 1
         self._grow(used)
         return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))
 
     def _grow(self, used: float) -> None:
-        """Relocate and add Gaussians where that is due after a step that began at `used`."""
+        """Relocate and add Gaussians if that is due; used: part of the budget spent so far."""
         regular = self.step - self.grown >= _STEPS_BETWEEN_GROWTHS and used < _SETTLED
-        if regular or (used >= _GROWN and self.leaves.count < self.wanted):
+        if regular or (used >= _GROWN and self.free.count < self.wanted):
             self.grown = self.step
             share = min(used / _GROWN, 1.0)
             now = round(self.start * (self.wanted / self.start) ** share)
-            self.leaves.grow(now, self.generator)
+            self.free.grow(now, self.generator)
 
 
 def half_swept(
     gaussians: Gaussians, views: Views, count: int, generator: torch.Generator
 ) -> Gaussians:
-    """The most opaque Gaussians (1, G), half of `count`, and as many where the photos agree.
+    """`count` Gaussians (1, count): half the most opaque given ones, half swept from the photos.
 
-    With one photo, which agrees with none, `count` of the most opaque. Spherical harmonics and
-    features of those on the photos are 0.
+    A single photo has no depth, so that all are given ones. Spherical harmonics and features of
+    the swept ones are 0.
     """
     new = count // 2 if views.images.shape[1] > 1 else 0
     kept = gaussians.most_opaque(count - new)
@@ -228,9 +228,9 @@ def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: 
     given = (*gaussians.means.shape[:2], *views.images.shape[:2])
     if given[0] != 1 or given[2] != 1 or 0 in given or not seconds > 0 or count < 1:
         raise ValueError(
-            "refinement takes Gaussians (1, G) and photos (1, V) of one scene, and some time; got "
-            "{} scenes of {} Gaussians, {} scenes of {} photos".format(*given)
-            + f", {seconds:g} seconds, {count} Gaussians wanted: give at least one of each"
+            "refinement takes Gaussians (1, G) and photos (1, V) of one scene; got {} scenes of "
+            "{} Gaussians, {} scenes of {} photos".format(*given)
+            + f", {seconds:g} seconds, count={count}: give at least one of each"
         )
     if not all(bool(tensor.isfinite().all()) for _, tensor in named_tensors(gaussians)):
         raise ValueError(

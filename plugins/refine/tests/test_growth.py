@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-
-from qgs.engine.growth import shared
+from qgs_refine.growth import shared
 
 POSITIONS = torch.linspace(-12, 12, 20001, dtype=torch.float64)
 

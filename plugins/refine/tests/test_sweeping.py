@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from qgs_refine.refining import half_swept
+from qgs_refine.sweeping import swept
 from torch import Tensor
 
-from qgs.engine.refining import half_swept
-from qgs.engine.sweeping import swept
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras, Gaussians, Views
 
