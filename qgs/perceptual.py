@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from qgs.contracts import MissingExtraError
 from qgs.geometry.precision import full_precision
 
 _VGG_FILE = "vgg16-397923af.pth"  # torchvision's VGG-16 in torch's cache
@@ -26,16 +27,7 @@ SMALLEST_SIDE = 2 ** (len(_BLOCKS) - 1)
 
 
 class PerceptualDistance(nn.Module):
-    """LPIPS of images against the truth, with fixed weights; nothing is downloaded.
-
-    unavailable: why it cannot be computed here, "" if it can.
-    """
-
-    def __init__(self, weights: str | None) -> None:
-        """weights: file of VGG-16 (safetensors, or torchvision's); None for torch's cache."""
-        super().__init__()
-        self.unavailable = self._load(weights)
-        self.requires_grad_(False)
+    """LPIPS of images against the truth, with fixed weights; `load` reads them."""
 
     @full_precision
     def forward(self, images: Tensor, truth: Tensor) -> Tensor:
@@ -65,19 +57,23 @@ class PerceptualDistance(nn.Module):
             found.append(x / (x.norm(dim=1, keepdim=True) + _EPS))
         return found
 
-    def _load(self, weights: str | None) -> str:
-        """Read the weights; why they cannot be read, "" if they were."""
+    def load(self, weights: str | None) -> None:
+        """Read the weights; nothing is downloaded.
+
+        weights: file of VGG-16 (safetensors, or torchvision's); None for the one in torch's cache.
+        Raises MissingExtraError where they are not there or do not fit.
+        """
         package = find_spec("lpips")
         if package is None or not package.submodule_search_locations:
-            return (
-                "the package lpips, which holds its weights, is not installed: "
+            raise MissingExtraError(
+                "the package lpips, which holds the weights of LPIPS, is not installed: "
                 'pip install "query-gaussians[lpips]"'
             )
         linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
         vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / _VGG_FILE
         if not vgg.is_file():
             place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
-            return (
+            raise MissingExtraError(
                 f"there are no VGG-16 weights {place}: download torchvision's {_VGG_FILE} and name "
                 "it in the option `weights` of qgs/lpips"
             )
@@ -91,11 +87,11 @@ class PerceptualDistance(nn.Module):
             names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
             self.linear = nn.ParameterList([factors[name].float() for name in names])
         except (KeyError, RuntimeError, ValueError, OSError) as error:
-            return (
+            raise MissingExtraError(
                 f"{vgg.name} or {linear.name} does not hold the weights of VGG-16 and LPIPS 0.1 "
                 f"({type(error).__name__}: {error})"
-            )
-        return ""
+            ) from error
+        self.requires_grad_(False)
 
 
 def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]:

@@ -247,7 +247,7 @@ class ImageMemory(TensorContainer):
     grid: (V, H/P, W/P), M is its product; tokens are ordered view, row, column. None for tokens
         that are no patches, such as learned latents.
 
-    `Encoder.provides` says which of them there are.
+    its `writes` say which of them there are.
     """
 
     features: Tensor
@@ -268,7 +268,7 @@ class ImageMemory(TensorContainer):
             raise ValueError(f"ImageMemory.grid {self.grid} must hold the {tokens} tokens")
 
     def __getitem__(self, name: str) -> Tensor:
-        """A tensor that a component `requires`, such as "keys"; KeyError where there is none."""
+        """A tensor that a component `reads`, such as "keys"; KeyError where there is none."""
         part = getattr(self, name, None)
         if name == "grid" and part is not None:
             raise KeyError("the grid of an image memory is no tensor: read `memory.grid`")

@@ -50,7 +50,7 @@ class TapeSource(SceneSource):
         return self._tapes
 
 
-plugin = Plugin("tapes", 2, (TapeSource,))
+plugin = Plugin("tapes", 1, (TapeSource,))
 
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,7 +151,10 @@ def _type(option: Schema) -> str:
 def _fields(component: type[Component]) -> Iterator[str]:
     """What it requires and provides with default options; nothing where that is nothing."""
     config = default_config(component)
-    for word, declare in (("requires", component.requires), ("provides", component.provides)):
+    for word, declare in (
+        ("requires", component.fields_read),
+        ("provides", component.fields_written),
+    ):
         text = "depends on options"
         if config is not None:
             try:

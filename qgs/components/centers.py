@@ -1,7 +1,6 @@
 """`qgs/free` (TokenGS), `qgs/offset`: means from the head's offsets, anywhere in the world."""
 
 import math
-from typing import ClassVar
 
 import torch
 from pydantic import Field
@@ -34,7 +33,7 @@ def posact(
 class FreeCenters(Centers):
     """mean = posact(offset) + (0, 0, z_offset)."""
 
-    name: ClassVar[str] = "free"
+    name = "free"
 
     class Config(ComponentConfig):
         z_offset: float = 1.0
@@ -54,7 +53,7 @@ class FreeCenters(Centers):
 class OffsetCenters(Centers):
     """mean = offset + (0, 0, z_offset)."""
 
-    name: ClassVar[str] = "offset"
+    name = "offset"
 
     class Config(ComponentConfig):
         z_offset: float = 1.0

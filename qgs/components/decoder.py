@@ -1,8 +1,5 @@
 """The default decoder layer: attention by content alone, an MLP, no refinement (TokenGS)."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -14,17 +11,16 @@ from qgs.components.blocks import (
     SelfAttentionCore,
 )
 from qgs.contracts import (
-    MEMORY_FIELDS,
     AttentionWeights,
     ComponentConfig,
     CrossAttention,
     DecoderLayer,
     FeedForward,
-    Fields,
-    ModelComponent,
+    LayerParts,
     ModelDims,
     Refinement,
     SelfAttention,
+    memory_fields,
 )
 from qgs.types import ImageMemory, QueryState
 
@@ -32,23 +28,18 @@ from qgs.types import ImageMemory, QueryState
 class CrossSelfMlp(DecoderLayer):
     """Cross-attention, self-attention, MLP; each update is scaled and added (TokenGS release)."""
 
-    name: ClassVar[str] = "cross_self_mlp"
+    name = "cross_self_mlp"
     sublayers = ("cross_attention", "self_attention", "feed_forward")
 
-    def __init__(
-        self,
-        config: ComponentConfig,
-        dims: ModelDims,
-        sublayers: Mapping[str, ModelComponent],
-        layer_scale: float,
-    ) -> None:
-        super().__init__(config, dims, sublayers, layer_scale)
-        self.cross_attention = sublayers["cross_attention"]
-        self.cross_scale = LayerScale(dims.width, layer_scale)
-        self.self_attention = sublayers["self_attention"]
-        self.self_scale = LayerScale(dims.width, layer_scale)
-        self.feed_forward = sublayers["feed_forward"]
-        self.feed_forward_scale = LayerScale(dims.width, layer_scale)
+    def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
+        super().__init__(config, parts)
+        width, layer_scale = parts.dims.width, parts.layer_scale
+        self.cross_attention = parts.sublayers["cross_attention"]
+        self.cross_scale = LayerScale(width, layer_scale)
+        self.self_attention = parts.sublayers["self_attention"]
+        self.self_scale = LayerScale(width, layer_scale)
+        self.feed_forward = parts.sublayers["feed_forward"]
+        self.feed_forward_scale = LayerScale(width, layer_scale)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
@@ -61,7 +52,8 @@ class CrossSelfMlp(DecoderLayer):
 class ContentCrossAttention(CrossAttention):
     """By content alone: softmax(q k / sqrt(d)) v over all image tokens."""
 
-    name: ClassVar[str] = "content"
+    name = "content"
+    reads = memory_fields("keys", "values")
 
     class Config(ComponentConfig):
         norm_eps: float = Field(default=NORM_EPS, gt=0)
@@ -73,10 +65,6 @@ class ContentCrossAttention(CrossAttention):
         super().__init__(config, dims)
         self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
 
-    @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        return {name: MEMORY_FIELDS[name] for name in ("memory.keys", "memory.values")}
-
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
         return self.core(state.features, memory["keys"], memory["values"])
 
@@ -87,7 +75,7 @@ class ContentCrossAttention(CrossAttention):
 class ContentSelfAttention(SelfAttention):
     """Pre-norm self-attention over the N queries of a scene."""
 
-    name: ClassVar[str] = "content"
+    name = "content"
 
     class Config(ComponentConfig):
         norm_eps: float = Field(default=NORM_EPS, gt=0)
@@ -110,7 +98,7 @@ class ContentSelfAttention(SelfAttention):
 class MlpFeedForward(FeedForward):
     """LayerNorm, D -> ratio*D -> D with GELU."""
 
-    name: ClassVar[str] = "mlp"
+    name = "mlp"
 
     class Config(ComponentConfig):
         ratio: float = Field(default=4.0, ge=1)
@@ -130,7 +118,7 @@ class MlpFeedForward(FeedForward):
 class NoRefinement(Refinement):
     """Returns the state unchanged."""
 
-    name: ClassVar[str] = "none"
+    name = "none"
 
     def forward(self, state: QueryState) -> QueryState:
         return state

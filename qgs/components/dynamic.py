@@ -1,7 +1,6 @@
 """Queries of scenes that move: static ones, and others of the moment asked for (TokenGS 2026.6)."""
 
 from collections.abc import Iterable
-from typing import ClassVar
 
 import torch
 from pydantic import Field
@@ -39,7 +38,7 @@ _FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
 class DynamicQueries(Queries):
     """N learned vectors, of which the last ones also know the time that is asked for."""
 
-    name: ClassVar[str] = "dynamic"
+    name = "dynamic"
     reads_cameras = False
 
     class Config(ComponentConfig):
@@ -76,13 +75,8 @@ class DynamicQueries(Queries):
             )
 
     @classmethod
-    def provides(cls, config: Config) -> Fields:
+    def fields_written(cls, config: Config) -> Fields:
         return _FIELDS if config.dynamic else {}
-
-    @property
-    def count(self) -> int:
-        """N, static and dynamic."""
-        return self.config.count
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """With dynamic ones, the field `dynamic.moves` (B, N).
@@ -108,11 +102,8 @@ class DynamicQueries(Queries):
 class BlockCausalSelfAttention(ContentSelfAttention):
     """Dynamic queries read all queries, static ones the static ones alone."""
 
-    name: ClassVar[str] = "block_causal"
-
-    @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        return _FIELDS
+    name = "block_causal"
+    reads = _FIELDS
 
     def forward(self, state: QueryState) -> Tensor:
         return self.attention(self.norm(state.features), _readable(state))
@@ -124,8 +115,9 @@ class BlockCausalSelfAttention(ContentSelfAttention):
 class DynamicObjective(Objective):
     """One pass, judged as a whole and again by the Gaussians of its dynamic queries alone."""
 
-    name: ClassVar[str] = "dynamic"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    name = "dynamic"
+    reads = _FIELDS
+    scheduled = frozenset({"weight"})
     judges_inputs = False  # photos of other moments than the one that is reconstructed
 
     class Config(ComponentConfig):
@@ -133,10 +125,6 @@ class DynamicObjective(Objective):
         """Factor of the second judgement (TokenGS: 0.3 for 5,000 steps, to 0 over 10,000)."""
 
     config: Config
-
-    @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        return _FIELDS
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
         """The term `dynamic`, besides those of the whole."""

@@ -1,7 +1,6 @@
 """ViTs over the patches of all views together; `qgs/multiview_vit` (TokenGS release)."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import ClassVar
+from collections.abc import Iterable, Mapping
 
 import torch
 from einops import rearrange, repeat
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
 from qgs.components.times import TimeEmbedding, without_times
-from qgs.contracts import ComponentConfig, Encoder, ModelDims, Problem, RecipeContext
+from qgs.contracts import ModelDims, PatchEncoder, Problem, RecipeContext
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
 
@@ -29,7 +28,7 @@ class PatchEmbedding(nn.Module):
         self.proj = nn.Conv2d(channels, width, kernel_size=patch_size, stride=patch_size)
         self.norm = nn.LayerNorm(width, norm_eps)
 
-    def forward(self, images: Tensor) -> Tensor:
+    def forward(self, images: Tensor) -> Tensor:  # (X, C, H, W)
         return self.norm(rearrange(self.proj(images), "x d h w -> x (h w) d"))
 
 
@@ -52,27 +51,13 @@ class EncoderBlock(nn.Module):
         return x_BMD + self.scale2(self.mlp(self.norm2(x_BMD)))
 
 
-def undivided(patch: int, context: RecipeContext) -> Iterator[Problem]:
-    """The option `patch_size` where squares of `patch` pixels do not divide the data's images."""
-    size = context.image_size
-    if size and any(side % patch for side in size):
-        nearest = [max(round(side / patch), 1) * patch for side in size]
-        yield Problem(
-            "patch_size",
-            f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
-            f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
-        )
-
-
-class PatchViT(Encoder):
+class PatchViT(PatchEncoder):
     """RGB and Plücker embeddings added, then ViT blocks over the tokens of all views together.
 
     Subclasses say what of the blocks' outputs the memory holds.
     """
 
-    class Config(ComponentConfig):
-        patch_size: int = Field(default=8, ge=1)
-        """Side of a patch, pixels; must divide both sides of the image."""
+    class Config(PatchEncoder.Config):
         depth: int = Field(default=3, ge=0, le=256)
         """Number of ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
@@ -88,12 +73,11 @@ class PatchViT(Encoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.patch_size, eps = config.patch_size, config.norm_eps
-        self.rgb_embedding = PatchEmbedding(3, dims.width, config.patch_size, eps)
-        self.ray_embedding = PatchEmbedding(6, dims.width, config.patch_size, eps)
+        patch, eps = config.patch_size, config.norm_eps
+        self.rgb_embedding = PatchEmbedding(3, dims.width, patch, eps)
+        self.ray_embedding = PatchEmbedding(6, dims.width, patch, eps)
         if config.time_channels:
-            channels, patch = config.time_channels, config.patch_size
-            self.time_embedding = TimeEmbedding(channels, dims.width, patch)
+            self.time_embedding = TimeEmbedding(config.time_channels, dims.width, patch)
         self.blocks = nn.ModuleList(
             EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale, eps)
             for _ in range(config.depth)
@@ -102,7 +86,7 @@ class PatchViT(Encoder):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         yield from without_times(config.time_channels, context)
-        yield from undivided(config.patch_size, context)
+        yield from super().problems(config, context)
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Weights of smaller patches serve larger ones, if their side is a multiple.
@@ -114,16 +98,6 @@ class PatchViT(Encoder):
             name: _larger(kernel, own[name].shape[-1]) if name in _PATCH_KERNELS else kernel
             for name, kernel in learned.items()
         }
-
-    def grid(self, views: Views) -> tuple[int, int, int]:
-        """(V, H/P, W/P); raises ValueError when the patch does not divide the images."""
-        view_count, _, height, width = views.images.shape[1:]
-        if height % self.patch_size or width % self.patch_size:
-            raise ValueError(
-                f"images of {height} x {width} cannot be cut into patches of {self.patch_size}; "
-                "resize the views, or compose the model with another patch_size"
-            )
-        return view_count, height // self.patch_size, width // self.patch_size
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
         """Views (B, V) and their Plücker maps (B, V, 6, H, W) -> (B, M, D).
@@ -146,7 +120,7 @@ class PatchViT(Encoder):
 class MultiViewViT(PatchViT):
     """RGB and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
 
-    name: ClassVar[str] = "multiview_vit"
+    name = "multiview_vit"
 
     def __init__(self, config: PatchViT.Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -155,15 +129,14 @@ class MultiViewViT(PatchViT):
         self.k_norm = nn.LayerNorm(dims.width // dims.heads, config.norm_eps)
 
     def forward(self, views: Views) -> ImageMemory:
-        """The memory of all views; raises ValueError when the patch does not divide the images."""
         grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
         x_BMD = self.embed(views, plucker_BV6HW)
         for block in self.blocks:
             x_BMD = block(x_BMD)
         x_BMD = self.norm(x_BMD)
         keys, values = keys_and_values(x_BMD, self.kv_proj, self.k_norm)
-        rays = patch_rays(plucker_BV6HW, self.patch_size)
-        return ImageMemory(x_BMD, keys, values, rays, grid)
+        rays = patch_rays(plucker_BV6HW, self.config.patch_size)
+        return ImageMemory(features=x_BMD, keys=keys, values=values, patch_rays=rays, grid=grid)
 
 
 def keys_and_values(

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -22,7 +21,7 @@ CHANNELS = (3, 3, 3, 4, 1)
 class GaussianHead(Head):
     """D -> K * 14 linear, then the published activations in float32."""
 
-    name: ClassVar[str] = "gaussian_head"
+    name = "gaussian_head"
 
     class Config(ComponentConfig):
         """Defaults are the LocusGS release's."""
@@ -68,10 +67,6 @@ class GaussianHead(Head):
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         if not config.norm:
             yield from without_effect(config, ("norm_eps",), "`norm` is false")
-
-    @property
-    def gaussians_per_query(self) -> int:
-        return self.config.gaussians_per_query
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         raw_BNC = self.linear(self.norm(state.features))

@@ -3,8 +3,6 @@
 Axes: L latents, C = S D the width of the image tokens' features.
 """
 
-from typing import ClassVar
-
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -12,7 +10,7 @@ from torch import Tensor, nn
 from qgs.components.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.components.encoder import keys_and_values
 from qgs.components.multiscale import MultiscaleReadout
-from qgs.contracts import MEMORY_FIELDS, ComponentConfig, Fields, ModelDims
+from qgs.contracts import ModelDims, memory_fields
 from qgs.geometry.rays import plucker_rays
 from qgs.types import ImageMemory, Views
 
@@ -45,8 +43,9 @@ class LatentBottleneck(MultiscaleReadout):
     It has neither rays nor a grid, and as many tokens for two photos as for six.
     """
 
-    name: ClassVar[str] = "latent_bottleneck"
+    name = "latent_bottleneck"
     tunable = True
+    writes = memory_fields("features", "keys", "values")
 
     class Config(MultiscaleReadout.Config):
         depth: int = Field(default=12, ge=1, le=256)
@@ -72,11 +71,6 @@ class LatentBottleneck(MultiscaleReadout):
         )
         self.latent_kv_proj = nn.Linear(width, 2 * width)
         self.k_norm = nn.LayerNorm(width // dims.heads, eps)
-
-    @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        of_patches = ("memory.patch_rays", "memory.grid")
-        return {name: spec for name, spec in MEMORY_FIELDS.items() if name not in of_patches}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """No weight decay on the latents (TokenGS release)."""

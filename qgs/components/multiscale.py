@@ -1,7 +1,6 @@
 """`qgs/multiscale_vit`: keys and values from several blocks of a ViT (TokenGS 2026.6)."""
 
 from collections.abc import Iterable
-from typing import ClassVar
 
 import torch
 from pydantic import Field, field_validator
@@ -70,7 +69,7 @@ class MultiscaleReadout(PatchViT):
 class MultiscaleViT(MultiscaleReadout):
     """Keys and values of every image token from several blocks of a ViT."""
 
-    name: ClassVar[str] = "multiscale_vit"
+    name = "multiscale_vit"
 
     def __init__(self, config: MultiscaleReadout.Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -78,7 +77,7 @@ class MultiscaleViT(MultiscaleReadout):
         self.k_norm = nn.LayerNorm(dims.width // dims.heads, config.norm_eps)
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
+    def fields_written(cls, config: ComponentConfig) -> Fields:
         assert isinstance(config, MultiscaleReadout.Config)
         scales = len(config.blocks)
         wide = FieldSpec(("D" if scales == 1 else f"{scales}*D",))
@@ -89,5 +88,5 @@ class MultiscaleViT(MultiscaleReadout):
         grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
         x_BMC = self.features(views, plucker_BV6HW)
         keys, values = keys_and_values(x_BMC, self.kv_proj, self.k_norm)
-        rays = patch_rays(plucker_BV6HW, self.patch_size)
+        rays = patch_rays(plucker_BV6HW, self.config.patch_size)
         return ImageMemory(x_BMC, keys, values, rays, grid)

@@ -1,7 +1,5 @@
 """`qgs/one_pass`: one forward pass of all input views, judged on the target views (TokenGS)."""
 
-from typing import ClassVar
-
 from qgs.contracts import Objective, Outcome, Passes
 from qgs.types import Views
 
@@ -9,7 +7,7 @@ from qgs.types import Views
 class OnePass(Objective):
     """The recipe's losses of one prediction from all input views."""
 
-    name: ClassVar[str] = "one_pass"
+    name = "one_pass"
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
         return passes.judge(passes.predict(inputs), targets, inputs)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field
 from torch.optim import AdamW
@@ -24,7 +24,7 @@ class OneCycleAdamW(Optimizer):
     Raises ValueError when the warm-up fills all steps and no time budget shortens it.
     """
 
-    name: ClassVar[str] = "adamw"
+    name = "adamw"
 
     class Config(OptimizerConfig):
         """The learning rate, and AdamW's own options."""

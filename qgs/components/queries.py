@@ -1,7 +1,5 @@
 """`qgs/latent`: learned queries without a position (TokenGS)."""
 
-from typing import ClassVar
-
 import torch
 from pydantic import Field
 from torch import nn
@@ -13,7 +11,7 @@ from qgs.types import QueryState
 class LatentQueries(LearnedQueries):
     """N learned vectors, shared by all scenes, without a position."""
 
-    name: ClassVar[str] = "latent"
+    name = "latent"
 
     class Config(ComponentConfig):
         count: int = Field(default=4096, ge=1)
@@ -24,10 +22,6 @@ class LatentQueries(LearnedQueries):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
-
-    @property
-    def count(self) -> int:
-        return self.features.shape[0]
 
     def start(self, batch_size: int) -> QueryState:
         return QueryState(self.features.expand(batch_size, -1, -1))

@@ -1,7 +1,6 @@
 """`qgs/layers`: a set of supervised layers, later ones weighing more (LocusGS)."""
 
 from collections.abc import Iterable, Mapping
-from typing import ClassVar
 
 from pydantic import Field, field_validator
 
@@ -11,7 +10,7 @@ from qgs.contracts import ComponentConfig, OptionError, Problem, RecipeContext, 
 class LayerSupervision(Supervision):
     """The m-th of S supervised layers weighs m / (1 + ... + S)."""
 
-    name: ClassVar[str] = "layers"
+    name = "layers"
 
     class Config(ComponentConfig):
         layers: tuple[int, ...] = Field(default=(12,), min_length=1)

@@ -17,7 +17,9 @@ from qgs.composer.registry import BUILTIN, component_error, component_failure, p
 from qgs.composer.slots import SUBLAYER_SLOTS
 from qgs.contracts import (
     MEMORY_FIELDS,
+    Component,
     DecoderLayer,
+    LayerParts,
     ModelComponent,
     ModelDims,
     Optimizer,
@@ -69,7 +71,7 @@ def build_model(
             has = [slot for slot in SUBLAYER_SLOTS if ("model", *path, slot) in parts]
             sublayers = {slot: at(*path, slot) for slot in has}
             layer = parts["model", *path, "layer"]
-            decoder.append(build(layer, dims, sublayers, layer_scale))
+            decoder.append(build(layer, LayerParts(dims, sublayers, layer_scale)))
             refinements.append(at("decoder", "layers", index, "refinement"))
         model = QueryGaussianModel(
             encoder=encoder,
@@ -98,6 +100,8 @@ class ShapesAlone(TorchFunctionMode):
     ) -> Any:
         if func is torch.randn and not kwargs:
             func = torch.empty
+        elif func is torch.linspace:  # DINO's constructors read its numbers, which meta has not
+            kwargs = {"device": "cpu", **(kwargs or {})}
         elif (func is torch.cat or func in self.arithmetic) and len(args) == 2 and not kwargs:
             joined = func is torch.cat
             tensors = args[0] if joined else [x for x in args if type(x) not in (int, float)]
@@ -163,6 +167,18 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
     return built
 
 
+def load_pretrained(*parts: nn.Module) -> None:
+    """Call `load_pretrained` of every component; its MissingExtraError then names the component."""
+    for component in (module for part in parts for module in part.modules()):
+        on_meta = any(x.is_meta for x in component.parameters())
+        if isinstance(component, Component) and not on_meta:
+            try:
+                component.load_pretrained()
+            except MissingExtraError as error:
+                what = f"{component.slot} `{component.name}`"
+                raise MissingExtraError(f"{what} cannot be used: {error}") from error
+
+
 def _too_large(error: Exception) -> bool:
     """Whether torch or Python refused the size of a tensor; torch has no type for that."""
     words = "Storage size calculation overflowed", "Overflow when unpacking"
@@ -184,7 +200,7 @@ def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:
     if not isinstance(state, QueryState):
         return f"returns {type(state).__name__}, not a QueryState"
     found = ", ".join(state.fields) or "no field at all"
-    for name, spec in chosen.component.provides(chosen.config).items():
+    for name, spec in chosen.component.fields_written(chosen.config).items():
         says = f"says that it provides {name} ({spec}), but"
         if name not in state.fields:
             return f"{says} the state that it returns has {found}"

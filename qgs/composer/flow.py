@@ -42,11 +42,11 @@ _FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "los
 def check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
     """Report what is wrong with a component's options; whether its declarations can be read."""
     component, config, place = chosen.component, chosen.config, chosen.place
-    asked, failure, cause = "requires", None, None
+    asked, failure, cause = "fields_read", None, None
     try:
-        dict(component.requires(config))
-        asked = "provides"
-        provided = component.provides(config)
+        dict(component.fields_read(config))
+        asked = "fields_written"
+        provided = component.fields_written(config)
         beyond = provided.keys() - _writable(component, provided)
         if issubclass(component, Supervision):
             asked = "weights"
@@ -84,7 +84,7 @@ def _writable(component: type[Component], provided: Fields) -> Collection[str]:
         return [name for name in provided if not name.startswith(others)]
     if issubclass(component, Encoder | Head):
         return MEMORY_FIELDS if issubclass(component, Encoder) else GAUSSIAN_FIELDS
-    return Renderer.provides(Renderer.Config()) if issubclass(component, Renderer) else ()
+    return Renderer.fields_written(Renderer.Config()) if issubclass(component, Renderer) else ()
 
 
 def without_idle_sublayers(parts: Parts, depth: int, problems: Problems) -> Parts:
@@ -139,8 +139,8 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
     steps = list(_execution_order(parts, depth))
     told, whole = set[tuple[str, ...]](), True
     chosen_parts = [part for part in parts.values() if part]  # asked once, not for every layer
-    needs = {id(part): part.component.requires(part.config) for part in chosen_parts}
-    gives = {id(part): part.component.provides(part.config) for part in chosen_parts}
+    needs = {id(part): part.component.fields_read(part.config) for part in chosen_parts}
+    gives = {id(part): part.component.fields_written(part.config) for part in chosen_parts}
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     branch, branch_layer = dict(state), None
     for position, (chosen, layer) in enumerate(steps):
@@ -172,7 +172,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
 
 def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
     """Whether a component requires keys or values of the image memory."""
-    read = {name for part in parts.values() for name in part.component.requires(part.config)}
+    read = {name for part in parts.values() for name in part.component.fields_read(part.config)}
     return not read.isdisjoint({"memory.keys", "memory.values"})
 
 
@@ -186,7 +186,7 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     read = set[str]()
     for part in used.values():
         if not issubclass(part.component, Refinement):
-            read |= part.component.requires(part.config).keys()
+            read |= part.component.fields_read(part.config).keys()
     keepers = [c for c in used.values() if issubclass(c.component, Queries | Refinement)]
     queries = parts["model", "queries"]
     for name, spec in _offers(queries.component, queries.config).items():
@@ -196,8 +196,8 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
             f"set `{keeper.path}.{option}: {value}`"
             for keeper in {keeper.path: keeper for keeper in keepers}.values()
             for option, value, config in variants(keeper.config)
-            if name in keeper.component.provides(keeper.config)
-            if name not in keeper.component.provides(config)
+            if name in keeper.component.fields_written(keeper.config)
+            if name not in keeper.component.fields_written(config)
         ]
         advice = f"; to do without it, {' and '.join(changes)}" if changes else ""
         yield (
@@ -283,7 +283,7 @@ def _fixes(
                         break
     for option, value, config in variants(reader.config, ()):
         with suppress(Exception):  # what fails with this option is not suggested
-            if not missing.keys() & reader.component.requires(config).keys():
+            if not missing.keys() & reader.component.fields_read(config).keys():
                 names = " and no ".join(missing)
                 fixes[f"set `{reader.path}.{option}: {value}`, which needs no {names}"] = None
     return fixes
@@ -292,8 +292,8 @@ def _fixes(
 def _offers(component: type[Component], config: ComponentConfig) -> Fields:
     """What `component` provides with `config` without needing it; nothing where its code fails."""
     with suppress(Exception):
-        given = component.requires(config)
-        return {n: spec for n, spec in component.provides(config).items() if n not in given}
+        given = component.fields_read(config)
+        return {n: spec for n, spec in component.fields_written(config).items() if n not in given}
     return {}
 
 
@@ -324,7 +324,7 @@ def _mismatch(
 def _asked(name: str, reader: Chosen, config: ComponentConfig) -> FieldSpec | None:
     """How `reader` would read the field `name` with `config`; None if it would not, or fails."""
     with suppress(Exception):
-        return reader.component.requires(config).get(name)
+        return reader.component.fields_read(config).get(name)
     return None
 
 

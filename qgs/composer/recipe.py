@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from qgs import contracts
-from qgs.composer.build import build, build_model
+from qgs.composer.build import build, build_model, load_pretrained
 from qgs.composer.decode import Chosen, DecoderSettings, check_tree, decode_place, decode_settings
 from qgs.composer.errors import Problems
 from qgs.composer.files import MAX_BYTES, apply_overrides, merge, read_recipe, refuse_beyond_reading
@@ -74,9 +74,12 @@ class Recipe:
         """Of each place with options that follow the progress of training, these options."""
         return {path: part.schedules for path, part in self.parts.items() if part.schedules}
 
-    def build_model(self, device: torch.device | str | None = None) -> QueryGaussianModel:
+    def build_model(
+        self, device: torch.device | str | None = None, pretrained: bool = True
+    ) -> QueryGaussianModel:
         """The model with its initial parameters; on "meta" it takes no memory.
 
+        pretrained: components read the weights that options name; False where a checkpoint follows.
         Raises TooLargeError for weights that do not fit into memory, before any is made.
         """
         arguments = self.parts, self.dims, self.layer_scale, self.seed, self.tree
@@ -84,11 +87,17 @@ class Recipe:
             state = build_model(*arguments, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
             refuse_beyond_memory("the model with its weights", sizes, SMALLER_MODEL)
-        return build_model(*arguments, device)
+        model = build_model(*arguments, device)
+        if pretrained:
+            load_pretrained(model)
+        return model
 
-    def build_losses(self) -> dict[str, contracts.Loss]:
+    def build_losses(self, pretrained: bool = True) -> dict[str, contracts.Loss]:
         """Losses by the names that the recipe gives; only one without data may have none."""
-        return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
+        losses = {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
+        if pretrained:
+            load_pretrained(*losses.values())
+        return losses
 
     def build_objective(self) -> contracts.Objective:
         """What a training step computes."""
@@ -96,7 +105,13 @@ class Recipe:
 
     def build_metrics(self) -> dict[str, contracts.Metric]:
         """What evaluations measure, by the names that the recipe gives."""
-        return {path[1]: build(part) for path, part in self.parts.items() if path[0] == "metrics"}
+        found = {path[1]: build(part) for path, part in self.parts.items() if path[0] == "metrics"}
+        for metric in found.values():
+            try:
+                load_pretrained(metric)
+            except contracts.MissingExtraError as error:
+                metric.unavailable = str(error)  # evaluations go on with the other metrics
+        return found
 
     def build_optimizer(self) -> contracts.Optimizer:
         """The optimiser; raises ValueError where `training` is too short for it."""

@@ -20,10 +20,11 @@ from qgs.contracts.decoder import (
     CrossAttention,
     DecoderLayer,
     FeedForward,
+    LayerParts,
     Refinement,
     SelfAttention,
 )
-from qgs.contracts.encoder import MEMORY_FIELDS, Encoder
+from qgs.contracts.encoder import MEMORY_FIELDS, Encoder, PatchEncoder, memory_fields
 from qgs.contracts.head import GAUSSIAN_FIELDS, Centers, Head
 from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
@@ -54,6 +55,7 @@ __all__ = [
     "FieldSpec",
     "Fields",
     "Head",
+    "LayerParts",
     "LayoutError",
     "LearnedQueries",
     "Loss",
@@ -69,6 +71,7 @@ __all__ = [
     "Outcome",
     "ParameterGroup",
     "Passes",
+    "PatchEncoder",
     "Plugin",
     "Problem",
     "Queries",
@@ -87,5 +90,6 @@ __all__ = [
     "ViewsConfig",
     "WeightLayout",
     "component_of",
+    "memory_fields",
     "without_effect",
 ]

@@ -125,6 +125,11 @@ class Component(metaclass=ABCMeta):
 
     slot: ClassVar[str]
     name: ClassVar[str]
+    reads: ClassVar[Fields] = {}
+    """Fields that must exist before this component runs; see `fields_read` for those that depend on
+    options."""
+    writes: ClassVar[Fields] = {}
+    """Fields that exist after it has run; see `fields_written`."""
     scheduled: ClassVar[frozenset[str]] = frozenset()
     """Options, numbers, that are read from `self.config` in every call and nowhere else: training
     may change them from step to step, as a schedule in the recipe says."""
@@ -157,19 +162,27 @@ class Component(metaclass=ABCMeta):
         cls.Config.__component__ = cls
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        """Fields that must exist before this component runs with these options."""
-        return {}
+    def fields_read(cls, config: ComponentConfig) -> Fields:
+        """Fields that must exist before this component runs: `reads`, unless options decide."""
+        return cls.reads
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        """Fields that exist after this component has run with these options."""
-        return {}
+    def fields_written(cls, config: ComponentConfig) -> Fields:
+        """Fields that exist after this component has run: `writes`, unless options decide."""
+        return cls.writes
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
         """Options that do not fit each other or the rest of the recipe."""
         return ()
+
+    def load_pretrained(self) -> None:  # noqa: B027 (most have no such files)
+        """Read weights from files that options name.
+
+        Called once after a component is built, never on the meta device, and not where a checkpoint
+        brings all weights. Raises MissingExtraError where a file or a package is not there: the
+        message says what to do.
+        """
 
 
 def component_of(config: ComponentConfig) -> type[Component]:

@@ -40,10 +40,22 @@ class AttentionWeights:
             raise ValueError(f"weights must have shape {shape}, got {tuple(self.weights.shape)}")
 
 
+@dataclass(frozen=True)
+class LayerParts:
+    """What a decoder layer is built of.
+
+    sublayers: components by slot, those that the class names. layer_scale: `decoder.layer_scale`.
+    """
+
+    dims: ModelDims
+    sublayers: Mapping[str, ModelComponent]
+    layer_scale: float
+
+
 class DecoderLayer(ModelComponent):
     """(QueryState, ImageMemory) -> both, as the next layer reads them.
 
-    A layer may update features, write fields that it `provides`, and return a memory with other
+    A layer may update features, write fields that it declares, and return a memory with other
     features where image tokens change from layer to layer. Of a memory it keeps what it does not
     change, and the fields of a state.
 
@@ -57,15 +69,8 @@ class DecoderLayer(ModelComponent):
     sublayers: ClassVar[tuple[str, ...]] = ()
     reads_layer_scale: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        config: ComponentConfig,
-        dims: ModelDims,
-        sublayers: Mapping[str, ModelComponent],
-        layer_scale: float,
-    ) -> None:
-        """sublayers: by slot, those named in the class. layer_scale: `decoder.layer_scale`."""
-        super().__init__(config, dims)
+    def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
+        super().__init__(config, parts.dims)
 
     @abstractmethod
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
@@ -76,7 +81,7 @@ class CrossAttention(ModelComponent):
     """(QueryState, ImageMemory) -> update (B, N, D).
 
     Raises KeyError for a field that the state lacks (the composer rules this out through
-    `requires`), and RuntimeError (torch's) for a memory of another width or number of heads.
+    `reads`), and RuntimeError (torch's) for a memory of another width or number of heads.
 
     ordered_views: whether the order of the views matters. Otherwise, permuting the views of the
     memory leaves the update as it is.

@@ -1,13 +1,21 @@
 """Slot `encoder`: posed photos to image memory."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts.component import ComponentConfig, Fields, FieldSpec, ModelComponent
+from qgs.contracts.component import (
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    ModelComponent,
+    Problem,
+    RecipeContext,
+)
 from qgs.types import ImageMemory, Views
 
 MEMORY_FIELDS: Fields = {
@@ -17,6 +25,11 @@ MEMORY_FIELDS: Fields = {
     "memory.patch_rays": FieldSpec((6,), frame="world"),
     "memory.grid": FieldSpec((3,), torch.int64),  # no tensor: three numbers for all tokens
 }
+
+
+def memory_fields(*names: str) -> Fields:
+    """Those of MEMORY_FIELDS: `memory_fields("keys", "values")`."""
+    return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 
 class Encoder(ModelComponent):
@@ -36,14 +49,9 @@ class Encoder(ModelComponent):
     ordered_views: ClassVar[bool] = False
     reads_cameras: ClassVar[bool] = True
     tunable: ClassVar[bool] = False
-
-    @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        """The parts of the ImageMemory that it fills: all, unless it says otherwise.
-
-        One that leaves some out, or whose features have a width of its own, overrides this.
-        """
-        return MEMORY_FIELDS
+    writes = MEMORY_FIELDS
+    """The parts of the ImageMemory that it fills, all by default; its features may have a width of
+    their own."""
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """A state dict for this encoder, made of one `learned` with patches of another size.
@@ -63,3 +71,35 @@ class Encoder(ModelComponent):
         the encoder is `tunable`.
         """
         raise NotImplementedError(f"{type(self).__name__} makes no memory of other features")
+
+
+class PatchEncoder(Encoder):
+    """An encoder that cuts every photo into squares, a token each."""
+
+    class Config(ComponentConfig):
+        patch_size: int = Field(default=8, ge=1)
+        """Side of a patch, pixels; must divide both sides of the image."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """A patch that does not divide the data's images."""
+        size, patch = context.image_size, config.patch_size
+        if size and any(side % patch for side in size):
+            nearest = [max(round(side / patch), 1) * patch for side in size]
+            yield Problem(
+                "patch_size",
+                f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
+                f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
+            )
+
+    def grid(self, views: Views) -> tuple[int, int, int]:
+        """(V, H/P, W/P); raises ValueError where patches do not divide the images."""
+        patch, (count, _, height, width) = self.config.patch_size, views.images.shape[1:]
+        if height % patch or width % patch:
+            raise ValueError(
+                f"images of {height} x {width} cannot be cut into patches of {patch}; "
+                "resize the views, or compose the model with another patch_size"
+            )
+        return count, height // patch, width // patch

@@ -5,18 +5,20 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts.component import Component
+from qgs.contracts.component import Component, ComponentConfig
 from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Loss(Component, torch.nn.Module):
-    """(LayerPrediction, Rendering, target Views, input Views) -> named 0-d tensors, weighted.
+    """(LayerPrediction, Rendering, target Views, input Views) -> a number to minimise, or several.
 
-    Called for each supervised layer with a rendering from the target's cameras, and with all views
-    that the prediction was made from; what is minimised is the sum of all terms, weighted by layer.
-    Term names are unique within a recipe. Every term has a gradient in the prediction or in the
+    A loss defines `term`; its `weight`, and the schedule of that, are applied here. Called for each
+    supervised layer with a rendering from the target's cameras, and with all views that the
+    prediction was made from; what is minimised is the sum of all terms, weighted by layer. Term
+    names are unique within a recipe. Every term has a gradient in the prediction or in the
     rendering.
 
     renderings: which views a call needs, since training may render few at a time
@@ -27,12 +29,34 @@ class Loss(Component, torch.nn.Module):
 
     slot: ClassVar[str] = "losses"
     renderings: ClassVar[Literal["each", "all", "none"]] = "all"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+
+    class Config(ComponentConfig):
+        weight: float = Field(default=1.0, ge=0)
+        """Factor of this loss in the objective; 0 leaves it out and takes no time."""
+
+    config: Config
 
     @abstractmethod
+    def term(
+        self,
+        prediction: LayerPrediction,
+        rendering: Rendering,  # (B, V, ...); of no views where `renderings` is "none"
+        target: Views,  # (B, V)
+        inputs: Views,
+    ) -> Tensor | Mapping[str, Tensor]:
+        """The loss without its weight, averaged over scenes: 0-d, or several by name."""
+
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """The terms of this loss, each multiplied by its weight and averaged over scenes."""
+        """The terms, weighted, by name: that of the component where there is one; none for 0."""
+        weight = self.config.weight
+        if not weight:
+            return {}
+        found = self.term(prediction, rendering, target, inputs)
+        terms = found if isinstance(found, Mapping) else {self.name: found}
+        return {name: weight * term for name, term in terms.items()}
 
 
 class Supervision(Component):

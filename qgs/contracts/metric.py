@@ -65,7 +65,7 @@ class Metric(Component, torch.nn.Module):
     definition: what is measured, in words; part of the evaluation protocol, as the options are:
     change it when values change. not_in_protocol: options that change no value, such as a path.
     needs: parts of the input without which there is no value. column: how the value is shown.
-    unavailable: set by `__init__` to why there are no values here, such as a missing file.
+    unavailable: why there are no values here: what `load_pretrained` misses.
     """
 
     slot: ClassVar[str] = "metrics"

@@ -7,7 +7,7 @@ from typing import TypeAlias
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.weights import WeightLayout
 
-CONTRACT_VERSION = 2
+CONTRACT_VERSION = 1
 """Goes up when components written for the old contracts no longer fit."""
 
 ENTRY_POINT_GROUP = "qgs.plugins"

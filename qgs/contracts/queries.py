@@ -15,10 +15,10 @@ GROWTH_NOISE = 0.01
 
 
 class Queries(ModelComponent):
-    """(ImageMemory, Views) -> QueryState of N queries: features (B, N, D), fields in `provides`.
+    """(ImageMemory, Views) -> QueryState of N queries: features (B, N, D), fields in `writes`.
 
     Spatial fields are float32 in the world frame, (B, N, ...). Queries that read the memory say
-    which parts of it they need in `requires`, as `memory.features`. Scenes are independent; a
+    which parts of it they need in `reads`, as `memory.features`. Scenes are independent; a
     state whose scenes have different numbers of queries has a mask.
 
     reads_cameras: whether they read `views.cameras`. Those that do not may be given `Photos`.
@@ -28,9 +28,9 @@ class Queries(ModelComponent):
     reads_cameras: ClassVar[bool] = True
 
     @property
-    @abstractmethod
     def count(self) -> int | None:
-        """N, the number of queries; None where it depends on the views."""
+        """N, the number of queries: the option `count`; None where it depends on the views."""
+        return getattr(self.config, "count", None)
 
     @abstractmethod
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
@@ -60,11 +60,6 @@ class LearnedQueries(Queries):
     """Queries that start from parameters alone: the same in all scenes, whatever the photos."""
 
     reads_cameras = False
-
-    @property
-    @abstractmethod
-    def count(self) -> int:
-        """N, the number of queries."""
 
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:

@@ -65,15 +65,11 @@ class Renderer(Component, torch.nn.Module):
         """The settings of every renderer; add your own below."""
 
     config: RendererConfig
-
-    @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        """RGB, alpha and expected depth."""
-        return {
-            "rendering.rgb": FieldSpec((3, "H", "W")),
-            "rendering.alpha": FieldSpec((1, "H", "W")),
-            "rendering.depth": FieldSpec((1, "H", "W"), frame="camera"),
-        }
+    writes: ClassVar[Fields] = {
+        "rendering.rgb": FieldSpec((3, "H", "W")),
+        "rendering.alpha": FieldSpec((1, "H", "W")),
+        "rendering.depth": FieldSpec((1, "H", "W"), frame="camera"),
+    }
 
     @abstractmethod
     def forward(

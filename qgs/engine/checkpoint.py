@@ -167,7 +167,7 @@ class Saver:
         if not sharded(self.model):
             return self.model
         assert self.model.recipe is not None
-        copy = resolve(self.model.recipe).build_model()
+        copy = resolve(self.model.recipe).build_model(pretrained=False)
         load_weights(copy, self.parts["weights"].state(), "the model in shards")
         follow(copy.modules(), steps_followed(self.model.modules()) or 0)
         return copy.to(self._accelerator.device)

@@ -165,7 +165,7 @@ class Trainer:
             self.accelerator.wait_for_everyone()
             saved = saved_state(self.folder, recipe)
         refuse_unfit(recipe, self.accelerator)
-        self.model = recipe.build_model(device=self.accelerator.device).train()
+        self.model = recipe.build_model(self.accelerator.device, pretrained=not saved).train()
         warnings = [f"warning: {text}" for text in recipe.warnings]
         self.notes = warnings + ([] if saved else initialise(self.model, recipe))
         objective = TrainingPass.of(recipe, self.model).to(self.accelerator.device)

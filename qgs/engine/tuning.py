@@ -27,7 +27,7 @@ def tuning_loss(recipe: Recipe) -> Photometric:
 
     Weights that follow the training are those of its end, so that a protocol means one thing.
     """
-    follow((losses := recipe.build_losses()).values(), END)
+    follow((losses := recipe.build_losses(pretrained=False)).values(), END)
     for loss in losses.values():
         if isinstance(loss, Photometric) and any(loss.weights()):
             return loss

@@ -159,7 +159,7 @@ def load(
     recipe, tensors = load_recipe(path), read_tensors(path)
     try:
         _refuse_misfit(recipe.build_model("meta"), tensors, str(path))  # takes no memory
-        model = recipe.build_model()
+        model = recipe.build_model(pretrained=False)
     except (RecipeError, TooLargeError) as error:
         raise CheckpointError(
             f"{path}: the model of its recipe cannot be built: {error}"

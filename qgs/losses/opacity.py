@@ -1,11 +1,9 @@
 """`qgs/opacity`, `qgs/mask`: Gaussians become opaque, alpha becomes the mask (TokenGS release)."""
 
-from typing import ClassVar
-
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss
+from qgs.contracts import Loss
 from qgs.geometry.precision import at_least_float32
 from qgs.losses.means import mean_of_gaussians
 from qgs.losses.photometric import mean_squared_error
@@ -15,11 +13,10 @@ from qgs.types import LayerPrediction, Rendering, Views
 class Opacity(Loss):
     """Mean over Gaussians of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
 
-    name: ClassVar[str] = "opacity"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    name = "opacity"
     renderings = "none"
 
-    class Config(ComponentConfig):
+    class Config(Loss.Config):
         weight: float = Field(default=0.1, ge=0)
         """Factor of the term in the objective."""
         eps: float = Field(default=1e-6, gt=0)
@@ -27,34 +24,32 @@ class Opacity(Loss):
 
     config: Config
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
-    ) -> dict[str, Tensor]:
+    ) -> Tensor:
         opacities = at_least_float32(prediction.gaussians.opacities)
-        mean = mean_of_gaussians((opacities + self.config.eps).log(), prediction)
-        return {"opacity": self.config.weight * -mean}
+        return -mean_of_gaussians((opacities + self.config.eps).log(), prediction)
 
 
 class Mask(Loss):
     """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
 
-    name: ClassVar[str] = "mask"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    name = "mask"
     renderings = "each"
 
-    class Config(ComponentConfig):
+    class Config(Loss.Config):
         weight: float = Field(default=0.5, ge=0)
         """Factor of the term in the objective."""
 
     config: Config
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
-    ) -> dict[str, Tensor]:
-        """One term, `mask`. Raises ValueError for views without masks."""
+    ) -> Tensor:
+        """Raises ValueError for views without masks."""
         if target.masks is None:
             raise ValueError(
                 "the loss qgs/mask needs views with masks and these have none; "
                 "choose data with masks, or take the loss out of the recipe"
             )
-        return {"mask": self.config.weight * mean_squared_error(rendering.alpha, target.masks)}
+        return mean_squared_error(rendering.alpha, target.masks)

@@ -1,14 +1,14 @@
 """`qgs/photometric`: MSE, L1 and SSIM of rendered against true images (TokenGS, LocusGS)."""
 
 from collections.abc import Iterable, Iterator
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext
+from qgs.contracts import Loss, Problem, RecipeContext
 from qgs.geometry.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
 
@@ -54,13 +54,13 @@ def _window(size: int, padding: Padding) -> Tensor:
 
 
 class Photometric(Loss):
-    """mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2."""
+    """mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2, three terms."""
 
-    name: ClassVar[str] = "photometric"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"mse_weight", "l1_weight", "ssim_weight"})
+    name = "photometric"
+    scheduled = frozenset({"weight", "mse_weight", "l1_weight", "ssim_weight"})
     renderings = "each"
 
-    class Config(ComponentConfig):
+    class Config(Loss.Config):
         mse_weight: float = Field(default=1.0, ge=0)
         """Factor of the mean squared error; 0 leaves the term out."""
         l1_weight: float = Field(default=0.0, ge=0)
@@ -81,7 +81,7 @@ class Photometric(Loss):
         """Of MSE, L1 and SSIM."""
         return self.config.mse_weight, self.config.l1_weight, self.config.ssim_weight
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """Terms `mse`, `l1`, `ssim`; raises ValueError for images that are too small for SSIM."""

@@ -1,13 +1,13 @@
 """`qgs/visibility`: moves points that no target view sees towards the nearest one (TokenGS)."""
 
 from collections.abc import Iterable, Iterator
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss, Problem, RecipeContext, without_effect
+from qgs.contracts import Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.precision import full_precision
 from qgs.losses.means import mean_of_gaussians
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
@@ -19,15 +19,13 @@ INFINITE_PIXEL = 1e6
 """Stands for x / 0 with x != 0 (TokenGS release)."""
 
 
-class VisibilityOptions(ComponentConfig):
+class VisibilityOptions(Loss.Config):
     """Options of a visibility loss.
 
     A point behind the camera, like every clamped point, gets no gradient from that view; it still
     moves under views that it stands in front of.
     """
 
-    weight: float = Field(default=1.0, ge=0)
-    """Factor of the term in the objective."""
     clamp: float | None = Field(default=1.0, gt=0)
     """Upper bound per point, in halves of an image side (release: 1); null for no bound."""
     near: float = Field(default=0.025, gt=0)
@@ -57,8 +55,7 @@ class VisibilityOptions(ComponentConfig):
 class Visibility(Loss):
     """Mean over Gaussians of `view_visibility` of their means."""
 
-    name: ClassVar[str] = "visibility"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    name = "visibility"
     renderings = "none"
 
     class Config(VisibilityOptions):
@@ -73,9 +70,9 @@ class Visibility(Loss):
         if config.clamp is not None:
             yield from without_effect(config, ("infinite_pixel",), "`clamp` bounds every point")
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
-    ) -> dict[str, Tensor]:
+    ) -> Tensor:
         per_point = view_visibility(
             prediction.gaussians.means,
             target.cameras,
@@ -83,7 +80,7 @@ class Visibility(Loss):
             behind=self.config.behind,
             infinite_pixel=self.config.infinite_pixel,
         )
-        return {"visibility": self.config.weight * mean_of_gaussians(per_point, prediction)}
+        return mean_of_gaussians(per_point, prediction)
 
 
 @full_precision

@@ -1,7 +1,6 @@
 """What is measured on Gaussians alone: how far those of one query scatter."""
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,8 +17,8 @@ class Dispersion(Metric):
     one place. A few far ones rule its mean, which LocusGS publishes, not its median.
     """
 
-    name: ClassVar[str] = "dispersion"
-    definition: ClassVar[str] = "distance of Gaussians to their token's centroid, world units"
+    name = "dispersion"
+    definition = "distance of Gaussians to their token's centroid, world units"
     needs = ("gaussians",)
 
     def columns(self) -> Mapping[str, Column]:

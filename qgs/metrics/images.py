@@ -1,7 +1,7 @@
 """PSNR and SSIM as papers report them (LocusGS evaluation)."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -21,9 +21,9 @@ _MSE_FLOOR = 1e-10  # identical images get 100 dB
 class Psnr(Metric):
     """PSNR, peak signal-to-noise ratio of each view: 6 dB more is half the error."""
 
-    name: ClassVar[str] = "psnr"
-    definition: ClassVar[str] = "dB of images clipped to [0, 1], mean over views, then over scenes"
-    column: ClassVar[Column] = Column("PSNR", "higher", digits=2, unit="dB")
+    name = "psnr"
+    definition = "dB of images clipped to [0, 1], mean over views, then over scenes"
+    column = Column("PSNR", "higher", digits=2, unit="dB")
 
     def forward(self, given: MetricInput) -> Tensor:
         """(1, T)."""
@@ -33,10 +33,8 @@ class Psnr(Metric):
 class Ssim(Metric):
     """SSIM, structural similarity of each view (Wang et al. 2004): 1 is the photo itself."""
 
-    name: ClassVar[str] = "ssim"
-    definition: ClassVar[str] = (
-        "scikit-image: Gaussian window of 11, sigma 1.5, data range 1, borders left out"
-    )
+    name = "ssim"
+    definition = "scikit-image: Gaussian window of 11, sigma 1.5, data range 1, borders left out"
 
     class Config(ComponentConfig):
         """Options of SSIM."""

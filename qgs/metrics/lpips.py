@@ -1,7 +1,5 @@
 """`qgs/lpips`: LPIPS, see `qgs.perceptual`."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
@@ -12,10 +10,10 @@ from qgs.perceptual import PerceptualDistance
 class Lpips(Metric):
     """LPIPS, distance of each view to the truth in features of VGG-16; nothing is downloaded."""
 
-    name: ClassVar[str] = "lpips"
-    definition: ClassVar[str] = "VGG-16, version 0.1, images in [-1, 1]"
-    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"weights"})
-    column: ClassVar[Column] = Column("LPIPS", "lower")
+    name = "lpips"
+    definition = "VGG-16, version 0.1, images in [-1, 1]"
+    not_in_protocol = frozenset({"weights"})
+    column = Column("LPIPS", "lower")
 
     class Config(ComponentConfig):
         """Options of LPIPS."""
@@ -24,10 +22,15 @@ class Lpips(Metric):
         """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
         the one in torch's cache."""
 
+    config: Config
+
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        self.network = PerceptualDistance(config.weights)
-        self.unavailable = self.network.unavailable
+        self.network = PerceptualDistance()
+
+    def load_pretrained(self) -> None:
+        """See `Component`."""
+        self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
         """(1, T). Raises ValueError when a side is shorter than 16 pixels."""

@@ -15,7 +15,7 @@ from qgs.components import (
     MultiViewViT,
     NoRefinement,
 )
-from qgs.contracts import ModelDims
+from qgs.contracts import LayerParts, ModelDims
 from qgs.model import QueryGaussianModel
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Views
@@ -36,7 +36,7 @@ def build_model() -> QueryGaussianModel:
             "self_attention": make(ContentSelfAttention),
             "feed_forward": make(MlpFeedForward),
         }
-        return CrossSelfMlp(CrossSelfMlp.Config(), dims, sublayers, 0.1)
+        return CrossSelfMlp(CrossSelfMlp.Config(), LayerParts(dims, sublayers, 0.1))
 
     layers = [layer() for _ in range(DEPTH)]
     refinement = make(NoRefinement)

@@ -76,7 +76,7 @@ class Mean(Metric):
     definition, column = "mean colour", Column("level", "higher")
     def forward(self, given):
         return given.images.mean((-3, -2, -1))
-plugin = Plugin("mine", 2, (Mean,))
+plugin = Plugin("mine", 1, (Mean,))
 """
 
 

@@ -111,11 +111,11 @@ def _unmet(chosen: dict[str, Choice]) -> dict[str, set[str]]:
     given: dict[str, FieldSpec] = {}
     for slot in ("queries", *LAYER, *LAYER, "centers"):
         kind, component, config = chosen[slot]
-        needed = {n: s for n, s in component.requires(config).items() if "memory." not in n}
+        needed = {n: s for n, s in component.fields_read(config).items() if "memory." not in n}
         lacking = {name for name, spec in needed.items() if given.get(name) != spec}
         if lacking:
             unmet[kind] = unmet.get(kind, set()) | lacking
-        written = component.provides(config).items()
+        written = component.fields_written(config).items()
         given |= {n: spec for n, spec in written if n not in needed or n in given}
     return unmet
 
@@ -180,7 +180,7 @@ def test_an_encoder_runs_with_all_that_need_no_rays(
     chosen = dict(zip(SLOTS, parts, strict=True))
     recipe = _recipe(chosen)
     recipe["model"]["encoder"] = {"type": encoder, **ENCODERS[encoder]}
-    needed = chosen["cross_attention"][1].requires(chosen["cross_attention"][2])
+    needed = chosen["cross_attention"][1].fields_read(chosen["cross_attention"][2])
     if encoder == "qgs/latent_bottleneck" and "memory.patch_rays" in needed:
         with pytest.raises(RecipeError, match=r"needs memory.patch_rays .*qgs/latent_bottleneck"):
             resolve(recipe)

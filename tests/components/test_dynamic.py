@@ -81,7 +81,7 @@ def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all(
     assert not changed[1].any()
     if dynamic:
         assert torch.equal(early[MOVES], torch.tensor([moving] * 2).bool())
-    assert early.fields.keys() == DynamicQueries.provides(queries.config).keys()
+    assert early.fields.keys() == DynamicQueries.fields_written(queries.config).keys()
 
 
 @pytest.mark.parametrize("dynamic", [3, 0])

@@ -21,7 +21,7 @@ class Placed(LearnedQueries):
         count: int = 4
         radius: bool = True
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return PLACE | (RADIUS if config.radius else {})
     @property
     def count(self):
@@ -35,7 +35,7 @@ class Near(CrossAttention):
         bandwidth: Literal["radius", "fixed"] = "radius"
         sigma: float = 0.1
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return PLACE | (RADIUS if config.bandwidth == "radius" else {})
     def forward(self, state, memory):
         raise NotImplementedError
@@ -43,7 +43,7 @@ class Near(CrossAttention):
 class Measure(Refinement):
     name = "measure"
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return RADIUS
     def forward(self, state):
         return state
@@ -51,7 +51,7 @@ class Measure(Refinement):
 class Local(Refinement):
     name = "local"
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return {"place.center": FieldSpec((3,), frame="camera")}
     def forward(self, state):
         return state
@@ -61,7 +61,7 @@ class Scenes(SceneSource):
     def scenes(self, split):
         return []
 
-plugin = Plugin("spatial", 2, (Placed, Near, Measure, Local, Scenes))
+plugin = Plugin("spatial", 1, (Placed, Near, Measure, Local, Scenes))
 """
 
 

@@ -18,30 +18,30 @@ class Start(LearnedQueries):
     name = "start"
     count = 3
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return {"place": FieldSpec((3,))}
     def start(self, batch_size):
         raise NotImplementedError
 
 class Reader(CrossAttention):
     name = "reader"
-    requires = Start.provides
+    fields_read = Start.fields_written
     def forward(self, state, memory):
         return state.features
 
 class Refine(Refinement):
     name = "refine"
-    requires = provides = Start.provides
+    fields_read = fields_written = Start.fields_written
     def forward(self, state):
         return state
 
 class Late(Refinement):
     name = "late"
-    provides = Start.provides
+    fields_written = Start.fields_written
     def forward(self, state):
         return state
 
-plugin = Plugin("chain", 2, (Reader, Refine, Late, Start))
+plugin = Plugin("chain", 1, (Reader, Refine, Late, Start))
 """
 
 
@@ -76,29 +76,29 @@ BROKEN_PLUGINS = {
     ),
     "no object at its entry point": ("other = 1", "has no attribute 'plugin'"),
     "unlisted component": (
-        "plugin = Plugin('bad', 2, LatentQueries)",
+        "plugin = Plugin('bad', 1, LatentQueries)",
         "must give `components` as a tuple or a list, written `(Mine,)` for a single one",
     ),
     "nameless component": (
-        "class Nameless(LatentQueries):\n    name = ''\nplugin = Plugin('bad', 2, (Nameless,))",
+        "class Nameless(LatentQueries):\n    name = ''\nplugin = Plugin('bad', 1, (Nameless,))",
         "whose name '' is empty or has a slash or a blank",
     ),
     "option that no recipe can give": (
         "class Odd(Centers):\n    name = 'odd'\n"
         "    class Config(ComponentConfig):\n        function: Callable = print\n"
         "    def forward(self, offsets, state):\n        return offsets\n"
-        "plugin = Plugin('bad', 2, (Odd,))",
+        "plugin = Plugin('bad', 1, (Odd,))",
         "lists Odd, whose Config has options that YAML cannot express",
     ),
     "options that can be changed": (
         "class Soft(LatentQueries):\n    name = 'soft'\n"
         "    class Config(LatentQueries.Config):\n        model_config = {'frozen': False}\n"
-        "plugin = Plugin('bad', 2, (Soft,))",
+        "plugin = Plugin('bad', 1, (Soft,))",
         "lists Soft, whose Config is not frozen; leave `frozen` of its `model_config` at True",
     ),
     "metric that does not say what it measures": (
         "class Mute(Psnr):\n    name = 'mute'\n    definition = ''\n"
-        "plugin = Plugin('bad', 2, (Mute,))",
+        "plugin = Plugin('bad', 1, (Mute,))",
         "lists Mute, which gives no `definition`; say in words what it measures, since protocols "
         "hash it",
     ),
@@ -112,26 +112,26 @@ BROKEN_PLUGINS = {
         "must give `contract_version` as a whole number, not True",
     ),
     "nothing in it": (
-        "plugin = Plugin('bad', 2, ())",
+        "plugin = Plugin('bad', 1, ())",
         "is empty: it lists no `components`, `layouts` or `models`",
     ),
-    "other name": ("plugin = Plugin('qgs', 2, ())", "calls itself `qgs`"),
+    "other name": ("plugin = Plugin('qgs', 1, ())", "calls itself `qgs`"),
     "taken component name": (
-        "plugin = Plugin('bad', 2, (LatentQueries, LatentQueries))",
+        "plugin = Plugin('bad', 1, (LatentQueries, LatentQueries))",
         "registers `latent` twice",
     ),
     "abstract component": (
-        "class Half(LearnedQueries):\n    name = 'half'\nplugin = Plugin('bad', 2, (Half,))",
-        "leaves count, start abstract",
+        "class Half(LearnedQueries):\n    name = 'half'\nplugin = Plugin('bad', 1, (Half,))",
+        "leaves start abstract",
     ),
     "device that is none": (
         "class Odd(TorchRenderer):\n    name = 'odd'\n    devices = ('tpu',)\n"
-        "plugin = Plugin('bad', 2, (Odd,))",
+        "plugin = Plugin('bad', 1, (Odd,))",
         "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda', 'mps') as a tuple",
     ),
-    "no component": ("plugin = Plugin('bad', 2, (int,))", "is no qgs component"),
+    "no component": ("plugin = Plugin('bad', 1, (int,))", "is no qgs component"),
     "no layout": (
-        "plugin = Plugin('bad', 2, (), layouts=(int,))",
+        "plugin = Plugin('bad', 1, (), layouts=(int,))",
         "lists <class 'int'>, which is no WeightLayout",
     ),
 }
@@ -153,7 +153,7 @@ def test_a_plugin_may_offer_layouts_alone(write, install):
     source = """
     from qgs.components import TOKENGS
     from qgs.contracts import Plugin
-    plugin = Plugin("layouts", 2, (), layouts=(TOKENGS,))
+    plugin = Plugin("layouts", 1, (), layouts=(TOKENGS,))
     """
     install("qgs-layouts", "layouts", source)
     assert resolve(write("recipe: 1\nplugins: [layouts]\n")).plugin_versions["layouts"] == "1.2"
@@ -178,7 +178,7 @@ def test_fix_of_a_plugin_that_cannot_be_imported(source, fix, write, install):
 
 
 def test_two_distributions_with_one_plugin_name(write, install):
-    source = "from qgs.contracts import Plugin\nplugin = Plugin('twin', 2, ())"
+    source = "from qgs.contracts import Plugin\nplugin = Plugin('twin', 1, ())"
     install("first-twin", "twin", source)
     install("second-twin", "twin", source)
     problem = refused(write("recipe: 1\nplugins: [twin]\n"))
@@ -187,7 +187,7 @@ def test_two_distributions_with_one_plugin_name(write, install):
 
 
 def test_a_distribution_that_takes_the_frameworks_name_is_reported(write, install):
-    install("impostor", "qgs", "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 2, ())")
+    install("impostor", "qgs", "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 1, ())")
     registry, broken = load_sound_plugins()
     (message,) = [message for message in broken if "impostor 1.2" in message]
     assert "`qgs`, the framework's own name" in message
@@ -214,7 +214,7 @@ def test_one_fault_of_a_plugin_does_not_hide_the_others_of_an_installation(insta
                 model_config = {"validate_default": True}
             def forward(self, offsets, state):
                 return offsets
-        plugin = Plugin("moody", 2, (Moody,))
+        plugin = Plugin("moody", 1, (Moody,))
         """,
     )
     result = CliRunner().invoke(app, ["list"], env={"COLUMNS": "200"})

@@ -38,11 +38,11 @@ class Faulty(Refinement):
         super().__init__(config, dims)
         look_up("x") if config.at == "__init__" else None
     @classmethod
-    def requires(cls, config):
-        return look_up("x") if config.at == "requires" else {}
+    def fields_read(cls, config):
+        return look_up("x") if config.at == "fields_read" else {}
     @classmethod
-    def provides(cls, config):
-        return look_up("x") if config.at == "provides" else {}
+    def fields_written(cls, config):
+        return look_up("x") if config.at == "fields_written" else {}
     @classmethod
     def problems(cls, config, context):
         return look_up("x") if config.at == "problems" else ()
@@ -53,7 +53,7 @@ class ExplodingLoss(Loss):
     name = "exploding"
     def __init__(self, config):
         look_up("x")
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         raise NotImplementedError
 
 class Closed(SceneSource):
@@ -69,14 +69,14 @@ class Silent(LearnedQueries):
     name = "silent"
     count = 3
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return PLACE
     def start(self, batch_size):
         return QueryState(torch.zeros(batch_size, 3, self.dims.width))
 
 class Shapeless(Refinement):
     name = "shapeless"
-    provides = Silent.provides
+    fields_written = Silent.fields_written
     def forward(self, state):
         return state.replace(fields={"place": state.features[..., :2]})
 
@@ -88,7 +88,7 @@ class Losing(Refinement):
 class Placed(LearnedQueries):
     name = "placed"
     count = 3
-    provides = Silent.provides
+    fields_written = Silent.fields_written
     def start(self, batch_size):
         place = torch.zeros(batch_size, 3, 3)
         return QueryState(torch.zeros(batch_size, 3, self.dims.width), {"place": place})
@@ -101,12 +101,12 @@ class Bare(LearnedQueries):
 
 class Boasting(CrossAttention):
     name = "boasting"
-    provides = Silent.provides
+    fields_written = Silent.fields_written
     def forward(self, state, memory):
         return state.features
 
 STATES = (Silent, Shapeless, Losing, Placed, Bare, Boasting)
-plugin = Plugin("faulty", 2, (Faulty, ExplodingLoss, Closed, *STATES))
+plugin = Plugin("faulty", 1, (Faulty, ExplodingLoss, Closed, *STATES))
 """
 
 HEAD = "recipe: 1\nplugins: [faulty]\n"
@@ -161,7 +161,7 @@ def test_a_module_without_the_plugin_has_no_place(write, install):
 
 
 @pytest.mark.parametrize("editable", [True, False])
-@pytest.mark.parametrize("at", ["Config", "requires", "provides", "problems", "__init__"])
+@pytest.mark.parametrize("at", ["Config", "fields_read", "fields_written", "problems", "__init__"])
 def test_a_component_that_fails_is_placed(at, editable, write, install):
     install("qgs-faulty", "faulty", SOURCE, version="0.3", editable=editable)
     model = f"model:\n  decoder: {{refinement: {{type: faulty/faulty, at: {at}}}}}\n"
@@ -240,7 +240,7 @@ def test_a_broken_promise_is_placed_at_its_forward(write, install):
         def forward(self, state):  # line 9, its decorator 8
             return None
 
-    plugin = Plugin("faulty", 2, (Empty,))
+    plugin = Plugin("faulty", 1, (Empty,))
     """
     install("qgs-faulty", "faulty", source, editable=True)
     recipe = resolve(write(HEAD + "model: {decoder: {refinement: {type: faulty/empty}}}\n"))
@@ -259,12 +259,14 @@ def test_a_plugin_in_memory_is_reported_without_a_distribution():
             raise NotImplementedError
 
         @classmethod
-        def provides(cls, config):
+        def fields_written(cls, config):
             raise KeyError("oops")
 
     recipe = {"recipe": 1, "plugins": ["mine"], "model": {"queries": {"type": "mine/silent"}}}
-    problem = refused(recipe, plugins=[Plugin("mine", 2, (Silent,))])
-    assert problem.reason.startswith("the plugin `mine` fails: `provides` of `mine/silent` raises")
+    problem = refused(recipe, plugins=[Plugin("mine", 1, (Silent,))])
+    assert problem.reason.startswith(
+        "the plugin `mine` fails: `fields_written` of `mine/silent` raises"
+    )
     place = rf"correct {re.escape(__file__)}:\d+, or choose another component"
     assert re.fullmatch(place, problem.fix)
 

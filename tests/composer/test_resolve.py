@@ -138,7 +138,7 @@ def test_extends_merges_mappings_replaces_lists_and_replaces_nodes_of_another_ty
 def test_plugins_are_united_and_each_keeps_its_line(write, spatial, install):
     source = "from qgs.components import LatentQueries\nfrom qgs.contracts import Plugin\n"
     for name in ("first", "second"):
-        listed = f"plugin = Plugin('{name}', 2, (LatentQueries,))\n"
+        listed = f"plugin = Plugin('{name}', 1, (LatentQueries,))\n"
         install(f"qgs-{name}", name, source + listed)
     write("recipe: 1\nplugins: [spatial]\ndata: {type: spatial/scenes}\n", "a.yaml")
     queries = "model: {queries: {type: first/latent}}\n"
@@ -262,7 +262,7 @@ def test_layers_with_equal_refinement_share_a_module_unless_it_forbids_that(inst
             shared_by_layers = False
             def forward(self, state):
                 return state
-        plugin = Plugin("apart", 2, (Apart,))
+        plugin = Plugin("apart", 1, (Apart,))
         """,
     )
     overrides = ["plugins=[apart]", "model.decoder.refinement.type=apart/apart"]

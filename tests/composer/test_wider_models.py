@@ -21,6 +21,7 @@ from qgs.contracts import (
     DecoderLayer,
     Fields,
     FieldSpec,
+    LayerParts,
     Loss,
     ModelDims,
     Plugin,
@@ -54,7 +55,7 @@ class TokenQueries(Queries):
         self.norm = nn.LayerNorm(dims.width)
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
+    def fields_read(cls, config: ComponentConfig) -> Fields:
         return FEATURES
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
@@ -67,7 +68,7 @@ class RowQueries(TokenQueries):
     name: ClassVar[str] = "rows"
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
+    def fields_read(cls, config: ComponentConfig) -> Fields:
         return {**FEATURES, "memory.grid": MEMORY_FIELDS["memory.grid"]}
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
@@ -94,12 +95,13 @@ class JointLayer(DecoderLayer):
 
     name: ClassVar[str] = "joint"
 
-    def __init__(self, config: Any, dims: ModelDims, sublayers: Any, layer_scale: float) -> None:
-        super().__init__(config, dims, sublayers, layer_scale)
+    def __init__(self, config: Any, parts: LayerParts) -> None:
+        super().__init__(config, parts)
+        dims = parts.dims
         self.attention = nn.MultiheadAttention(dims.width, dims.heads, batch_first=True)
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
+    def fields_read(cls, config: ComponentConfig) -> Fields:
         return FEATURES
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
@@ -115,7 +117,7 @@ class BlindEncoder(MultiViewViT):
     name: ClassVar[str] = "blind"
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
+    def fields_written(cls, config: ComponentConfig) -> Fields:
         return {"memory.features": FieldSpec((32,))}
 
     def forward(self, views: Views) -> ImageMemory:
@@ -129,7 +131,7 @@ class WideQueries(TokenQueries):
     name: ClassVar[str] = "wide"
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
+    def fields_read(cls, config: ComponentConfig) -> Fields:
         return {"memory.features": FieldSpec((32,))}
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
@@ -143,14 +145,14 @@ class FeatureLoss(Loss):
     renderings = "each"
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
+    def fields_read(cls, config: ComponentConfig) -> Fields:
         return {"gaussians.features": GAUSSIAN_FIELDS["gaussians.features"]}
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
-    ) -> dict[str, Tensor]:
+    ) -> Tensor:
         assert rendering.features is not None
-        return {"features": rendering.features.square().mean()}
+        return rendering.features.square().mean()
 
 
 class FeatureHead(GaussianHead):
@@ -159,7 +161,7 @@ class FeatureHead(GaussianHead):
     name: ClassVar[str] = "carrying"
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
+    def fields_written(cls, config: ComponentConfig) -> Fields:
         return {"gaussians.features": GAUSSIAN_FIELDS["gaussians.features"]}
 
     def forward(self, state: QueryState) -> GaussianAttributes:
@@ -413,10 +415,14 @@ def test_a_component_that_loses_what_others_need_is_named(decoder: Any, told: st
 @pytest.mark.parametrize("contract", [JointLayer, TokenQueries, UnmaskingRefinement])
 @pytest.mark.parametrize("field", ["memory.features", "rendering.rgb", "gaussians.color"])
 def test_what_no_state_holds_cannot_be_provided_by_a_state(contract: Any, field: str) -> None:
-    def provides(cls: Any, config: ComponentConfig) -> Fields:
+    def fields_written(cls: Any, config: ComponentConfig) -> Fields:
         return {field: FieldSpec((3,))}
 
-    methods = {"name": "boasting", "provides": classmethod(provides), "__module__": __name__}
+    methods = {
+        "name": "boasting",
+        "fields_written": classmethod(fields_written),
+        "__module__": __name__,
+    }
     boasting = type("Boasting", (contract,), methods)
     place = {boasting.slot: {"type": "mine/boasting"}}
     wanted = recipe(**(place if contract is TokenQueries else {"decoder": {"depth": 2, **place}}))
@@ -447,7 +453,7 @@ class PictureEncoder(MultiViewViT):
     reads_cameras = False
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
+    def fields_written(cls, config: ComponentConfig) -> Fields:
         return {n: spec for n, spec in MEMORY_FIELDS.items() if n != "memory.patch_rays"}
 
     def forward(self, views: Views) -> ImageMemory:

@@ -14,7 +14,7 @@ from training_runs import TWO, Tiny, first_batch
 from varying_head import VaryingHead
 
 from qgs.composer import Recipe
-from qgs.contracts import ComponentConfig, Loss, Outcome
+from qgs.contracts import Loss, Outcome
 from qgs.engine.objective import TrainingPass, measure
 from qgs.losses import Mask, Opacity
 from qgs.metrics.images import psnr
@@ -75,10 +75,10 @@ class Flicker(Loss):
     name: ClassVar[str] = "flicker"
 
     def __init__(self) -> None:
-        super().__init__(ComponentConfig())
+        super().__init__(Loss.Config())
         self.gain = nn.Parameter(torch.tensor(0.7))
 
-    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
+    def term(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == TARGETS
         brightness = rendering.rgb.mean((-3, -2, -1))
         return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
@@ -90,7 +90,7 @@ class Blind(Loss):
     name: ClassVar[str] = "blind"
     renderings = "none"
 
-    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
+    def term(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         assert rendering.rgb.shape[1] == 0
         assert target.images.shape[1] == TARGETS
         return {"blind": prediction.state.features.square().mean()}
@@ -100,7 +100,7 @@ def every_loss(recipe: Recipe) -> dict[str, Loss]:
     extra = {
         "mask": Mask(Mask.Config()),
         "opacity": Opacity(Opacity.Config()),
-        "blind": Blind(ComponentConfig()),
+        "blind": Blind(Loss.Config()),
     }
     return {**recipe.build_losses(), **extra}
 
@@ -181,7 +181,7 @@ class Marked(Loss):
     name: ClassVar[str] = "marked"
     renderings = "each"
 
-    def forward(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
+    def term(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
         return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
 
 
@@ -192,9 +192,7 @@ def test_harmonics_and_features_get_theirs(
 ) -> None:
     model, losses, *batch = setting(renderer)
     model.head = VaryingHead(model.head)
-    losses |= {"marked": Marked(ComponentConfig())} | (
-        {"flicker": Flicker()} if all_at_once else {}
-    )
+    losses |= {"marked": Marked(Loss.Config())} | ({"flicker": Flicker()} if all_at_once else {})
     objective = TrainingPass(model, losses, render_views=2)
     assert error(objective, *batch) < 1e-6
     found = gradients(objective, objective(*batch).total)["model.head.linear.weight"]

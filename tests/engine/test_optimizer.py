@@ -176,7 +176,7 @@ class Plain(Optimizer):
     def learning_rate(self, step, seconds):
         return self.config.rate
 
-plugin = Plugin("plain", 2, (Plain,))
+plugin = Plugin("plain", 1, (Plain,))
 """
 
 

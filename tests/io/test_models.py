@@ -28,7 +28,7 @@ RECIPE = {
 }
 PLUGIN = """
 from qgs.contracts import Plugin
-plugin = Plugin("box", 2, (), models={
+plugin = Plugin("box", 1, (), models={
     "small": "models/small.safetensors",
     "small-1.5": "models/small.safetensors",
     "gone": "models/gone.safetensors",
@@ -95,7 +95,7 @@ def test_models_are_listed_and_checked(shipped: Path) -> None:
 @pytest.mark.parametrize("models", ["['a']", "{'a/b': 'f'}", "{'a': 1}"])
 def test_models_of_another_form_are_refused(install, models: str) -> None:
     source = "from qgs.contracts import Plugin\n"
-    install("qgs-bad", "bad", f"{source}plugin = Plugin('bad', 2, (), models={models})")
+    install("qgs-bad", "bad", f"{source}plugin = Plugin('bad', 1, (), models={models})")
     assert any("models" in message for message in load_sound_plugins()[1])
 
 

@@ -14,6 +14,7 @@ from qgs_plugintools.inputs import Sizes, inputs_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from qgs.composer import resolve
 from qgs.contracts import MissingExtraError
 from qgs.losses import LpipsLoss
 from qgs.metrics.lpips import Lpips
@@ -58,7 +59,9 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Tensor
 
 
 def lpips_of(weights: object = None) -> Lpips:
-    return Lpips(Lpips.Config(weights=weights and str(weights)))
+    made = Lpips(Lpips.Config(weights=weights and str(weights)))
+    made.load_pretrained()
+    return made
 
 
 def images(*shape: int) -> tuple[Tensor, Tensor]:
@@ -91,7 +94,6 @@ def test_lpips_is_the_published_formula(vgg: Path, package: dict[str, Tensor], f
     if form == "pth":
         torch.save(load_file(vgg), file)
     lpips = lpips_of(file)
-    assert not lpips.unavailable
     image, truth = images(2, 2, 3, 33, 40)
     values = lpips.distance(image, truth)
     assert values.shape == (2, 2)
@@ -131,24 +133,23 @@ def test_images_are_clipped_and_small_ones_refused(vgg: Path) -> None:
 
 def test_without_the_package_the_reason_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("qgs.perceptual.find_spec", lambda name: None)
-    reason = 'not installed: pip install "query-gaussians[lpips]"'
-    assert lpips_of().unavailable.endswith(reason)
+    with pytest.raises(MissingExtraError, match="lpips"):
+        lpips_of()
+    metrics = resolve({"recipe": 1, "metrics": {"lpips": {"type": "qgs/lpips"}}}).build_metrics()
+    assert "lpips" in metrics["lpips"].unavailable  # evaluations go on without it
 
 
 @pytest.mark.usefixtures("package")
-def test_without_weights_the_reason_says_what_to_download(
+def test_weights_that_are_not_there_or_do_not_fit_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    assert "no VGG-16 weights in the cache of torch.hub: download" in lpips_of().unavailable
-    assert "no VGG-16 weights at mine.pth: download" in lpips_of("mine.pth").unavailable
-
-
-@pytest.mark.usefixtures("package")
-def test_other_weights_are_told(tmp_path: Path) -> None:
     save_file({"conv1.weight": torch.zeros(1)}, tmp_path / "resnet.safetensors")
-    found = lpips_of(tmp_path / "resnet.safetensors").unavailable
-    assert found.startswith("resnet.safetensors or vgg.pth does not")
+    for weights, named in (
+        (None, "cache"), ("mine.pth", "mine.pth"), (tmp_path / "resnet.safetensors", "resnet"),
+    ):  # fmt: skip
+        with pytest.raises(MissingExtraError, match=named):
+            lpips_of(weights)
 
 
 def loss_and_inputs(weights: object) -> tuple[LpipsLoss, dict[str, Any]]:
@@ -170,9 +171,3 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg: Pat
     step = rendering.rgb - 0.01 * gradient / gradient.abs().max()
     assert loss(prediction, replace(rendering, rgb=step), target, inputs)["lpips"] < value
     assert not any(parameter.requires_grad for parameter in loss.parameters())
-
-
-def test_a_loss_without_its_weights_says_what_to_download() -> None:
-    loss, given = loss_and_inputs("mine.pth")
-    with pytest.raises(MissingExtraError, match=r"(?s)the loss qgs/lpips cannot .*lpips"):
-        loss(*given.values())

@@ -23,13 +23,13 @@ class Hollow(LearnedQueries):
     count = 4
 
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return {"hollow.place": FieldSpec((3,), frame="world")}
 
     def start(self, batch_size):
         return QueryState(torch.zeros(batch_size, self.count, self.dims.width))
 
-plugin = Plugin("liar", 2, (Hollow,))
+plugin = Plugin("liar", 1, (Hollow,))
 """
 
 SOURCES = {
@@ -46,7 +46,7 @@ SOURCES = {
         """
         from qgs.components import LatentQueries
         from qgs.contracts import Plugin
-        plugin = Plugin("repeats", 2, (LatentQueries, LatentQueries))
+        plugin = Plugin("repeats", 1, (LatentQueries, LatentQueries))
         """,
         "registers `latent` twice",
     ),

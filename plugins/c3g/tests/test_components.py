@@ -10,7 +10,7 @@ from qgs_c3g.joint import JointLayer
 from torch import Tensor
 
 from qgs import QueryState
-from qgs.contracts import ModelDims
+from qgs.contracts import LayerParts, ModelDims
 from qgs.types import ImageMemory
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
@@ -18,7 +18,7 @@ DIMS = ModelDims(width=16, heads=2, depth=2)
 
 def layer(scale: float = 1.0, **options: float) -> JointLayer:
     """In float64, with parameters far from their start."""
-    made = JointLayer(JointLayer.Config(**options), DIMS, {}, scale).double()
+    made = JointLayer(JointLayer.Config(**options), LayerParts(DIMS, {}, scale)).double()
     with torch.no_grad():
         for parameter in made.parameters():
             parameter += 0.3 * torch.randn_like(parameter)

@@ -90,8 +90,8 @@ def test_a_fixed_bandwidth_is_that_of_locusgs() -> None:
     ours = EllipsoidCrossAttention(EllipsoidCrossAttention.Config(**options), DIMS)
     theirs = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(**options), DIMS)
     assert torch.equal(ours.bias(state, memory).dense(), theirs.bias(state, memory).dense())
-    assert set(EllipsoidCrossAttention.requires(ours.config)) == set(
-        RayBiasedCrossAttention.requires(theirs.config)
+    assert set(EllipsoidCrossAttention.fields_read(ours.config)) == set(
+        RayBiasedCrossAttention.fields_read(theirs.config)
     )
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from globalsplat_inputs import DIMS, cameras, views
-from qgs_globalsplat.encoder import PatchEncoder, lens, place
+from qgs_globalsplat.encoder import PosedPatches, lens, place
 from qgs_globalsplat.slots import TEXTURE, SlotQueries
 
 from qgs.contracts import RecipeContext
@@ -17,7 +17,7 @@ OPTIONS = {"patch_size": 4, "rgb_width": 6, "ray_width": 5, "lens_width": 3, "ba
 
 def test_a_token_is_its_colours_beside_its_rays_and_its_camera() -> None:
     torch.manual_seed(0)
-    encoder, given = PatchEncoder(PatchEncoder.Config(**OPTIONS), DIMS), views()
+    encoder, given = PosedPatches(PosedPatches.Config(**OPTIONS), DIMS), views()
     memory = encoder(given)
     assert memory.features.shape == (2, 2 * 3 * 4 + 4, 11)
     assert memory.grid is memory.keys is memory.patch_rays is None
@@ -40,14 +40,14 @@ def test_a_token_is_its_colours_beside_its_rays_and_its_camera() -> None:
 def test_published_sizes_of_what_a_camera_tells() -> None:
     assert lens(cameras()).shape[-1] == 4
     assert place(cameras(), 4).shape[-1] == 27
-    config = PatchEncoder.Config()
-    assert PatchEncoder.provides(config)["memory.features"].shape == (768,)
-    assert PatchEncoder(config, DIMS).camera_proj.weight.shape == (256, 64 + 27)
+    config = PosedPatches.Config()
+    assert PosedPatches.fields_written(config)["memory.features"].shape == (768,)
+    assert PosedPatches(config, DIMS).camera_proj.weight.shape == (256, 64 + 27)
 
 
 def test_patches_go_with_their_views_and_registers_stay() -> None:
     torch.manual_seed(0)
-    encoder, given = PatchEncoder(PatchEncoder.Config(**OPTIONS), DIMS), views(3)
+    encoder, given = PosedPatches(PosedPatches.Config(**OPTIONS), DIMS), views(3)
     order = [2, 0, 1]
     one, other = encoder(given).features, encoder(given.select(order)).features
     torch.testing.assert_close(
@@ -57,16 +57,16 @@ def test_patches_go_with_their_views_and_registers_stay() -> None:
 
 
 def test_without_registers_there_is_a_grid() -> None:
-    memory = PatchEncoder(PatchEncoder.Config(**OPTIONS, registers=0), DIMS)(views())
+    memory = PosedPatches(PosedPatches.Config(**OPTIONS, registers=0), DIMS)(views())
     assert memory.grid == (2, 3, 4)
 
 
 def test_images_that_patches_do_not_divide_are_refused() -> None:
-    config = PatchEncoder.Config(patch_size=5)
-    (problem,) = PatchEncoder.problems(config, RecipeContext(DIMS, (12, 16)))
+    config = PosedPatches.Config(patch_size=5)
+    (problem,) = PosedPatches.problems(config, RecipeContext(DIMS, (12, 16)))
     assert "patches of 5 do not divide images of 12 x 16" in problem.reason
     with pytest.raises(ValueError, match="12 x 16 cannot be cut into patches of 5; resize"):
-        PatchEncoder(config, DIMS)(views())
+        PosedPatches(config, DIMS)(views())
 
 
 def test_two_streams_of_one_token() -> None:

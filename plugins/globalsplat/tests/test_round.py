@@ -7,6 +7,7 @@ from qgs_globalsplat.rounds import Round, Stream
 from qgs_globalsplat.slots import TEXTURE
 from torch import Tensor, nn
 
+from qgs.contracts import LayerParts
 from qgs.types import ImageMemory, QueryState
 
 HEADS, EACH = 2, 8
@@ -53,7 +54,7 @@ def one_stream(stream: Stream, x: Tensor, memory: Tensor) -> Tensor:
 
 
 def test_a_round_is_two_streams_and_a_mixer() -> None:
-    layer = lively(Round(Round.Config(memory_width=10), DIMS, {}, 0.5))
+    layer = lively(Round(Round.Config(memory_width=10), LayerParts(DIMS, {}, 0.5)))
     memory = ImageMemory(torch.randn(2, 7, 10).double())
     given = QueryState(state().features.double(), {TEXTURE: state()[TEXTURE].double()})
     after, passed = layer(given, memory)
@@ -71,7 +72,7 @@ def test_a_round_is_two_streams_and_a_mixer() -> None:
 
 
 def test_scales_start_as_published() -> None:
-    layer = Round(Round.Config(), DIMS, {}, 1e-3)
+    layer = Round(Round.Config(), LayerParts(DIMS, {}, 1e-3))
     scales = {n: p for n, p in layer.named_parameters() if n.endswith("gamma")}
     of_blocks = {n: p for n, p in scales.items() if ".blocks." in n}
     assert len(of_blocks) == 2 * 2 * 2
@@ -84,7 +85,7 @@ def test_scales_start_as_published() -> None:
 
 
 def test_tokens_that_decode_nothing_are_read() -> None:
-    layer = lively(Round(Round.Config(), DIMS, {}, 0.5)).float()
+    layer = lively(Round(Round.Config(), LayerParts(DIMS, {}, 0.5))).float()
     memory, given = ImageMemory(torch.randn(2, 7, 16)), state()
     mask = torch.tensor([True] * 4 + [False]).expand(2, -1)
     moved = given.features.clone()

@@ -60,7 +60,7 @@ def test_queries_start_as_configured() -> None:
 
 def test_queries_without_radius_provide_none() -> None:
     config = AnchoredQueries.Config(count=4, radius=False)
-    assert set(AnchoredQueries.provides(config)) == {"anchor.center"}
+    assert set(AnchoredQueries.fields_written(config)) == {"anchor.center"}
     assert set(AnchoredQueries(config, DIMS).start(1).fields) == {"anchor.center"}
 
 
@@ -127,7 +127,7 @@ def test_bandwidths_have_their_floor() -> None:
     torch.testing.assert_close(attention.sigma_sq(state), torch.tensor([[[1e-3], [4.0]]]))
     fixed = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(bandwidth="fixed"), DIMS)
     assert fixed.sigma_sq(state) == pytest.approx(0.01)
-    assert "anchor.raw_radius" not in RayBiasedCrossAttention.requires(fixed.config)
+    assert "anchor.raw_radius" not in RayBiasedCrossAttention.fields_read(fixed.config)
 
 
 LOCUS = {"recipe": 1, "plugins": ["locus"]}

@@ -7,7 +7,7 @@ from qgs_c3g.vggt import VggtFeatures
 
 plugin = Plugin(
     name="c3g",
-    contract_version=2,
+    contract_version=1,
     components=(JointLayer, C3GHead, VggtFeatures),
     examples=(
         JointLayer.Config(mlp_ratio=4.0, norm_eps=1e-3),

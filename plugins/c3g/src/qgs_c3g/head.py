@@ -1,7 +1,5 @@
 """`c3g/head`: from a query to its Gaussian, one by default (C3G)."""
 
-from typing import ClassVar
-
 import torch
 import torch.nn.functional as F
 from einops import rearrange
@@ -21,7 +19,7 @@ CHANNELS = (3, 1, 3, 4, 3)
 class C3GHead(Head):
     """LayerNorm, then D -> K * 14 linear and the published activations in float32."""
 
-    name: ClassVar[str] = "head"
+    name = "head"
 
     class Config(ComponentConfig):
         gaussians_per_query: int = Field(default=1, ge=1)
@@ -39,11 +37,6 @@ class C3GHead(Head):
         super().__init__(config, dims)
         self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
-
-    @property
-    def gaussians_per_query(self) -> int:
-        """K."""
-        return self.config.gaussians_per_query
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """Weight decay on all (C3G release)."""

@@ -3,9 +3,7 @@
 Axes: T = M + N tokens, those of the images first.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -14,14 +12,7 @@ from torch import Tensor, nn
 
 from qgs.components import NORM_EPS, Mlp
 from qgs.components.blocks import merge_heads, split_heads
-from qgs.contracts import (
-    MEMORY_FIELDS,
-    ComponentConfig,
-    DecoderLayer,
-    Fields,
-    ModelComponent,
-    ModelDims,
-)
+from qgs.contracts import ComponentConfig, DecoderLayer, LayerParts, memory_fields
 from qgs.types import ImageMemory, QueryState
 
 
@@ -32,7 +23,8 @@ class JointLayer(DecoderLayer):
     Keys, values and rays of the memory stay.
     """
 
-    name: ClassVar[str] = "joint"
+    name = "joint"
+    reads = memory_fields("features")
     reads_layer_scale = False
 
     class Config(ComponentConfig):
@@ -43,25 +35,14 @@ class JointLayer(DecoderLayer):
 
     config: Config
 
-    def __init__(
-        self,
-        config: Config,
-        dims: ModelDims,
-        sublayers: Mapping[str, ModelComponent],
-        layer_scale: float,
-    ) -> None:
-        super().__init__(config, dims, sublayers, layer_scale)
-        width = dims.width
+    def __init__(self, config: Config, parts: LayerParts) -> None:
+        super().__init__(config, parts)
+        width = parts.dims.width
         self.norm = nn.LayerNorm(width, config.norm_eps)
         self.qkv = nn.Linear(width, 3 * width, bias=False)
         self.proj = nn.Linear(width, width)
         self.mlp_norm = nn.LayerNorm(width, config.norm_eps)
         self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
-
-    @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        """Image tokens of the model's width."""
-        return {"memory.features": MEMORY_FIELDS["memory.features"]}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """Weight decay on all (C3G release)."""

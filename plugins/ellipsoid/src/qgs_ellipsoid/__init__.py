@@ -8,7 +8,7 @@ from qgs_ellipsoid.refinement import EllipsoidRefinement
 
 plugin = Plugin(
     name="ellipsoid",
-    contract_version=2,
+    contract_version=1,
     components=(
         EllipsoidQueries,
         EllipsoidCrossAttention,

@@ -1,6 +1,6 @@
 """`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it."""
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,7 @@ Radius = Annotated[float, Field(gt=0)]
 class EllipsoidQueries(LearnedQueries):
     """N learned vectors, centres mu, rotations and raw radii, shared by all scenes."""
 
-    name: ClassVar[str] = "anchored"
+    name = "anchored"
 
     class Config(RadiusOptions):
         count: int = Field(default=4096, ge=1)
@@ -45,14 +45,9 @@ class EllipsoidQueries(LearnedQueries):
         self.raw_radii = nn.Parameter(torch.cat(raw, -1))
 
     @classmethod
-    def provides(cls, config: Config) -> Fields:
+    def fields_written(cls, config: Config) -> Fields:
         """Centre, rotation and raw radii."""
         return {**CENTER_FIELD, **shape_fields(config)}
-
-    @property
-    def count(self) -> int:
-        """N."""
-        return self.features.shape[0]
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """No weight decay on rotations, whose length has no effect."""

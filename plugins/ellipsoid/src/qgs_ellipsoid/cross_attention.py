@@ -1,7 +1,5 @@
 """`ellipsoid/ray_biased`: queries attend more to rays that pass through their ellipsoid."""
 
-from typing import ClassVar
-
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER, RAW_RADIUS
 from torch import Tensor
@@ -20,14 +18,16 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
     a fixed bandwidth ignores the shape.
     """
 
-    name: ClassVar[str] = "ray_biased"
-    raw_radius: ClassVar[str] = RAW_RADII
+    name = "ray_biased"
+    raw_radius = RAW_RADII
 
     @classmethod
-    def requires(cls, config: RayBiasedCrossAttention.Config) -> Fields:
+    def fields_read(cls, config: RayBiasedCrossAttention.Config) -> Fields:
         """Those of `locus/ray_biased`, with a shape for its radius."""
         shape = shape_fields(config) if config.bandwidth == "radius" else {}
-        return {n: f for n, f in super().requires(config).items() if n != RAW_RADIUS} | dict(shape)
+        return {n: f for n, f in super().fields_read(config).items() if n != RAW_RADIUS} | dict(
+            shape
+        )
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""

@@ -1,7 +1,6 @@
 """`ellipsoid/gaussian_head`, `ellipsoid/axis_scaled`: Gaussians relative to their anchor."""
 
 from dataclasses import replace
-from typing import ClassVar
 
 from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, support_radius
@@ -23,7 +22,7 @@ class EllipsoidHead(GaussianHead):
     the ellipsoid has in that direction: s / |u / r|, with u the axis in the anchor's frame.
     """
 
-    name: ClassVar[str] = "gaussian_head"
+    name = "gaussian_head"
 
     class Config(GaussianHead.Config, RadiusOptions):
         """As `qgs/gaussian_head`; `scale_cap` is a multiple of the anchor's radius."""
@@ -31,7 +30,7 @@ class EllipsoidHead(GaussianHead):
     config: Config
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def fields_read(cls, config: Config) -> Fields:
         """The shape of the anchors."""
         return shape_fields(config)
 
@@ -56,10 +55,10 @@ def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
 class AxisScaledCenters(RadiusScaledCenters):
     """mean = mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
 
-    name: ClassVar[str] = "axis_scaled"
+    name = "axis_scaled"
 
     @classmethod
-    def requires(cls, config: RadiusScaledCenters.Config) -> Fields:
+    def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
         """Centres and shapes."""
         return {**CENTER_FIELD, **shape_fields(config)}
 

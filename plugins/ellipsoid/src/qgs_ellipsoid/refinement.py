@@ -1,7 +1,5 @@
 """`ellipsoid/refine`: updates centres, rotations and radii of anchors after each decoder layer."""
 
-from typing import ClassVar
-
 from qgs_locus.refinement import AnchorRefinement
 
 from qgs.contracts import Fields, ModelDims
@@ -13,8 +11,8 @@ from qgs_ellipsoid.rotations import turned
 class EllipsoidRefinement(AnchorRefinement):
     """`locus/refine` with three radii (rho += MLP(x)), and R = turn(MLP(x)) R."""
 
-    name: ClassVar[str] = "refine"
-    parts: ClassVar[tuple[str, ...]] = ("`center`", "`rotation`", "`radius`")
+    name = "refine"
+    parts = ("`center`", "`rotation`", "`radius`")
 
     class Config(AnchorRefinement.Config):
         rotation: bool = True
@@ -33,9 +31,9 @@ class EllipsoidRefinement(AnchorRefinement):
         return radii_field(config)
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def fields_read(cls, config: Config) -> Fields:
         """Whatever is refined."""
-        return {**super().requires(config), **(ROTATION_FIELD if config.rotation else {})}
+        return {**super().fields_read(config), **(ROTATION_FIELD if config.rotation else {})}
 
     def forward(self, state: QueryState) -> QueryState:
         """A state with moved centres, turned rotations and changed raw radii."""

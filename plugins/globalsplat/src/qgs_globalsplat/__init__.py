@@ -1,7 +1,7 @@
 """GlobalSplat for qgs: scene tokens in two streams, candidates merged by gates, two passes."""
 
 from qgs.contracts import ExpectedError, Plugin
-from qgs_globalsplat.encoder import PatchEncoder
+from qgs_globalsplat.encoder import PosedPatches
 from qgs_globalsplat.head import MergingHead
 from qgs_globalsplat.losses import Frustum, Regularisers
 from qgs_globalsplat.objective import TwoPasses
@@ -10,9 +10,9 @@ from qgs_globalsplat.slots import SlotQueries
 
 plugin = Plugin(
     name="globalsplat",
-    contract_version=2,
+    contract_version=1,
     components=(
-        PatchEncoder,
+        PosedPatches,
         SlotQueries,
         Round,
         MergingHead,
@@ -21,7 +21,7 @@ plugin = Plugin(
         TwoPasses,
     ),
     examples=(
-        PatchEncoder.Config(patch_size=4, rgb_width=24, ray_width=16, bands=2, registers=0),
+        PosedPatches.Config(patch_size=4, rgb_width=24, ray_width=16, bands=2, registers=0),
         SlotQueries.Config(count=12, extra=3, std=0.3),
         SlotQueries.Config(count=8, extra=0),
         Round.Config(memory_width=40, blocks=1, mlp_ratio=2.0, block_layer_scale=0.3),
@@ -35,7 +35,7 @@ plugin = Plugin(
             "masked_queries_are_not_read": "what a mask leaves out here are not places without a "
             "query, but tokens that decode nothing: registers, which the others read"
         },
-        PatchEncoder.Config(): {  # type: ignore[reportUnhashable]  # frozen, which pyright misses
+        PosedPatches.Config(): {  # type: ignore[reportUnhashable]  # frozen, which pyright misses
             "view_permutation": "its registers are of no view, so that its memory has no grid to "
             "permute by; its patches are permuted with their views, as without registers"
         },

@@ -1,8 +1,7 @@
 """`globalsplat/patches`: patches, their rays and their cameras, side by side, without a network."""
 
 import math
-from collections.abc import Iterable
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from einops import rearrange
@@ -10,17 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import Mlp
-from qgs.components.encoder import undivided
-from qgs.contracts import (
-    MEMORY_FIELDS,
-    ComponentConfig,
-    Encoder,
-    Fields,
-    FieldSpec,
-    ModelDims,
-    Problem,
-    RecipeContext,
-)
+from qgs.contracts import Fields, FieldSpec, ModelDims, PatchEncoder, memory_fields
 from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import plucker_rays
 from qgs.types import Cameras, ImageMemory, Views
@@ -29,20 +18,18 @@ REGISTER_STD = 0.02
 """Standard deviation of the normal distribution that the registers start from."""
 
 
-class PatchEncoder(Encoder):
+class PosedPatches(PatchEncoder):
     """A token of each patch: its colours beside its rays, to which its camera is added.
 
     The features are `rgb_width` + `ray_width` wide, whatever the width of the model. Learned
     registers, which are of no patch, stand behind the patches.
     """
 
-    name: ClassVar[str] = "patches"
+    name = "patches"
 
-    class Config(ComponentConfig):
+    class Config(PatchEncoder.Config):
         """Defaults are GlobalSplat's; the size of a patch is ours."""
 
-        patch_size: int = Field(default=8, ge=1)
-        """Side of a patch, pixels; must divide both sides of the image."""
         rgb_width: int = Field(default=512, ge=1)
         """Channels of a token that are made of the patch's colours."""
         ray_width: int = Field(default=256, ge=1)
@@ -68,28 +55,14 @@ class PatchEncoder(Encoder):
         self.registers = nn.Parameter(registers) if config.registers else None
 
     @classmethod
-    def provides(cls, config: Config) -> Fields:
+    def fields_written(cls, config: Config) -> Fields:
         """Features of their own width, and a grid where there are no registers behind it."""
         features = {"memory.features": FieldSpec((config.rgb_width + config.ray_width,))}
-        grid = {} if config.registers else {"memory.grid": MEMORY_FIELDS["memory.grid"]}
-        return {**features, **grid}
-
-    @classmethod
-    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Patches that do not divide the images."""
-        return undivided(config.patch_size, context)
+        return features if config.registers else {**features, **memory_fields("grid")}
 
     def forward(self, views: Views) -> ImageMemory:
-        """The memory, with a grid where there are no registers.
-
-        Raises ValueError when the patch does not divide the images.
-        """
-        side, (height, width) = self.config.patch_size, views.cameras.size
-        if height % side or width % side:
-            raise ValueError(
-                f"images of {height} x {width} cannot be cut into patches of {side}; resize the "
-                "views, or compose the model with another patch_size"
-            )
+        """The memory, with a grid where there are no registers."""
+        grid = self.grid(views)
         rgb_BVPC = _tokens(self.rgb_embedding, 2 * views.images - 1)
         ray_BVPC = _tokens(self.ray_embedding, plucker_rays(views.cameras))
         camera_BVC = torch.cat(
@@ -98,9 +71,9 @@ class PatchEncoder(Encoder):
         ray_BVPC = ray_BVPC + self.camera_proj(camera_BVC)[:, :, None]
         x_BMC = torch.cat([rgb_BVPC, ray_BVPC], -1).flatten(1, 2)
         if self.registers is None:
-            return ImageMemory(x_BMC, grid=(views.images.shape[1], height // side, width // side))
+            return ImageMemory(features=x_BMC, grid=grid)
         registers_BRC = self.registers.to(x_BMC).expand(len(x_BMC), -1, -1)
-        return ImageMemory(torch.cat([x_BMC, registers_BRC], 1))
+        return ImageMemory(features=torch.cat([x_BMC, registers_BRC], 1))
 
 
 def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -38,8 +37,9 @@ class MergingHead(Head):
     Between two whole levels both are shown, with logs of transmittance scaled by their shares.
     """
 
-    name: ClassVar[str] = "merging_head"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"level"})
+    name = "merging_head"
+    reads = TEXTURE_FIELD
+    scheduled = frozenset({"level"})
 
     class Config(ComponentConfig):
         """Defaults are GlobalSplat's, with `level` at its end; how weights start is ours."""
@@ -90,11 +90,6 @@ class MergingHead(Head):
                 self.geometry.weight.unflatten(0, (config.candidates, -1))[:, :3] = rows_C3D
 
     @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        """The stream of texture."""
-        return TEXTURE_FIELD
-
-    @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """More Gaussians than candidates; scales without a range."""
         most = int(math.log2(config.candidates))
@@ -106,7 +101,7 @@ class MergingHead(Head):
             yield Problem("scale_min", reason, "write a smaller one")
 
     @classmethod
-    def provides(cls, config: Config) -> Fields:
+    def fields_written(cls, config: Config) -> Fields:
         """Harmonics, unless their degree is 0."""
         sh = "gaussians.sh"
         return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}

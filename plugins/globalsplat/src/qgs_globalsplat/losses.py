@@ -1,14 +1,13 @@
 """`globalsplat/frustum`, `globalsplat/regularisers`: Gaussians in sight, few, small."""
 
 import math
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import ComponentConfig, Loss
+from qgs.contracts import Loss
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera
 from qgs.losses import mean_of_gaussians
@@ -18,11 +17,10 @@ from qgs.types import Cameras, LayerPrediction, Rendering, Views
 class Frustum(Loss):
     """Mean over Gaussians of `beyond_frusta` of the input cameras."""
 
-    name: ClassVar[str] = "frustum"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    name = "frustum"
     renderings = "none"
 
-    class Config(ComponentConfig):
+    class Config(Loss.Config):
         """The weight is GlobalSplat's."""
 
         weight: float = Field(default=0.01, ge=0)
@@ -34,23 +32,22 @@ class Frustum(Loss):
 
     config: Config
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
-    ) -> dict[str, Tensor]:
-        """One term, `frustum`."""
+    ) -> Tensor:
         options = self.config.softness, self.config.near
         per_point = beyond_frusta(prediction.gaussians.means, inputs.cameras, *options)
-        return {"frustum": self.config.weight * mean_of_gaussians(per_point, prediction)}
+        return mean_of_gaussians(per_point, prediction)
 
 
 class Regularisers(Loss):
     """Mean opacity and mean scale (as in Kheradmand et al. 2024, 3DGS as MCMC)."""
 
-    name: ClassVar[str] = "regularisers"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"opacity_weight", "scale_weight"})
+    name = "regularisers"
+    scheduled = frozenset({"weight", "opacity_weight", "scale_weight"})
     renderings = "none"
 
-    class Config(ComponentConfig):
+    class Config(Loss.Config):
         """The weights are GlobalSplat's."""
 
         opacity_weight: float = Field(default=0.01, ge=0)
@@ -60,7 +57,7 @@ class Regularisers(Loss):
 
     config: Config
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
         """Terms `mean_opacity`, `mean_scale`."""

@@ -1,7 +1,6 @@
 """`globalsplat/two_passes`: two predictions of one scene, from different photos, should agree."""
 
 from collections.abc import Iterable
-from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
@@ -28,8 +27,8 @@ class TwoPasses(Objective):
     other one, which stands still meanwhile.
     """
 
-    name: ClassVar[str] = "two_passes"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"alpha_weight", "depth_weight"})
+    name = "two_passes"
+    scheduled = frozenset({"alpha_weight", "depth_weight"})
 
     class Config(ComponentConfig):
         """Defaults are GlobalSplat's."""

@@ -1,8 +1,5 @@
 """`globalsplat/round`: a decoder layer of two streams that read the photos, then are mixed."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -14,7 +11,7 @@ from qgs.contracts import (
     DecoderLayer,
     Fields,
     FieldSpec,
-    ModelComponent,
+    LayerParts,
     ModelDims,
 )
 from qgs.types import ImageMemory, QueryState
@@ -28,7 +25,8 @@ class Round(DecoderLayer):
     the mask leaves out decode no Gaussians, but all tokens read them: they are registers.
     """
 
-    name: ClassVar[str] = "round"
+    name = "round"
+    writes = TEXTURE_FIELD
 
     class Config(ComponentConfig):
         """Defaults are GlobalSplat's."""
@@ -43,14 +41,9 @@ class Round(DecoderLayer):
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width (rounded down) of the streams' MLPs over the model's width."""
 
-    def __init__(
-        self,
-        config: Config,
-        dims: ModelDims,
-        sublayers: Mapping[str, ModelComponent],
-        layer_scale: float,
-    ) -> None:
-        super().__init__(config, dims, sublayers, layer_scale)
+    def __init__(self, config: Config, parts: LayerParts) -> None:
+        super().__init__(config, parts)
+        dims, layer_scale = parts.dims, parts.layer_scale
         self.geometry = Stream(config, dims, layer_scale)
         self.texture = Stream(config, dims, layer_scale)
         self.geometry_norm = nn.LayerNorm(dims.width)
@@ -59,14 +52,9 @@ class Round(DecoderLayer):
         self.mixer_scale = LayerScale(2 * dims.width, layer_scale)
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def fields_read(cls, config: Config) -> Fields:
         """Features of the memory, as wide as the options say, and the stream of texture."""
         return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
-
-    @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        """The stream of texture, updated."""
-        return TEXTURE_FIELD
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         """One round; the memory is passed on."""

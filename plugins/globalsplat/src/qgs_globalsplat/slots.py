@@ -1,7 +1,6 @@
 """`globalsplat/slots`: learned tokens, each as two streams, one of geometry, one of texture."""
 
 from collections.abc import Iterable
-from typing import ClassVar
 
 import torch
 from pydantic import Field
@@ -31,7 +30,8 @@ class SlotQueries(LearnedQueries):
     Geometry = Linear(LayerNorm(token)), texture = another Linear(LayerNorm(token)).
     """
 
-    name: ClassVar[str] = "slots"
+    name = "slots"
+    writes = TEXTURE_FIELD
 
     class Config(ComponentConfig):
         """Defaults are GlobalSplat's."""
@@ -55,21 +55,11 @@ class SlotQueries(LearnedQueries):
         self.texture = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
 
     @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        """The stream of texture."""
-        return TEXTURE_FIELD
-
-    @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """Tokens of which none decodes Gaussians."""
         if config.extra >= config.count:
             reason = f"all {config.count} tokens are extra ones, which decode no Gaussians"
             yield Problem("extra", reason, f"write at most {config.count - 1}, or raise `count`")
-
-    @property
-    def count(self) -> int:
-        """N, extra tokens included."""
-        return self.config.count
 
     def start(self, batch_size: int) -> QueryState:
         """The two streams of all tokens, in every scene alike."""
@@ -81,5 +71,5 @@ class SlotQueries(LearnedQueries):
     def _mask(self, batch_size: int) -> Tensor | None:
         if self.extra is None:
             return None
-        places = torch.arange(self.count, device=self.slots.device)
+        places = torch.arange(self.config.count, device=self.slots.device)
         return (places < len(self.slots)).expand(batch_size, -1)

@@ -7,7 +7,7 @@ from qgs_gslrm.pixels import AlongRays, PixelQueries
 
 plugin = Plugin(
     name="gslrm",
-    contract_version=2,
+    contract_version=1,
     components=(Transformer, PixelQueries, PixelHead, AlongRays),
     examples=(
         Transformer.Config(depth=2, mlp_ratio=2.0),

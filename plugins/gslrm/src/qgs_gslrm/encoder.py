@@ -1,8 +1,5 @@
 """`gslrm/transformer`: patches of colours and rays, one linear layer, a plain transformer."""
 
-from collections.abc import Iterable
-from typing import ClassVar
-
 import torch
 import torch.nn.functional as F
 from einops import rearrange
@@ -11,16 +8,7 @@ from torch import Tensor, nn
 
 from qgs.components import NORM_EPS
 from qgs.components.blocks import merge_heads, split_heads
-from qgs.components.encoder import undivided
-from qgs.contracts import (
-    MEMORY_FIELDS,
-    ComponentConfig,
-    Encoder,
-    Fields,
-    ModelDims,
-    Problem,
-    RecipeContext,
-)
+from qgs.contracts import ModelDims, PatchEncoder, memory_fields
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
 
@@ -51,19 +39,18 @@ class Block(nn.Module):
         return x_BMD + self.fc2(F.gelu(self.fc1(self.norm2(x_BMD))))
 
 
-class Transformer(Encoder):
+class Transformer(PatchEncoder):
     """A token for each patch of all views, through blocks of self-attention over all of them.
 
     Its memory has features, rays and the grid, but neither keys nor values: GS-LRM has no decoder.
     """
 
-    name: ClassVar[str] = "transformer"
+    name = "transformer"
+    writes = memory_fields("features", "patch_rays", "grid")
 
-    class Config(ComponentConfig):
+    class Config(PatchEncoder.Config):
         """Defaults are the paper's."""
 
-        patch_size: int = Field(default=8, ge=1)
-        """P, side of a patch, pixels; must divide both sides of the image."""
         depth: int = Field(default=24, ge=0, le=256)
         """Number of blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
@@ -88,33 +75,16 @@ class Transformer(Encoder):
             if isinstance(module, nn.Linear):
                 nn.init.normal_(module.weight, std=config.init_std)
 
-    @classmethod
-    def provides(cls, config: Config) -> Fields:
-        """Features, rays and the grid."""
-        known = ("memory.features", "memory.patch_rays", "memory.grid")
-        return {name: MEMORY_FIELDS[name] for name in known}
-
-    @classmethod
-    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """A patch that does not divide the images."""
-        return undivided(config.patch_size, context)
-
     def forward(self, views: Views) -> ImageMemory:
         """Features (B, M, D), before any last norm, which belongs to the head.
 
         Raises ValueError when the patch does not divide the images.
         """
-        patch, (height, width) = self.config.patch_size, views.cameras.size
-        if height % patch or width % patch:
-            raise ValueError(
-                f"images of {height} x {width} cannot be cut into patches of {patch}; "
-                "resize the views, or compose the model with another patch_size"
-            )
+        patch, grid = self.config.patch_size, self.grid(views)
         plucker_BV6HW = plucker_rays(views.cameras)
         pixels_BV9HW = torch.cat([2 * views.images - 1, plucker_BV6HW], 2)
         x_BMC = rearrange(pixels_BV9HW, "b v c (h p) (w q) -> b (v h w) (p q c)", p=patch, q=patch)
         x_BMD = self.norm(self.embedding(x_BMC))
         for block in self.blocks:
             x_BMD = block(x_BMD)
-        grid = (views.images.shape[1], height // patch, width // patch)
-        return ImageMemory(x_BMD, patch_rays=patch_rays(plucker_BV6HW, patch), grid=grid)
+        return ImageMemory(features=x_BMD, patch_rays=patch_rays(plucker_BV6HW, patch), grid=grid)

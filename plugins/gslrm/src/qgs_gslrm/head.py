@@ -1,6 +1,6 @@
 """`gslrm/pixel_head`: LayerNorm and one linear layer, a token to the Gaussians of its pixels."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from einops import rearrange
@@ -17,7 +17,7 @@ from qgs.types import GaussianAttributes, QueryState
 class PixelHead(Head):
     """LayerNorm, then D -> K (3 or 1 + 11) linear, both without biases."""
 
-    name: ClassVar[str] = "pixel_head"
+    name = "pixel_head"
 
     class Config(ComponentConfig):
         """Defaults are those of the public re-implementations."""
@@ -48,11 +48,6 @@ class PixelHead(Head):
         outputs = config.gaussians_per_query * sum(self.channels)
         self.linear = nn.Linear(dims.width, outputs, bias=False)
         nn.init.normal_(self.linear.weight, std=config.init_std)
-
-    @property
-    def gaussians_per_query(self) -> int:
-        """K."""
-        return self.config.gaussians_per_query
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """Weight decay on the linear layer too (paper); a head has none by default."""

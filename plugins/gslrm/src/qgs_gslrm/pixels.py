@@ -1,7 +1,7 @@
 """`gslrm/pixels`, `gslrm/along_rays`: a query for each image token, means along rays of pixels."""
 
 import math
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -10,13 +10,13 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from qgs.contracts import (
-    MEMORY_FIELDS,
     Centers,
     ComponentConfig,
     Fields,
     FieldSpec,
     OptionError,
     Queries,
+    memory_fields,
 )
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, QueryState, Views
@@ -36,21 +36,9 @@ PATCH_FIELD: Fields = {
 class PixelQueries(Queries):
     """A query for each image token, with its features, that knows the rays of its patch."""
 
-    name: ClassVar[str] = "pixels"
-
-    @property
-    def count(self) -> None:
-        """As many as there are image tokens."""
-
-    @classmethod
-    def requires(cls, config: ComponentConfig) -> Fields:
-        """Tokens of patches, as wide as the model."""
-        return {name: MEMORY_FIELDS[name] for name in ("memory.features", "memory.grid")}
-
-    @classmethod
-    def provides(cls, config: ComponentConfig) -> Fields:
-        """The rays of the patch."""
-        return PATCH_FIELD
+    name = "pixels"
+    reads = memory_fields("features", "grid")
+    writes = PATCH_FIELD
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Features (B, M, D) of the tokens, `gslrm.patch` (B, M, 4, 3)."""
@@ -106,7 +94,8 @@ class AlongRays(Centers):
     `patch_rays_at`.
     """
 
-    name: ClassVar[str] = "along_rays"
+    name = "along_rays"
+    reads = PATCH_FIELD
 
     class Config(ComponentConfig):
         near: float = Field(default=0.0, ge=0)
@@ -126,11 +115,6 @@ class AlongRays(Centers):
             return self
 
     config: Config
-
-    @classmethod
-    def requires(cls, config: Config) -> Fields:
-        """The rays of the patch."""
-        return PATCH_FIELD
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""

@@ -13,7 +13,7 @@ FRUSTUM = FrustumCenters(kind="frustum")
 
 plugin = Plugin(
     name="locus",
-    contract_version=2,
+    contract_version=1,
     components=(
         AnchoredQueries,
         RayBiasedCrossAttention,

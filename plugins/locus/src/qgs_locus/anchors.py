@@ -1,7 +1,7 @@
 """`locus/anchored`: every query has a 3D anchor, a centre with a support radius."""
 
 from collections.abc import Iterable
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, field_validator
@@ -75,7 +75,7 @@ class FrustumCenters(ComponentConfig):
 class AnchoredQueries(LearnedQueries):
     """N learned vectors, centres mu and raw radii rho, shared by all scenes (LocusGS)."""
 
-    name: ClassVar[str] = "anchored"
+    name = "anchored"
 
     class Config(RadiusOptions):
         count: int = Field(default=4096, ge=1)
@@ -102,7 +102,7 @@ class AnchoredQueries(LearnedQueries):
             self.raw_radius = nn.Parameter(torch.full((config.count, 1), raw))
 
     @classmethod
-    def provides(cls, config: Config) -> Fields:
+    def fields_written(cls, config: Config) -> Fields:
         """The centre, and the raw radius if there is one."""
         return {**CENTER_FIELD, **(radius_field(config) if config.radius else {})}
 
@@ -112,11 +112,6 @@ class AnchoredQueries(LearnedQueries):
         if not config.radius:
             idle = ("init_radius", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`radius` is false")
-
-    @property
-    def count(self) -> int:
-        """N."""
-        return self.features.shape[0]
 
     def start(self, batch_size: int) -> QueryState:
         """Features (B, N, D), `anchor.center` (B, N, 3) and `anchor.raw_radius` (B, N, 1)."""

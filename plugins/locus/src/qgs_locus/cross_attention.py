@@ -1,7 +1,7 @@
 """`locus/ray_biased`: queries attend more to rays that pass near their anchor."""
 
 from collections.abc import Iterable
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -38,8 +38,8 @@ class RayBiasedCrossAttention(CrossAttention):
     sigma = sigma0 r ("radius") or sigma0 ("fixed"); the bias is the same for all heads.
     """
 
-    name: ClassVar[str] = "ray_biased"
-    raw_radius: ClassVar[str] = RAW_RADIUS
+    name = "ray_biased"
+    raw_radius = RAW_RADIUS
 
     class Config(RadiusOptions):
         bandwidth: Literal["radius", "fixed"] = "radius"
@@ -65,7 +65,7 @@ class RayBiasedCrossAttention(CrossAttention):
         self.raw_gamma = nn.Parameter(torch.tensor(config.gamma_init))
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def fields_read(cls, config: Config) -> Fields:
         """Keys, values, patch rays, centres, and radii if the bandwidth follows them."""
         memory = ("memory.keys", "memory.values", "memory.patch_rays")
         radius = radius_field(config) if config.bandwidth == "radius" else {}

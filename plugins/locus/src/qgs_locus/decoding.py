@@ -1,7 +1,7 @@
 """`locus/anchor_offset`, `locus/radius_scaled`: means around the query's anchor."""
 
 from collections.abc import Iterable
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 from torch import Tensor
@@ -40,17 +40,13 @@ class OffsetOptions(ComponentConfig):
 class AnchorOffsetCenters(Centers):
     """mean = mu + posact(offset)."""
 
-    name: ClassVar[str] = "anchor_offset"
+    name = "anchor_offset"
+    reads = CENTER_FIELD
 
     class Config(OffsetOptions):
         """See `OffsetOptions`."""
 
     config: Config
-
-    @classmethod
-    def requires(cls, config: Config) -> Fields:
-        """Centres."""
-        return CENTER_FIELD
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
@@ -66,7 +62,7 @@ class AnchorOffsetCenters(Centers):
 class RadiusScaledCenters(AnchorOffsetCenters):
     """mean = mu + r posact(offset)."""
 
-    name: ClassVar[str] = "radius_scaled"
+    name = "radius_scaled"
 
     class Config(OffsetOptions, RadiusOptions):
         """See `OffsetOptions` and `RadiusOptions`."""
@@ -74,7 +70,7 @@ class RadiusScaledCenters(AnchorOffsetCenters):
     config: Config
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def fields_read(cls, config: Config) -> Fields:
         """Centres and radii."""
         return {**CENTER_FIELD, **radius_field(config)}
 

@@ -1,7 +1,7 @@
 """`locus/refine`: updates the centres and radii of anchors after each decoder layer."""
 
 from collections.abc import Iterable
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 from torch import Tensor, nn
@@ -16,8 +16,8 @@ from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field
 class AnchorRefinement(Refinement):
     """mu += posact(MLP_mu(x)), rho += MLP_rho(x), heads shared by all layers (LocusGS)."""
 
-    name: ClassVar[str] = "refine"
-    parts: ClassVar[tuple[str, ...]] = ("`center`", "`radius`")
+    name = "refine"
+    parts = ("`center`", "`radius`")
 
     class Config(RadiusOptions):
         center: bool = True
@@ -56,20 +56,20 @@ class AnchorRefinement(Refinement):
         return radius_field(config)
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
+    def fields_read(cls, config: Config) -> Fields:
         """Whatever is refined."""
         center = CENTER_FIELD if config.center else {}
         return {**center, **(cls.radius_field(config) if config.radius else {})}
 
     @classmethod
-    def provides(cls, config: Config) -> Fields:
+    def fields_written(cls, config: Config) -> Fields:
         """Whatever is refined."""
-        return cls.requires(config)
+        return cls.fields_read(config)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """Nothing to refine, and options without effect."""
-        if not cls.requires(config):
+        if not cls.fields_read(config):
             yield Problem(
                 "",
                 f"nothing is refined: {', '.join(cls.parts)} are all false",

@@ -1,14 +1,14 @@
 """`locus/anchor_aware`: self-attention with an embedding of the anchors' centres."""
 
 import math
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import NORM_EPS, Mlp, SelfAttentionCore
-from qgs.contracts import AttentionWeights, ComponentConfig, Fields, ModelDims, SelfAttention
+from qgs.contracts import AttentionWeights, ComponentConfig, ModelDims, SelfAttention
 from qgs.geometry.precision import full_precision
 from qgs.types import QueryState
 from qgs_locus.fields import CENTER, CENTER_FIELD
@@ -35,7 +35,8 @@ class AnchorAwareSelfAttention(SelfAttention):
     The residual stream does not keep p.
     """
 
-    name: ClassVar[str] = "anchor_aware"
+    name = "anchor_aware"
+    reads = CENTER_FIELD
 
     class Config(ComponentConfig):
         position: Literal["tanh", "raw"] = "tanh"
@@ -56,11 +57,6 @@ class AnchorAwareSelfAttention(SelfAttention):
         self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
         self.position_mlp = Mlp(3 * config.features, dims.width, dims.width)
-
-    @classmethod
-    def requires(cls, config: Config) -> Fields:
-        """Centres."""
-        return CENTER_FIELD
 
     def position_embedding(self, state: QueryState) -> Tensor:
         """p (B, N, D)."""

@@ -1,12 +1,11 @@
 """`locus/anchor_visibility`: moves anchors that no target view sees towards the nearest one."""
 
 from collections.abc import Iterable
-from typing import ClassVar
 
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import Fields, Loss, Problem, RecipeContext
+from qgs.contracts import Loss, Problem, RecipeContext
 from qgs.losses import VisibilityOptions, mean_of_gaussians, view_visibility
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs_locus.fields import CENTER, CENTER_FIELD
@@ -15,8 +14,8 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 class AnchorVisibility(Loss):
     """Mean over queries of `qgs.losses.view_visibility` of their anchor centres (LocusGS)."""
 
-    name: ClassVar[str] = "anchor_visibility"
-    scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    name = "anchor_visibility"
+    reads = CENTER_FIELD
     renderings = "none"
 
     class Config(VisibilityOptions):
@@ -28,19 +27,13 @@ class AnchorVisibility(Loss):
     config: Config
 
     @classmethod
-    def requires(cls, config: Config) -> Fields:
-        """Centres."""
-        return CENTER_FIELD
-
-    @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """Options that contradict each other or have no effect."""
         return config.conflicts()
 
-    def forward(
+    def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
-    ) -> dict[str, Tensor]:
-        """One term, `anchor_visibility`."""
+    ) -> Tensor:
         per_anchor = view_visibility(
             prediction.state[CENTER],
             target.cameras,
@@ -48,4 +41,4 @@ class AnchorVisibility(Loss):
             behind=self.config.behind,
             z_guard=self.config.z_guard,
         )
-        return {"anchor_visibility": self.config.weight * mean_of_gaussians(per_anchor, prediction)}
+        return mean_of_gaussians(per_anchor, prediction)

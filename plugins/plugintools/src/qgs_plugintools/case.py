@@ -9,6 +9,7 @@ from pydantic_core import to_jsonable_python
 from torch import Tensor, nn
 
 from qgs.components import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
+from qgs.composer.build import load_pretrained
 from qgs.composer.errors import did_you_mean
 from qgs.composer.registry import component_fault
 from qgs.composer.yaml_text import dump
@@ -16,6 +17,7 @@ from qgs.contracts import (
     Component,
     ComponentConfig,
     DecoderLayer,
+    LayerParts,
     ModelComponent,
     ModelDims,
     Problem,
@@ -86,7 +88,7 @@ class Case:
         fault = component_fault(component)
         if fault:
             raise TypeError(f"{component.__qualname__} cannot be checked: {fault}")
-        known = {*component.requires(self.config), *component.provides(self.config)}
+        known = {*component.fields_read(self.config), *component.fields_written(self.config)}
         for name in self.fields.keys() - known:
             raise ValueError(
                 f"fields names {name!r}, which this component neither requires nor provides; "
@@ -158,8 +160,11 @@ class Case:
         if issubclass(make, DecoderLayer):
             inside = {slot: SUBLAYERS[slot] for slot in make.sublayers}
             parts = {slot: part(part.Config(), self.dims) for slot, part in inside.items()}
-            return make(self.config, self.dims, parts, LAYER_SCALE)
-        return make(self.config, self.dims) if self.has_parameters else make(self.config)
+            return make(self.config, LayerParts(self.dims, parts, LAYER_SCALE))
+        built = make(self.config, self.dims) if self.has_parameters else make(self.config)
+        if isinstance(built, nn.Module):
+            load_pretrained(built)
+        return built
 
     def lively(self, seed: int = 0) -> Any:
         """An instance in evaluation mode in which no parameter is zero by initialisation."""

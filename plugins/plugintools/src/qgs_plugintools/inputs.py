@@ -84,14 +84,14 @@ def tracked_inputs(case: Case, inputs: Inputs) -> Inputs:
 
 def required_fields(case: Case) -> dict[str, FieldSpec]:
     """The fields of the state of the queries that the case requires."""
-    required = case.component.requires(case.config)
+    required = case.component.fields_read(case.config)
     elsewhere = ("memory.", "rendering.", "gaussians.")
     return {n: spec for n, spec in required.items() if not n.startswith(elsewhere)}
 
 
 def memory_width(case: Case) -> int:
     """Width of the memory's features: what the case requires, else that of its model."""
-    spec = case.component.requires(case.config).get("memory.features")
+    spec = case.component.fields_read(case.config).get("memory.features")
     width = spec.shape[0] if spec else "D"
     return width if isinstance(width, int) else case.dims.width
 
@@ -195,7 +195,7 @@ class Maker:
 
     def gives(self, name: str) -> bool:
         """Whether Gaussians have `sh` or `features`: for a renderer, and what requires them."""
-        required = self.case.component.requires(self.case.config)
+        required = self.case.component.fields_read(self.case.config)
         return self.case.slot == "renderer" or f"gaussians.{name}" in required
 
     def prediction(self) -> LayerPrediction:

@@ -47,7 +47,7 @@ class ForgetsToReturn(MlpFeedForward):
 class GivesNumbersAsTerms(Loss):
     renderings = "each"
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         return {"error": (rendering.rgb - target.images).square().mean().item()}
 
 

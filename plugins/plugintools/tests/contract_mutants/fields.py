@@ -20,7 +20,7 @@ class AtPlaces:
     """A component that reads centres."""
 
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return PLACE
 
 
@@ -42,7 +42,7 @@ class Steps(AtPlaces, Refinement):
         self.step = nn.Linear(dims.width, 3)
 
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return PLACE
 
     def moved(self, center: Tensor, step: Tensor) -> dict[str, Tensor]:
@@ -90,7 +90,7 @@ class SearchesTheFields(NoRefinement):
 class ReadsAnUndeclaredRendering(Loss):
     renderings = "none"
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
 
 
@@ -98,7 +98,7 @@ class ReadsAnUndeclaredRendering(Loss):
 class ReadsAFieldOfThePrediction(Loss):
     renderings = "none"
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         radius = prediction.state.fields.get("anchor.raw_radius")
         small = prediction.gaussians.scales.mean()
         return {"small": small if radius is None else small + radius.mean()}
@@ -113,8 +113,8 @@ class ReadsTheGridUndeclared(ContentCrossAttention):
 @mutant("requires_are_read", "requires memory.grid, which")
 class RequiresTheGridForNothing(ContentCrossAttention):
     @classmethod
-    def requires(cls, config):
-        return {**super().requires(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
+    def fields_read(cls, config):
+        return {**super().fields_read(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
 
 
 @mutant(
@@ -124,7 +124,7 @@ class RequiresTheGridForNothing(ContentCrossAttention):
 )
 class RequiresTooMuch(ContentCrossAttention):
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return MEMORY_FIELDS
 
 

@@ -35,11 +35,11 @@ class DetachesLaterGaussians(FreeCenters):
         return super().forward(torch.cat([first, later.detach()], 2), state)
 
 
-@mutant("terms_have_gradients", "from the term term")
+@mutant("terms_have_gradients", "no gradient comes from the term")
 class DetachedLoss(OneTerm):
     renderings = "each"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         return (rendering.rgb.detach() - target.images.detach()).square().mean()
 
 
@@ -47,7 +47,7 @@ class DetachedLoss(OneTerm):
 class HasATermOfTheTargetAlone(Loss):
     renderings = "each"
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         error = (rendering.rgb - target.images).square().mean()
         return {"error": error, "contrast": target.images.square().mean()}
 
@@ -56,7 +56,7 @@ class HasATermOfTheTargetAlone(Loss):
 class HasATermOfTheInputsAlone(Loss):
     renderings = "each"
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         error = (rendering.rgb - target.images).square().mean()
         return {"error": error, "brightness": inputs.images.mean()}
 

@@ -58,9 +58,9 @@ class ReadsItsWeightOnce(Opacity):
         super().__init__(config)
         self.weight = config.weight
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         opacities = prediction.gaussians.opacities
-        return {"opacity": self.weight * -(opacities + self.config.eps).log().mean()}
+        return self.weight * -(opacities + self.config.eps).log().mean()
 
 
 @mutant(
@@ -72,14 +72,14 @@ class KeepsWhatItMadeOfAnOption(Opacity):
     scheduled = frozenset({"weight", "eps"})
     made = None
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         self.made = self.config.eps if self.made is None else self.made
         opacities = prediction.gaussians.opacities
-        return {"opacity": self.config.weight * -(opacities + 1e4 * self.made).log().mean()}
+        return -(opacities + 1e4 * self.made).log().mean()
 
 
-@mutant("scheduled_options_are_read_anew", "changes what it requires", options={"weight": 0.0})
+@mutant("scheduled_options_are_read_anew", "changes its `fields_read`", options={"weight": 0.0})
 class RequiresWhatItsWeightSays(Opacity):
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return {"a.field": FieldSpec((3,))} if config.weight else {}

@@ -67,7 +67,7 @@ class PlacesQueriesInHalf(LatentQueries):
         self.turn = nn.Parameter(TURN.clone())
 
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return PLACE
 
     def start(self, batch_size):
@@ -85,11 +85,11 @@ class KeepsItsRadiusInHalf(Refinement):
         self.step = nn.Linear(dims.width, 1)
 
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return RADIUS
 
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return RADIUS
 
     def forward(self, state):
@@ -108,7 +108,7 @@ class DecodesInHalf(GaussianHead):
 @mutant(CHECK, "explain.geometry")
 class BiasesInHalf(ContentCrossAttention):
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         memory = ("memory.keys", "memory.values", "memory.patch_rays")
         return {**PLACE, **{name: MEMORY_FIELDS[name] for name in memory}}
 
@@ -143,11 +143,11 @@ class ExplainsNoBias(BiasesInHalf):
         return self.core.explain(state.features, memory.keys, queries)
 
 
-@mutant(CHECK, "term: values differ", also="masked_queries_are_not_judged")
+@mutant(CHECK, "values differ", also="masked_queries_are_not_judged")
 class MeasuresInHalf(OneTerm):
     renderings = "none"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         scales = prediction.gaussians.scales
         return (scales @ scales.mT).mean((1, 2)).mean().to(scales)
 

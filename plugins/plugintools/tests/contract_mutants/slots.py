@@ -27,17 +27,11 @@ from qgs.contracts import (
     SceneSource,
 )
 from qgs.metrics.images import Psnr
-from qgs.types import Cameras, ImageMemory, LayerPrediction, Rendering, Views
+from qgs.types import Cameras, ImageMemory, Views
 
 
 class OneTerm(Loss):
     """A loss of one term, which mutants define."""
-
-    def term(self, prediction: LayerPrediction, rendering: Rendering, target: Views) -> Tensor:
-        raise NotImplementedError
-
-    def forward(self, prediction, rendering, target, inputs):
-        return {"term": self.term(prediction, rendering, target)}
 
 
 class ChangedEncoder(MultiViewViT):
@@ -134,7 +128,7 @@ class HoldsOutTooMuch(DrawsItsImages):
 class SumsOverScenes(OneTerm):
     renderings = "each"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         return (rendering.rgb - target.images).square().mean((1, 2, 3, 4)).sum()
 
 
@@ -142,7 +136,7 @@ class SumsOverScenes(OneTerm):
 class TakesTheWorstView(OneTerm):
     renderings = "each"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
 
 
@@ -277,7 +271,7 @@ class SharesItsProjection(CrossAttention):
         self.kv = nn.Linear(dims.width, 2 * dims.width)
 
     @classmethod
-    def requires(cls, config):
+    def fields_read(cls, config):
         return {"memory.features": MEMORY_FIELDS["memory.features"]}
 
     def forward(self, state, memory):
@@ -346,7 +340,7 @@ class IgnoresTheMask(ContentSelfAttention):
 class JudgesWhatIsMasked(OneTerm):
     renderings = "none"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         return prediction.gaussians.scales.mean()
 
 

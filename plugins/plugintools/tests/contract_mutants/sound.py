@@ -111,8 +111,8 @@ class ReadsTheFirstViewMost(ContentCrossAttention):
     ordered_views = True
 
     @classmethod
-    def requires(cls, config):
-        return {**super().requires(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
+    def fields_read(cls, config):
+        return {**super().fields_read(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
 
     def forward(self, state, memory):
         views = memory.grid[0]
@@ -153,7 +153,7 @@ class DecodesItsQueries(LearnedQueries):
         return self.code.shape[0]
 
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return {"place.size": FieldSpec((1,))}
 
     def start(self, batch_size):
@@ -213,8 +213,11 @@ class EachHeadSeesASide(ContentCrossAttention):
     """A bias for each head that hides what lies left, or right, of the camera's axis."""
 
     @classmethod
-    def requires(cls, config):
-        return {**super().requires(config), "memory.patch_rays": MEMORY_FIELDS["memory.patch_rays"]}
+    def fields_read(cls, config):
+        return {
+            **super().fields_read(config),
+            "memory.patch_rays": MEMORY_FIELDS["memory.patch_rays"],
+        }
 
     def bias(self, state, memory):
         side_B1M = memory.patch_rays[:, None, :, 3]

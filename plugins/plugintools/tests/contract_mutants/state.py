@@ -47,7 +47,7 @@ class ReturnsItsBuffer(Refinement):
         self.register_buffer("home", torch.zeros(1, 1, 3))
 
     @classmethod
-    def provides(cls, config):
+    def fields_written(cls, config):
         return PLACE
 
     def forward(self, state):

@@ -77,11 +77,11 @@ class FadesLaterGaussians(ChangedRenderer):
         return replace(gaussians, opacities=gaussians.opacities / (1 + number / 100)), cameras
 
 
-@mutant("query_permutation", "permuted queries, term")
+@mutant("query_permutation", "permuted queries")
 class MeasuresTheFirstGaussian(OneTerm):
     renderings = "none"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         return prediction.gaussians.scales[:, :1].mean()
 
 
@@ -117,20 +117,20 @@ class ScalesDepthByView(ChangedRenderer):
         return replace(out, depth=out.depth / number[:, None, None, None])
 
 
-@mutant("view_permutation", "permuted views, term")
+@mutant("view_permutation", "permuted views")
 class WeighsTheFirstViewMost(OneTerm):
     renderings = "all"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         error = (rendering.rgb - target.images).square().mean((0, 2, 3, 4))
         return (error / torch.arange(1.0, len(error) + 1).to(error)).sum()
 
 
-@mutant("view_permutation", "permuted views, term")
+@mutant("view_permutation", "permuted views")
 class ComparesWithTheFirstInput(Loss):
     renderings = "all"
 
-    def forward(self, prediction, rendering, target, inputs):
+    def term(self, prediction, rendering, target, inputs):
         return {"term": (rendering.rgb - inputs.images[:, :1]).square().mean()}
 
 
@@ -152,19 +152,19 @@ class DarkensByHeight(ChangedRenderer):
 
 @mutant(
     "world_frame_makes_no_difference",
-    "in a moved world, term",
+    "in a moved world",
     also="masked_queries_are_not_judged",
 )
 class MeasuresFromTheOrigin(OneTerm):
     renderings = "none"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         return prediction.gaussians.means.square().mean()
 
 
 @mutant(
     "world_frame_makes_no_difference",
-    "in a moved world, term",
+    "in a moved world",
     also="masked_queries_are_not_judged",
 )
 class MeasuresHeight(OneTerm):
@@ -172,6 +172,6 @@ class MeasuresHeight(OneTerm):
 
     renderings = "none"
 
-    def term(self, prediction, rendering, target):
+    def term(self, prediction, rendering, target, inputs):
         height = prediction.gaussians.means[..., 1]
         return (height - height.mean(1, keepdim=True)).square().mean()

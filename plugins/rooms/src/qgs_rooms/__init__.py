@@ -5,7 +5,7 @@ from qgs_rooms.source import RoomsSource
 
 plugin = Plugin(
     name="rooms",
-    contract_version=2,
+    contract_version=1,
     components=(RoomsSource,),
     models={
         "locus-128": "models/locus-128.safetensors",

@@ -115,13 +115,13 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
                     *((batch, heads, None) if name in of_heads else (batch, None)),
                     *sizes_of(spec, case.dims),
                 )
-                for name, spec in case.component.provides(case.config).items()
+                for name, spec in case.component.fields_written(case.config).items()
                 if name != "memory.grid"  # no tensor
             }
         case "queries" | "refinement" | "layer":
             count = module.count if case.slot == "queries" else count
             maker = Maker(case, replace(sizes, queries=count or 1), torch.Generator())
-            provided = case.component.provides(case.config).items()
+            provided = case.component.fields_written(case.config).items()
             where = "0." if case.slot == "layer" else ""
             fields = {n: (batch, count, *maker.field(n, s).shape[2:]) for n, s in provided}
             fields = {f"{where}fields.{name}": shape for name, shape in fields.items()}

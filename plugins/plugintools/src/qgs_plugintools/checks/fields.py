@@ -57,7 +57,11 @@ def check_reads_within_requires(case: Case) -> None:
     Looking whether a field is there is asking for it. The other fields are passed on with
     `QueryState.replace`. A loss looks at no rendering if it declares that it needs none.
     """
-    module, inputs, required = case.lively(), inputs_of(case), case.component.requires(case.config)
+    module, inputs, required = (
+        case.lively(),
+        inputs_of(case),
+        case.component.fields_read(case.config),
+    )
     unread = {name for name in leaves(inputs) if name.startswith("memory.")} - set(required)
     if issubclass(case.component, DecoderLayer) and case.component.sublayers:
         unread = set()  # what stands in its slots may read them
@@ -126,7 +130,7 @@ def check_requires_are_read(case: Case) -> None:
     """
     module, inputs = case.lively(), inputs_of(case)
     outputs = module(*inputs.values())
-    for field in case.component.requires(case.config):
+    for field in case.component.fields_read(case.config):
         changed = list(_with_others(case, inputs, field))
         read = any(difference(outputs, module(*given.values())) for given in changed)
         expect(read, f"it requires {field}, which changes nothing")
@@ -163,7 +167,7 @@ def check_writes_equal_provides(case: Case) -> None:
         with seeded(0):
             output = module(*inputs.values())
         output = output[0] if case.slot == "layer" else output
-        provided = case.component.provides(case.config)
+        provided = case.component.fields_written(case.config)
         kept = {n for n, x in output.fields.items() if n in before and _same(x, before[n])}
         written = set(output.fields) - kept
         for told, names in (
@@ -213,11 +217,13 @@ def _resolved(case: Case, given: Fields) -> Recipe:
     if given:
         components.append(_queries_with(case, given))
         recipe["model"]["queries"]["type"] = f"{PLUGIN}/{GIVEN}"
-    features = case.component.requires(case.config).get("memory.features")
+    features = case.component.fields_read(case.config).get("memory.features")
     if features and features != MEMORY_FIELDS["memory.features"]:
         components.append(_encoder_with(case, features))
         recipe["model"]["encoder"]["type"] = f"{PLUGIN}/{GIVEN}"
-    look = {n: s for n, s in case.component.requires(case.config).items() if n in GAUSSIAN_FIELDS}
+    look = {
+        n: s for n, s in case.component.fields_read(case.config).items() if n in GAUSSIAN_FIELDS
+    }
     if look:
         components.append(_head_with(look))
         recipe["model"]["head"]["type"] = f"{PLUGIN}/{GIVEN}"
@@ -231,7 +237,7 @@ def _head_with(look: Fields) -> type[Component]:
         name: ClassVar[str] = GIVEN
 
         @classmethod
-        def provides(cls, config: ComponentConfig) -> Fields:
+        def fields_written(cls, config: ComponentConfig) -> Fields:
             return look
 
         def forward(self, state: QueryState) -> GaussianAttributes:
@@ -250,7 +256,7 @@ def _encoder_with(case: Case, spec: FieldSpec) -> type[Component]:
         name: ClassVar[str] = GIVEN
 
         @classmethod
-        def provides(cls, config: ComponentConfig) -> Fields:
+        def fields_written(cls, config: ComponentConfig) -> Fields:
             return {**MEMORY_FIELDS, "memory.features": spec}
 
         def forward(self, views: Views) -> ImageMemory:
@@ -268,7 +274,7 @@ def _queries_with(case: Case, given: Fields) -> type[Component]:
         name: ClassVar[str] = GIVEN
 
         @classmethod
-        def provides(cls, config: ComponentConfig) -> Fields:
+        def fields_written(cls, config: ComponentConfig) -> Fields:
             return given
 
         def start(self, batch_size: int) -> QueryState:
@@ -297,7 +303,7 @@ def _recipe_with(case: Case) -> dict[str, Any]:
     }
     losses = {"photometric": {"type": "qgs/photometric"}}
     recipe: dict[str, Any] = {"recipe": 1, "plugins": [PLUGIN], "model": model, "losses": losses}
-    of_encoder = case.component.provides(case.config) if slot == "encoder" else MEMORY_FIELDS
+    of_encoder = case.component.fields_written(case.config) if slot == "encoder" else MEMORY_FIELDS
     if not {"memory.keys", "memory.values"} <= of_encoder.keys():  # the default layers read both
         model |= {"decoder": {"depth": 0}, "supervision": {"layers": [0]}}
     if slot in LAYER_SLOTS:

@@ -50,8 +50,8 @@ def check_gradients_reach_inputs(case: Case) -> None:
     A component that requires nothing and gives zeros alone is an ablation, and passes.
     """
     module, missing = case.lively(), [*_read(case)]
-    provided = {f"fields.{name}" for name in case.component.provides(case.config)}
-    zeros = not case.component.requires(case.config)
+    provided = {f"fields.{name}" for name in case.component.fields_written(case.config)}
+    zeros = not case.component.fields_read(case.config)
     for inputs in _draws(case):
         outputs = floating(module(*inputs.values()))
         if case.slot == "refinement":
@@ -69,7 +69,7 @@ def _read(case: Case) -> Iterable[str]:
     yield from READ[case.slot]
     state = "prediction.state" if case.slot == "losses" else "state"
     fields = required_fields(case)
-    for name, spec in case.component.requires(case.config).items():
+    for name, spec in case.component.fields_read(case.config).items():
         if spec.dtype.is_floating_point and name not in GAUSSIAN_FIELDS:  # may be read rendered
             yield f"{state}.fields.{name}" if name in fields else name
 
@@ -90,7 +90,7 @@ def check_terms_have_gradients(case: Case) -> None:
     A loss that requires nothing and is zero for all that it is given, as one of weight 0, passes.
     """
     module = case.lively()
-    zeros, idle = not case.component.requires(case.config), None
+    zeros, idle = not case.component.fields_read(case.config), None
     for inputs in _draws(case):
         terms = module(*inputs.values())
         zeros = zeros and _are_zero(terms)

@@ -65,9 +65,9 @@ def check_scheduled_options_are_read_anew(case: Case) -> None:
         other = replace(case, config=config, state_dict=None)
         if option not in case.component.scheduled or other.problems(case.size):
             continue
-        for what in (case.component.requires, case.component.provides):
+        for what in (case.component.fields_read, case.component.fields_written):
             same = dict(what(config)) == dict(what(case.config))
-            expect(same, f"`{option}: {value}` changes what it {what.__name__}")
+            expect(same, f"`{option}: {value}` changes its `{what.__name__}`")
         module = _ready(case)
         _called(case, module)
         module.config = config

@@ -82,8 +82,8 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
             expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
         with seeded(0), LearnedLayers(layers.outputs) as replayed:
             exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
-        required = case.component.requires(case.config)
-        provided = case.component.provides(case.config).items()
+        required = case.component.fields_read(case.config)
+        provided = case.component.fields_written(case.config).items()
         # Fields that stand in no frame and carry on none that was read.
         learned = {f"fields.{n}" for n, s in provided if s.frame == "none" and n not in required}
         placed = {name: x for name, x in seen.items() if name not in learned}

@@ -57,7 +57,7 @@ def check_head_gives_gaussians(case: Case) -> None:
     With initial parameters too, for ordinary features. `sh` and `features` are there if the head
     provides them.
     """
-    told = {name.removeprefix("gaussians.") for name in case.component.provides(case.config)}
+    told = {name.removeprefix("gaussians.") for name in case.component.fields_written(case.config)}
     modules = [(case.build(), 1.0, "with initial parameters,")]
     modules += [(case.lively(), f, f"for features times {f:g}") for f in (0.0, 1.0, 100.0)]
     state = inputs_of(case)["state"]
@@ -381,7 +381,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         views = map_tensors(lambda x: x[:1], views)
         memory = module(views)
         if memory.grid is None:
-            declared = "memory.grid" in case.component.provides(case.config)
+            declared = "memory.grid" in case.component.fields_written(case.config)
             expect(not declared, "`provides` says that there is a grid, and there is none")
             continue
         patch, grid = _patch_size(where, views, memory), memory.grid
@@ -539,7 +539,7 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
     """
     module, inputs = case.lively(), inputs_of(case)
     given = _explanation(module, inputs)
-    if given is None or "memory.values" not in case.component.requires(case.config):
+    if given is None or "memory.values" not in case.component.fields_read(case.config):
         return
     if given.geometry is None:
         state = inputs["state"]

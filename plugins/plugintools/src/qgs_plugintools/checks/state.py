@@ -39,7 +39,7 @@ def check_outputs_share_no_memory(case: Case) -> None:
     outputs = leaves(module(*inputs.values()))
     tensors = [*leaves(inputs).items(), *tensors_of(module).items()]
     owners = {x.untyped_storage().data_ptr(): name for name, x in tensors if x.numel()}
-    provided = [f"fields.{name}" for name in case.component.provides(case.config)]
+    provided = [f"fields.{name}" for name in case.component.fields_written(case.config)]
     own = {"refinement": provided, "layer": ["0.features", *(f"0.{name}" for name in provided)]}
     for name, tensor in outputs.items():
         if name not in own.get(case.slot, outputs):
