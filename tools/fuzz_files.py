@@ -4,7 +4,7 @@
 
     python tools/fuzz_files.py --seed 0 --only 17
 
-A checkpoint is loaded and made into Gaussians, a state is trained on; see attack.py.
+A checkpoint is loaded and made into Gaussians, a state is trained on; see fuzzing.py.
 """
 
 import json
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from attack import JUNK, FaultError, Use, attack, other_bytes, other_leaf, refused
+from fuzzing import JUNK, FaultError, Use, fuzz, other_bytes, other_leaf, refused
 from kill_training import RECIPE
 from rich.console import Console
 
@@ -271,4 +271,4 @@ def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
 
 
 if __name__ == "__main__":
-    sys.exit(attack(__doc__, prepared))
+    sys.exit(fuzz(__doc__, prepared))

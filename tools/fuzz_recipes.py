@@ -5,7 +5,7 @@
 
 A case is a shipped recipe in which values, types, structure, files or text were changed. It passes
 when it resolves, builds on "meta" and resolves to itself again, or when it is refused by one
-RecipeError that names a place, within the limits of attack.py, with a short message.
+RecipeError that names a place, within the limits of fuzzing.py, with a short message.
 """
 
 import json
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from attack import FaultError, Use, attack, refused
+from fuzzing import FaultError, Use, fuzz, refused
 
 from qgs.analysis.shown import parameter_counts
 from qgs.composer import PluginError, Recipe, RecipeError, resolve
@@ -389,4 +389,4 @@ def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
 
 
 if __name__ == "__main__":
-    sys.exit(attack(__doc__, prepared))
+    sys.exit(fuzz(__doc__, prepared))

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from attack import in_child
+from fuzzing import in_child
 from qgs_datatools import packing
 from qgs_datatools.entries import Encoding
 from rich.console import Console
