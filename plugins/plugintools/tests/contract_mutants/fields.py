@@ -66,27 +66,7 @@ class ReadsAFieldIfThere(ContentSelfAttention):
         return update if center is None else update + center.sum(-1, keepdim=True)
 
 
-@mutant(CHECK, "reads anchor.center")
-class LooksForAField(ContentSelfAttention):
-    def forward(self, state):
-        return super().forward(state) * (2 if "anchor.center" in state else 1)
-
-
-@mutant(CHECK, "reads anchor.center")
-class ReadsInTraining(ContentSelfAttention):
-    def forward(self, state):
-        missing = self.training and "anchor.center" not in state.fields
-        return super().forward(state) * (0.5 if missing else 1)
-
-
-@mutant("writes_equal_provides", "it writes unrelated.center besides")
-class SearchesTheFields(NoRefinement):
-    def forward(self, state):
-        moved = {name: x + 1 for name, x in state.fields.items() if name.endswith(".center")}
-        return state.replace(fields=moved)
-
-
-@mutant(CHECK, "reads some of rendering.alpha", also="masked_queries_are_not_judged")
+@mutant(CHECK, "reads some of rendering.alpha")
 class ReadsAnUndeclaredRendering(Loss):
     renderings = "none"
 
@@ -94,58 +74,20 @@ class ReadsAnUndeclaredRendering(Loss):
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
 
 
-@mutant(CHECK, "reads anchor.raw_radius", also="masked_queries_are_not_judged")
-class ReadsAFieldOfThePrediction(Loss):
-    renderings = "none"
-
-    def term(self, prediction, rendering, target, inputs):
-        radius = prediction.state.fields.get("anchor.raw_radius")
-        small = prediction.gaussians.scales.mean()
-        return {"small": small if radius is None else small + radius.mean()}
-
-
-@mutant(CHECK, "NoneType")
-class ReadsTheGridUndeclared(ContentCrossAttention):
-    def forward(self, state, memory):
-        return super().forward(state, memory) / memory.grid[0]
-
-
-@mutant("requires_are_read", "requires memory.grid, which")
-class RequiresTheGridForNothing(ContentCrossAttention):
-    @classmethod
-    def fields_read(cls, config):
-        return {**super().fields_read(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
-
-
-@mutant(
-    "requires_are_read",
-    "requires memory.features, which",
-    also="gradients_reach_inputs",
-)
+@mutant("requires_are_read", "requires memory.features, which")
 class RequiresTooMuch(ContentCrossAttention):
     @classmethod
     def fields_read(cls, config):
         return MEMORY_FIELDS
 
 
-@mutant(
-    "writes_equal_provides",
-    "writes place.center besides",
-    also="geometry_is_float32_under_autocast",  # what it writes is of the features' dtype
-)
+@mutant("writes_equal_provides", "writes place.center besides")
 class WritesMore(NoRefinement):
     def forward(self, state):
         return state.replace(fields={"place.center": state.features[..., :3].clone()})
 
 
-@mutant("writes_equal_provides", "in training it writes place.st")
-class WritesMoreInTraining(Steps):
-    def moved(self, center, step):
-        more = {"place.step": step.to(center)} if self.training else {}
-        return {**super().moved(center, step), **more}
-
-
-@mutant("unmet_requirement_fails_at_compose", "KeyError", also=None)
+@mutant("unmet_requirement_fails_at_compose", "KeyError")
 class NeedsAFieldUndeclared(ContentSelfAttention):
     def forward(self, state):
         return super().forward(state) + state["place.center"].sum(-1, keepdim=True)
@@ -156,9 +98,3 @@ class LayerLosesFields(CrossSelfMlp):
     def forward(self, state, memory):
         state, memory = super().forward(state, memory)
         return QueryState(state.features, mask=state.mask), memory
-
-
-@mutant("runs", "it gives a QueryState, not a tuple", also=None)
-class LayerForgetsTheMemory(CrossSelfMlp):
-    def forward(self, state, memory):
-        return super().forward(state, memory)[0]

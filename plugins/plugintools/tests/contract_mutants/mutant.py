@@ -18,14 +18,12 @@ NONE: Mapping[str, Any] = {}
 class Mutant:
     """A component, the check that must catch it, and what the check must see.
 
-    also: other checks that cannot but fail too; None where any may, since nothing can be called.
     options: of the component. case: further arguments of the case.
     """
 
     component: type[Component]
     check: str
     seen: str
-    also: frozenset[str] | None
     options: Mapping[str, Any]
     case: Mapping[str, Any]
 
@@ -49,15 +47,13 @@ def mutant(
     check: str,
     seen: str,
     *,
-    also: str | None = "",
     options: Mapping[str, Any] = NONE,
     case: Mapping[str, Any] = NONE,
 ) -> Callable[[C], C]:
-    """Register a component as a mutant. also: names of checks, separated by blanks."""
+    """Register a component as a mutant."""
 
     def register(component: C) -> C:
-        others = None if also is None else frozenset(also.split())
-        MUTANTS.append(Mutant(named(component), check, seen, others, options, case))
+        MUTANTS.append(Mutant(named(component), check, seen, options, case))
         return component
 
     return register

@@ -4,7 +4,7 @@ from contract_mutants.mutant import mutant
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 
 from qgs.components import FreeCenters, MlpFeedForward
-from qgs.contracts import ComponentConfig, FieldSpec
+from qgs.contracts import ComponentConfig
 from qgs.losses import Opacity
 
 
@@ -14,12 +14,6 @@ class RoundsAnOption(FreeCenters):
         @field_serializer("z_offset")
         def _rounded(self, z_offset: float) -> float:
             return float(round(z_offset))
-
-
-@mutant("config_round_trip", "shift is not written")
-class LosesAnOption(FreeCenters):
-    class Config(FreeCenters.Config):
-        shift: float = Field(default=0.0, exclude=True)
 
 
 @mutant("misspelt_option_is_refused", "`z_offset_x` is accepted")
@@ -61,25 +55,3 @@ class ReadsItsWeightOnce(Opacity):
     def term(self, prediction, rendering, target, inputs):
         opacities = prediction.gaussians.opacities
         return self.weight * -(opacities + self.config.eps).log().mean()
-
-
-@mutant(
-    "scheduled_options_are_read_anew",
-    "with `eps: 5.0e-07` set after it was built",
-    also="forward_keeps_no_state",
-)
-class KeepsWhatItMadeOfAnOption(Opacity):
-    scheduled = frozenset({"weight", "eps"})
-    made = None
-
-    def term(self, prediction, rendering, target, inputs):
-        self.made = self.config.eps if self.made is None else self.made
-        opacities = prediction.gaussians.opacities
-        return -(opacities + 1e4 * self.made).log().mean()
-
-
-@mutant("scheduled_options_are_read_anew", "changes its `fields_read`", options={"weight": 0.0})
-class RequiresWhatItsWeightSays(Opacity):
-    @classmethod
-    def fields_read(cls, config):
-        return {"a.field": FieldSpec((3,))} if config.weight else {}

@@ -4,7 +4,7 @@ import torch
 from contract_mutants.mutant import mutant
 from torch import nn
 
-from qgs.components import Mlp, MlpFeedForward
+from qgs.components import MlpFeedForward
 
 PINNED = {
     "norm.weight": (32,),
@@ -27,13 +27,6 @@ class AllocatesOnCpu(MlpFeedForward):
         return self.scale * super().forward(features)
 
 
-@mutant("registers_its_parameters", "keeps scale outside")
-class KeepsATensorAsAttribute(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.scale = torch.ones(dims.width)
-
-
 @mutant("registers_its_parameters", "keeps layers outside")
 class KeepsLayersInAList(MlpFeedForward):
     def __init__(self, config, dims):
@@ -48,11 +41,7 @@ class SeedsWhenBuilt(MlpFeedForward):
         super().__init__(config, dims)
 
 
-@mutant(
-    "same_seed_same_parameters",
-    "differ: mlp.fc1.weight",
-    also="forward_keeps_no_state",  # which compares two instances
-)
+@mutant("same_seed_same_parameters", "differ: mlp.fc1.weight")
 class DrawsFromItsOwnGenerator(MlpFeedForward):
     def __init__(self, config, dims):
         super().__init__(config, dims)
@@ -81,13 +70,6 @@ class RenamesItsNorm(MlpFeedForward):
 
     def forward(self, features):
         return self.mlp(self.layer_norm(features))
-
-
-@mutant("state_dict_keys", "(128, 32)", case={"state_dict": PINNED})
-class HalvesItsMlp(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.mlp = Mlp(dims.width, 2 * dims.width, dims.width)
 
 
 @mutant("moves_to_a_device", "device")

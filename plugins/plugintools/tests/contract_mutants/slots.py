@@ -7,7 +7,6 @@ from contract_mutants.mutant import mutant
 from torch import Tensor, nn
 
 from qgs.components import (
-    ContentCrossAttention,
     ContentSelfAttention,
     GaussianHead,
     LatentBottleneck,
@@ -57,13 +56,6 @@ class GivesLongQuaternions(GaussianHead):
         return replace(good, quats=2 * good.quats)
 
 
-@mutant("head_gives_gaussians", "with initial parameters")
-class StartsWithZeroQuaternions(GaussianHead):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        nn.init.zeros_(self.linear.weight)
-
-
 @mutant("queries_are_shared_by_scenes", "scene 1 of 3", options={"count": 6})
 class NumbersScenes(LatentQueries):
     def start(self, batch_size):
@@ -104,19 +96,7 @@ class DrawsItsImages(SceneSource):
         return [NoiseScene()]
 
 
-@mutant("scenes_are_as_listed", "is `noise`, not place 0", also="scenes_repeat")
-class NamesPlaces(DrawsItsImages):
-    def names(self, split):
-        return ["place 0"]
-
-
-@mutant("scenes_are_as_listed", "hold not each of 1 scenes once: 0, 0", also="scenes_repeat")
-class GroupsASceneTwice(DrawsItsImages):
-    def groups(self, split):
-        return [[0], [0]]
-
-
-@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]", also="scenes_repeat")
+@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]")
 class HoldsOutTooMuch(DrawsItsImages):
     def scenes(self, split):
         (scene,) = super().scenes(split)
@@ -138,12 +118,6 @@ class TakesTheWorstView(OneTerm):
 
     def term(self, prediction, rendering, target, inputs):
         return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
-
-
-@mutant("metric_gives_its_columns", "the values of the columns [''] are not finite")
-class DividesByTheError(Psnr):
-    def forward(self, given):
-        return 1 / (given.images - given.targets.images).square().mean((2, 3, 4))
 
 
 @mutant("metric_gives_its_columns", "it has values for ['', 'lost'], columns for ['']")
@@ -172,27 +146,10 @@ class CountsItsOwnSteps(OneCycleAdamW):
         return 0.1 / self.calls
 
 
-@mutant("patch_rays_are_those_of_the_grid", "differ by up to 0.9")
-class GivesZerosAsRays(ChangedEncoder):
-    def result(self, memory):
-        return replace(memory, patch_rays=torch.zeros_like(memory.patch_rays))
-
-
 @mutant("patch_rays_are_those_of_the_grid", "of patches of 8 pixels")
 class RoundsItsRays(ChangedEncoder):
     def result(self, memory):
         return replace(memory, patch_rays=memory.patch_rays.bfloat16().to(memory.patch_rays))
-
-
-@mutant(
-    "patch_rays_are_those_of_the_grid",
-    "`grid` is (2, 3, 2), whi",
-    also="tokens_are_those_of_the_grid",
-)
-class SwapsRowsAndColumns(ChangedEncoder):
-    def result(self, memory):
-        views, rows, columns = memory.grid
-        return replace(memory, grid=(views, columns, rows))
 
 
 @mutant("tokens_are_those_of_the_grid", "token of `keys` at (1, 1, 1)")
@@ -206,34 +163,10 @@ class OrdersTokensByColumn(ChangedEncoder):
         return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
 
 
-@mutant("tokens_are_those_of_the_grid", "`values` at (0, 0, 2)", also="view_permutation")
-class ReversesItsViews(ChangedEncoder):
-    def result(self, memory):
-        values = memory.values.unflatten(2, (memory.grid[0], -1)).flip(2)
-        return replace(memory, values=values.flatten(2, 3))
-
-
-@mutant("tokens_are_those_of_the_grid", "with images of 24 x 16, a")
-class FlipsTallImages(ChangedEncoder):
-    def given(self, views):
-        height, width = views.cameras.size
-        return replace(views, images=views.images.flip(-2)) if height > width else views
-
-
 @mutant("tokens_are_those_of_the_grid", "`values` stays as it is")
 class IgnoresImages(ChangedEncoder):
     def given(self, views):
         return replace(views, images=0 * views.images)
-
-
-@mutant(
-    "tokens_are_those_of_the_grid",
-    "says that there is a grid, and there is none",
-    also="view_permutation",
-)
-class PromisesAGrid(MultiViewViT):
-    def forward(self, views):
-        return replace(super().forward(views), grid=None)
 
 
 LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
@@ -245,20 +178,9 @@ class ProjectsDoubles(LatentBottleneck):
         return super().project(2 * features, memory)
 
 
-@mutant("project_makes_the_memory_again", "make the same memory", options=LATENTS)
-class ProjectsNothing(LatentBottleneck):
-    def project(self, features, memory):
-        return memory
-
-
 @mutant("project_makes_the_memory_again", "does not declare `tunable`", options=LATENTS)
 class ProjectsInSecret(LatentBottleneck):
     tunable = False
-
-
-@mutant("project_makes_the_memory_again", "`project` is not implemented")
-class PromisesToProject(ChangedEncoder):
-    tunable = True
 
 
 @mutant("memo_is_of_the_memory_alone", "depends on a weight")
@@ -280,13 +202,6 @@ class SharesItsProjection(CrossAttention):
         return self.core(state.features, keys, values)
 
 
-@mutant("memo_is_of_the_memory_alone", "depends on the state")
-class KeepsTheFirstState(ContentCrossAttention):
-    def forward(self, state, memory):
-        mean = memory.once("mutants.mean", lambda: state.features.mean(1, keepdim=True))
-        return super().forward(state, memory) + mean
-
-
 @mutant("explanation_is_a_softmax", "off the softmax")
 class ExplainsBySigmoid(ContentSelfAttention):
     def explain(self, state, queries):
@@ -294,39 +209,11 @@ class ExplainsBySigmoid(ContentSelfAttention):
         return AttentionWeights(content, None, torch.sigmoid(content))
 
 
-@mutant(
-    "explanation_is_a_softmax",
-    "geometry must have shape (2, 1, 6, 12) or (2, 2, 6, 12), got (2, 6, 12)",
-    also="explanation_is_of_the_forward_pass geometry_is_float32_under_autocast",
-)
-class ExplainsGeometryWithoutHeads(ContentCrossAttention):
-    def explain(self, state, memory, queries):
-        given = super().explain(state, memory, queries)
-        return AttentionWeights(given.content, 0 * given.content[:, 0], given.weights)
-
-
 @mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")
 class MasksItsContent(ContentSelfAttention):
     def explain(self, state, queries):
         content = super().explain(state, queries).content
         content = content.masked_fill(content < content.mean(), -torch.inf)
-        return AttentionWeights(content, None, content.softmax(-1))
-
-
-@mutant("explanation_is_a_softmax", "asked for queries 2 and 0 alone, it gives other weights")
-class ExplainsAllQueries(ContentCrossAttention):
-    def explain(self, state, memory, queries):
-        return super().explain(state, memory, torch.arange(state.features.shape[1]))
-
-
-@mutant(
-    "explanation_is_a_softmax",
-    "content is (2, 2, 6, 11), not (B, h, Q, T) = (2, h, 6, 12)",
-    also="explanation_is_of_the_forward_pass",
-)
-class ExplainsToFewTokens(ContentCrossAttention):
-    def explain(self, state, memory, queries):
-        content = super().explain(state, memory, queries).content[..., 1:]
         return AttentionWeights(content, None, content.softmax(-1))
 
 

@@ -1,7 +1,6 @@
 """Components that keep the contract in ways that a check could take for a fault."""
 
 from dataclasses import replace
-from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +11,6 @@ from torch import nn
 
 from qgs.components import (
     ContentCrossAttention,
-    ContentSelfAttention,
     MlpFeedForward,
     MultiViewViT,
 )
@@ -20,13 +18,11 @@ from qgs.components.blocks import merge_heads
 from qgs.contracts import (
     MEMORY_FIELDS,
     ComponentConfig,
-    FeedForward,
     FieldSpec,
     LearnedQueries,
     SelfAttention,
 )
 from qgs.losses import Opacity
-from qgs.renderers import TorchRenderer
 from qgs.types import QueryState
 
 
@@ -34,28 +30,6 @@ from qgs.types import QueryState
 class DropsOut(MlpFeedForward):
     def forward(self, features):
         return F.dropout(super().forward(features), 0.2, self.training)
-
-
-@named
-class LeavesItselfOut(MlpFeedForward):
-    """Stochastic depth: half of its training passes update nothing."""
-
-    def forward(self, features):
-        update = super().forward(features)
-        return update * (torch.rand(()) > 0.5).to(update) if self.training else update
-
-
-@named
-class Recurrent(FeedForward):
-    """A layer of torch that lists its weights a second time."""
-
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.gru = nn.GRU(dims.width, dims.width, batch_first=True)
-
-    def forward(self, features):
-        twice = features.flatten(0, 1)[:, None].expand(-1, 2, -1)
-        return self.gru(twice)[0][:, -1].unflatten(0, features.shape[:2])
 
 
 @named
@@ -67,35 +41,6 @@ class LooksNowhere(SelfAttention):
 
 
 @named
-class MovesItsState(ContentSelfAttention):
-    """`QueryState.to` goes through all fields, and sees none."""
-
-    def forward(self, state):
-        return super().forward(state.to(state.features.device))
-
-
-@named
-class KeepsAConstant(MlpFeedForward):
-    @cached_property
-    def half(self):
-        return 0.5
-
-    def forward(self, features):
-        return self.half * super().forward(features)
-
-
-@named
-class PassesFieldsOn(ContentSelfAttention):
-    """It makes states by hand, with fields that it does not look at."""
-
-    def forward(self, state):
-        doubled = replace(state, features=2 * state.features)
-        return super().forward(
-            QueryState(doubled.features, doubled.fields | {}, state.mask).replace()
-        )
-
-
-@named
 class TurnsAutocastOff(PlacesByALayer):
     """PyTorch's own idiom for float32 geometry, which torch refuses on meta."""
 
@@ -104,21 +49,6 @@ class TurnsAutocastOff(PlacesByALayer):
         with torch.autocast(center.device.type, enabled=False):
             bounded = center / (1 + center.norm(dim=-1, keepdim=True))
         return self.attention(self.norm(state.features + self.place(bounded)), state.mask)
-
-
-@named
-class ReadsTheFirstViewMost(ContentCrossAttention):
-    ordered_views = True
-
-    @classmethod
-    def fields_read(cls, config):
-        return {**super().fields_read(config), "memory.grid": MEMORY_FIELDS["memory.grid"]}
-
-    def forward(self, state, memory):
-        views = memory.grid[0]
-        values = memory.values.unflatten(2, (views, -1))
-        first = (values[:, :, :1] + values).flatten(2, 3)
-        return self.core(state.features, memory.keys, first)
 
 
 @named
@@ -199,13 +129,6 @@ class WeighsNothing(Opacity):
 @named
 class RefusesIntrinsics(RefusesWhatItDeclares):
     camera_gradients = ("c2w",)
-
-
-@named
-class Fades(TorchRenderer):
-    def forward(self, gaussians, cameras, background=None):
-        faded = replace(gaussians, opacities=0.7 * gaussians.opacities)
-        return super().forward(faded, cameras, background)
 
 
 @named
