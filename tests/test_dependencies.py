@@ -187,7 +187,7 @@ def test_an_extra_is_imported_where_it_is_used_alone(name: str) -> None:
     while more := {module for module in modules if at_once[module] & needy} - needy:
         needy |= more
     if name == "query-gaussians":
-        assert "qgs.renderers.cpu_kernels" in needy
+        assert "qgs.kernels.rasterisation" in needy
         assert not needy & {m for m in modules if m.startswith("qgs.cli")}
         assert not needy & set(FIRST_TO_BE_IMPORTED)
     else:

@@ -1,6 +1,5 @@
 """The default components: TokenGS, one file per slot."""
 
-from qgs.components.attention_bias import AttentionBias, Kernel
 from qgs.components.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.components.centers import FreeCenters, OffsetCenters, posact
 from qgs.components.decoder import (
@@ -21,6 +20,7 @@ from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
 from qgs.components.weights import TOKENGS
 from qgs.contracts import Component
+from qgs.kernels.attention_bias import AttentionBias, Kernel
 
 COMPONENTS: tuple[type[Component], ...] = (
     MultiViewViT,

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from qgs.components.attention_bias import AttentionBias, biased_attention
 from qgs.contracts import AttentionWeights
+from qgs.kernels.attention_bias import AttentionBias, biased_attention
 
 NORM_EPS = 1e-5
 """Added to the variance by every LayerNorm of both releases (PyTorch's default)."""

@@ -84,8 +84,8 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:
-        from qgs.renderers import cpu_kernels as kernels
-        from qgs.renderers.cpu_projection import project_unit
+        from qgs.kernels import rasterisation as kernels
+        from qgs.kernels.projection import project_unit
 
         *tensors, size, config = inputs
         tensors = [tensor.contiguous() for tensor in tensors]
@@ -116,8 +116,8 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        from qgs.renderers import cpu_kernels as kernels
-        from qgs.renderers.cpu_projection import CAMERA_GRADIENTS, project_backward_unit
+        from qgs.kernels import rasterisation as kernels
+        from qgs.kernels.projection import CAMERA_GRADIENTS, project_backward_unit
 
         saved = ctx.saved_tensors
         means, scales, quats, opacities, colors, c2w, lenses, rows, sums = _arrays(*saved)

@@ -174,7 +174,7 @@ def test_an_installation_that_cannot_be_written_renders(tmp_path: Path, home: st
     package = tmp_path / "site" / "qgs"
     source = Path(qgs.renderers.__file__).parents[1]
     shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "renderers" / "__pycache__").touch()  # stops even root from writing there
+    (package / "kernels" / "__pycache__").touch()  # stops even root from writing there
     (tmp_path / "file").touch()
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site"), "HOME": str(tmp_path / home)}
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):

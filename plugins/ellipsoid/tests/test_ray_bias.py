@@ -14,7 +14,7 @@ from qgs_locus.ray_bias import RayBias
 from qgs_locus.ray_bias import ray_tokens as isotropic_tokens
 from torch import Tensor
 
-from qgs.components.attention_bias import BLOCK
+from qgs.kernels.attention_bias import BLOCK
 
 ONE = torch.ones((), dtype=torch.float64)
 

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from qgs_locus.ray_bias import RayBias, ray_tokens
+from qgs_locus.ray_bias import RayBias, dense_bias, ray_tokens
 from torch import Tensor
 
-from qgs.components.attention_bias import BLOCK
 from qgs.geometry.rays import normalised_rays
+from qgs.kernels.attention_bias import BLOCK
 
 
 def _rays(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -16,15 +16,23 @@ def _rays(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.cat([torch.linalg.cross(origins, directions), directions], -1) * 0.97
 
 
-def ray_bias_direct(
-    center: Tensor, sigma_sq: Tensor | float, rays: Tensor, bias_min: float, gamma: Tensor
-) -> Tensor:
-    """The formula as the paper writes it."""
-    length = rays[..., 3:].norm(dim=-1, keepdim=True)
-    moments, directions = (rays / length).split(3, -1)
-    crossed = torch.linalg.cross(center[:, :, None], directions[:, None], dim=-1)
-    distance = (crossed - moments[:, None]).norm(dim=-1)
-    return gamma * (-0.5 * (distance.square() / sigma_sq)).clamp(bias_min, 0)
+def weighted(center, sigma_sq, rays, bias_min, gamma) -> Tensor:
+    return gamma * dense_bias(center, sigma_sq, rays, bias_min)
+
+
+def test_the_formula_is_the_distance_of_a_point_to_a_line() -> None:
+    """Against the least distance over points of the line, which is no formula of Plücker rays."""
+    origins, directions = torch.randn(2, 1, 7, 3).double()
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    center, sigma = torch.randn(1, 5, 3).double(), 0.3
+    steps = torch.linspace(-20, 20, 400_001).double()[:, None]
+    rays = torch.cat([torch.linalg.cross(origins, directions), directions], -1)
+    found = dense_bias(center, sigma**2, rays, -1e9)
+    for n in range(5):
+        for j in range(7):
+            points = origins[0, j] + steps * directions[0, j]
+            distance = (points - center[0, n]).norm(dim=-1).min()
+            assert found[0, n, j] == pytest.approx(-0.5 * (distance / sigma).item() ** 2, rel=1e-3)
 
 
 @pytest.mark.parametrize("bandwidth", ["radius", "fixed"])
@@ -32,7 +40,7 @@ def test_kernel_equals_the_formula(bandwidth: str) -> None:
     center, rays, gamma = torch.randn(2, 50, 3), _rays(200), torch.tensor(0.1)
     sigma_sq = 0.01 if bandwidth == "fixed" else torch.rand(2, 50, 1) * 0.05 + 1e-3
     fast = RayBias.of(center, sigma_sq, ray_tokens(rays), -20.0, gamma).dense()
-    direct = ray_bias_direct(center, sigma_sq, rays, -20.0, gamma)
+    direct = weighted(center, sigma_sq, rays, -20.0, gamma)
     assert fast.shape == (2, 50, 200)
     torch.testing.assert_close(fast, direct, rtol=0, atol=1e-4 * float(gamma))
     assert direct.min() == -2.0, "some pairs must reach the clamp"
@@ -47,8 +55,8 @@ def test_kernel_is_as_exact_as_the_formula_far_from_the_cameras(distance: float)
     origins = 0.1 * torch.randn(2, 50, 3)
     rays = torch.cat([torch.linalg.cross(origins, on_center), on_center], -1)
     one, smallest = torch.ones(()), 1e-3
-    exact = ray_bias_direct(center.double(), smallest, rays.double(), -20.0, one.double())
-    direct = ray_bias_direct(center, smallest, rays, -20.0, one)
+    exact = weighted(center.double(), smallest, rays.double(), -20.0, one.double())
+    direct = weighted(center, smallest, rays, -20.0, one)
     fast = RayBias.of(center, smallest, ray_tokens(rays), -20.0, one).dense()
     assert ((exact > -20) & (exact < -0.01)).any()
     assert (fast - exact).abs().max() <= 1.5 * (direct - exact).abs().max()
@@ -94,7 +102,7 @@ def test_gradients_equal_those_of_the_formula() -> None:
         (function(center, sigma_sq, rays, -2.0, gamma) * weight).sum().backward()
         return tuple(leaf.grad for leaf in leaves)
 
-    for fast, direct in zip(gradients(ours), gradients(ray_bias_direct), strict=True):
+    for fast, direct in zip(gradients(ours), gradients(weighted), strict=True):
         torch.testing.assert_close(fast, direct)
 
 

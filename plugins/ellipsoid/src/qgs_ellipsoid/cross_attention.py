@@ -1,7 +1,7 @@
 """`ellipsoid/ray_biased`: queries attend more to rays that pass through their ellipsoid."""
 
 from qgs_locus.cross_attention import RayBiasedCrossAttention
-from qgs_locus.fields import CENTER, RAW_RADIUS
+from qgs_locus.fields import CENTER
 from torch import Tensor
 
 from qgs.components import AttentionBias
@@ -22,12 +22,8 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
     raw_radius = RAW_RADII
 
     @classmethod
-    def fields_read(cls, config: RayBiasedCrossAttention.Config) -> Fields:
-        """Those of `locus/ray_biased`, with a shape for its radius."""
-        shape = shape_fields(config) if config.bandwidth == "radius" else {}
-        return {n: f for n, f in super().fields_read(config).items() if n != RAW_RADIUS} | dict(
-            shape
-        )
+    def bandwidth_fields(cls, config: RayBiasedCrossAttention.Config) -> Fields:
+        return shape_fields(config) if config.bandwidth == "radius" else {}
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
@@ -40,3 +36,6 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         )
         place = state[CENTER], anchor_rotation(state[ROTATION]), sigma_sq_BN3
         return EllipsoidBias.of(*place, tokens_B9M, config.bias_min, self.gamma)
+
+    def explained_bias(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> Tensor:
+        return self.bias(state, memory).dense(queries)

@@ -74,14 +74,12 @@ class EllipsoidBias(AttentionBias):
         return clamped(-factor_n1 * moment_nM / along_nM, lower_n1)
 
     def compiled(self) -> tuple[Kernel, Kernel]:
-        """Of `ray_bias_kernels`."""
-        from qgs_ellipsoid import ray_bias_kernels as kernels  # needs numba
+        from qgs_ellipsoid.kernels import ray_bias_numba as kernels  # needs numba
 
         return kernels.write, kernels.gradients
 
     def triton_functions(self) -> tuple[Any, Any]:
-        """Of `ray_bias_triton`."""
-        from qgs_ellipsoid import ray_bias_triton as functions  # needs triton
+        from qgs_ellipsoid.kernels import ray_bias_triton as functions  # needs triton
 
         return functions.value, functions.gradients
 

@@ -1,7 +1,7 @@
 """`locus/ray_biased`: queries attend more to rays that pass near their anchor."""
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -9,14 +9,15 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components import NORM_EPS, AttentionBias, CrossAttentionCore
+from qgs.components.blocks import attention_weights
 from qgs.contracts import (
-    MEMORY_FIELDS,
     AttentionWeights,
     CrossAttention,
     Fields,
     ModelDims,
     Problem,
     RecipeContext,
+    memory_fields,
     without_effect,
 )
 from qgs.types import ImageMemory, QueryState
@@ -28,18 +29,19 @@ from qgs_locus.fields import (
     radius_field,
     support_radius,
 )
-from qgs_locus.ray_bias import RayBias, ray_tokens
+from qgs_locus.ray_bias import RayBias, dense_bias, ray_tokens
 
 
 class RayBiasedCrossAttention(CrossAttention):
-    """By content, and by the distance D of a patch's ray to the anchor (LocusGS):
-    softmax(q k / sqrt(d) + gamma b) v, b = -1/2 (D / sigma)^2.
+    """softmax(q k / sqrt(d) + gamma b) v, with b = -1/2 (D / sigma)^2 (LocusGS), equation (4).
 
-    sigma = sigma0 r ("radius") or sigma0 ("fixed"); the bias is the same for all heads.
+    D is the distance of a patch's ray to the anchor; sigma = sigma0 r ("radius"), or sigma0
+    ("fixed"). The bias is the same for all heads.
     """
 
     name = "ray_biased"
     raw_radius = RAW_RADIUS
+    reads: ClassVar[Fields] = {**memory_fields("keys", "values", "patch_rays"), **CENTER_FIELD}
 
     class Config(RadiusOptions):
         bandwidth: Literal["radius", "fixed"] = "radius"
@@ -66,10 +68,13 @@ class RayBiasedCrossAttention(CrossAttention):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Keys, values, patch rays, centres, and radii if the bandwidth follows them."""
-        memory = ("memory.keys", "memory.values", "memory.patch_rays")
-        radius = radius_field(config) if config.bandwidth == "radius" else {}
-        return {**{name: MEMORY_FIELDS[name] for name in memory}, **CENTER_FIELD, **radius}
+        """Radii too if the bandwidth follows them."""
+        return {**cls.reads, **cls.bandwidth_fields(config)}
+
+    @classmethod
+    def bandwidth_fields(cls, config: Config) -> Fields:
+        """What a bandwidth that follows the anchor's size reads of it."""
+        return radius_field(config) if config.bandwidth == "radius" else {}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
@@ -88,23 +93,30 @@ class RayBiasedCrossAttention(CrossAttention):
         if self.config.bandwidth == "fixed":
             return self.config.sigma0**2
         r_BN1 = support_radius(state[self.raw_radius], self.config)
+        # The floor keeps an anchor that shrinks in sight of some ray, and 1 / sigma^2 finite.
         return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
         config, eps = self.config, self.config.direction_eps
-        rays_B6M = memory.once(
+        rays_B6M = memory.once(  # the rays of a scene are the same in all layers
             f"locus.ray_tokens.{eps:g}", lambda: ray_tokens(memory["patch_rays"], eps)
         )
         sigma_sq = self.sigma_sq(state)
         return RayBias.of(state[CENTER], sigma_sq, rays_B6M, config.bias_min, self.gamma)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        """The update (B, N, D)."""
         bias = self.bias(state, memory)
         return self.core(state.features, memory["keys"], memory["values"], bias)
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
-        """Attention over image tokens, with the bias apart."""
-        bias = self.bias(state, memory)
-        return self.core.explain(state.features, memory["keys"], queries, bias)
+        q_BhQd = self.core.project(state.features)[:, :, queries]
+        bias_BQM = self.explained_bias(state, memory, queries)
+        return attention_weights(q_BhQd, memory["keys"], bias_BQM[:, None])
+
+    def explained_bias(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> Tensor:
+        """gamma b (B, Q, M) of some queries, by the formula as it is written."""
+        sigma_sq, config = self.sigma_sq(state), self.config
+        chosen = sigma_sq[:, queries] if isinstance(sigma_sq, Tensor) else sigma_sq
+        rays, limits = memory["patch_rays"], (config.bias_min, config.direction_eps)
+        return self.gamma * dense_bias(state[CENTER][:, queries], chosen, rays, *limits)

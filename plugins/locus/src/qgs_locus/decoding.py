@@ -34,6 +34,7 @@ class OffsetOptions(ComponentConfig):
         """Displacements of raw offsets, float32 or better, any shape."""
         if self.offset == "linear":
             return at_least_float32(raw)
+        # The limits keep stray offsets of an untrained head finite, and their gradients.
         return posact(raw, self.input_limit, self.output_limit)
 
 
@@ -60,7 +61,7 @@ class AnchorOffsetCenters(Centers):
 
 
 class RadiusScaledCenters(AnchorOffsetCenters):
-    """mean = mu + r posact(offset)."""
+    """mean = mu + r posact(offset), equation (7)."""
 
     name = "radius_scaled"
 

@@ -38,9 +38,9 @@ def radius_field(options: RadiusOptions) -> Fields:
 
 @full_precision
 def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
-    """Support radii r > 0, world units, of raw radii of any shape."""
+    """Support radii r > 0, world units, of raw radii of any shape: equation (1)."""
     radius = F.softplus(raw_radius)
-    if options.radius_bound == "floor":
+    if options.radius_bound == "floor":  # softplus comes near 0, and r divides in equation (3)
         return radius.clamp_min(options.radius_min)
     return radius + options.radius_min
 

@@ -1,8 +1,7 @@
-"""The attention bias between anchors and image rays: b = -1/2 (D / sigma)^2.
+"""The attention bias between anchors and image rays, equations (2) and (3) of the README.
 
-D = |mu x d - m| is the distance of an anchor's centre mu to the line of a Plücker ray (m, d). It is
-computed as written, in float32: as a product of features of mu and of the ray it would be a small
-difference of numbers that grow with |mu|^2, off by several logits far from the cameras.
+`dense_bias` is the text: all pairs at once, line by line as written there. `RayBias` computes the
+same for blocks of queries, in a form that kernels can take; the tests hold it against `dense_bias`.
 """
 
 from typing import Any, Self
@@ -16,6 +15,25 @@ from qgs.geometry.rays import normalised_rays
 
 
 @full_precision
+def dense_bias(
+    center: Tensor,  # (B, N, 3) mu, world
+    sigma_sq: Tensor | float,  # (B, N, 1) sigma^2, world units squared, or one number
+    rays: Tensor,  # (B, M, 6) Plücker rays of patches, world
+    bias_min: float,
+    direction_eps: float = 1e-6,
+) -> Tensor:
+    """b (B, N, M), without its weight gamma."""
+    # A patch's ray is the mean of its pixels', shorter than 1, and D needs |d| = 1.
+    moment, direction = (x[:, None] for x in normalised_rays(rays, direction_eps))
+    # (2). In float32: where rays pass near, D is a small difference of numbers as large as |mu|.
+    D = (torch.linalg.cross(center[:, :, None], direction, dim=-1) - moment).norm(dim=-1)
+    sigma = sigma_sq**0.5
+    b = -1 / 2 * (D / sigma) ** 2  # (3)
+    # Beyond some 6 sigma rays differ no more: an anchor that sees none of them reads by content.
+    return b.clamp_min(bias_min)
+
+
+@full_precision
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
     """Moments and directions as rows: (B, M, 6) -> (B, 6, M).
 
@@ -25,9 +43,10 @@ def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
 
 
 class RayBias(AttentionBias):
-    """gamma * clamp(-D^2 / (2 sigma^2), bias_min, 0).
+    """gamma b as kernels read it: max(-factor D^2, lower).
 
-    Reads of a query mu, gamma / (2 sigma^2) and gamma * bias_min; of a token m and d.
+    Of a query the five numbers mu, factor = gamma / (2 sigma^2) and lower = gamma bias_min; of a
+    token m and d. What does not depend on the pair is thus computed once.
     """
 
     @classmethod
@@ -49,21 +68,23 @@ class RayBias(AttentionBias):
         return cls(torch.cat(parts, -1), tokens_B6M)
 
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """(n, M), through (n, M, 3) cross products."""
+        """(n, M), through (n, M, 3) cross products.
+
+        |mu x d - m|^2 as written: as a product of features of mu and of the ray, which a matrix
+        product could take, it would be off by several logits far from the cameras.
+        """
         center_n3, factor_n1, lower_n1 = queries_nF.split([3, 1, 1], -1)
         m_M3, d_M3 = tokens_GM[:3].mT, tokens_GM[3:6].mT
         moment_nM3 = torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1) - m_M3
         return clamped(-factor_n1 * moment_nM3.square().sum(-1), lower_n1)
 
     def compiled(self) -> tuple[Kernel, Kernel]:
-        """Of `ray_bias_kernels`."""
-        from qgs_locus import ray_bias_kernels as kernels  # needs numba
+        from qgs_locus.kernels import ray_bias_numba as kernels  # needs numba
 
         return kernels.write, kernels.gradients
 
     def triton_functions(self) -> tuple[Any, Any]:
-        """Of `ray_bias_triton`."""
-        from qgs_locus import ray_bias_triton as functions  # needs triton
+        from qgs_locus.kernels import ray_bias_triton as functions  # needs triton
 
         return functions.value, functions.gradients
 

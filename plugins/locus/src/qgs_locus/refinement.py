@@ -14,7 +14,7 @@ from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field
 
 
 class AnchorRefinement(Refinement):
-    """mu += posact(MLP_mu(x)), rho += MLP_rho(x), heads shared by all layers (LocusGS)."""
+    """mu += posact(MLP_mu(x)), rho += MLP_rho(x), heads shared by all layers: equation (6)."""
 
     name = "refine"
     parts = ("`center`", "`radius`")
@@ -90,6 +90,7 @@ class AnchorRefinement(Refinement):
             step_BN3 = self.center_mlp(state.features)
             if self.config.center_step == "posact":
                 step_BN3 = posact(step_BN3, self.config.input_limit, self.config.output_limit)
+            # Autocast gives the step in half precision, which has no digits for a place.
             refined[CENTER] = state[CENTER] + at_least_float32(step_BN3)
         if self.config.radius:
             step = at_least_float32(self.radius_mlp(state.features))

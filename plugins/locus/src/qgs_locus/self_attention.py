@@ -30,7 +30,7 @@ def sine_embedding(
 
 
 class AnchorAwareSelfAttention(SelfAttention):
-    """Self-attention over x + p with p = MLP(PE(mu)), for queries, keys and values.
+    """Self-attention over x + p with p = MLP(PE(mu)), for queries, keys and values: equation (5).
 
     The residual stream does not keep p.
     """
@@ -61,7 +61,7 @@ class AnchorAwareSelfAttention(SelfAttention):
     def position_embedding(self, state: QueryState) -> Tensor:
         """p (B, N, D)."""
         position_BN3, c = state[CENTER], self.config
-        if c.position == "tanh":
+        if c.position == "tanh":  # the sines are made for [-1, 1], and centres are unbounded
             position_BN3 = torch.tanh(position_BN3)
         return self.position_mlp(
             sine_embedding(position_BN3, c.features, c.temperature, c.divisor_eps)

@@ -12,7 +12,7 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 
 
 class AnchorVisibility(Loss):
-    """Mean over queries of `qgs.losses.view_visibility` of their anchor centres (LocusGS)."""
+    """Mean over queries of `qgs.losses.view_visibility` of their anchors: equation (8)."""
 
     name = "anchor_visibility"
     reads = CENTER_FIELD

@@ -1,13 +1,17 @@
-"""Compiling functions with numba (the extra `cpu`, see `qgs.threads.can_compile`)."""
+"""Compiled loops: numba on a CPU (the extra `cpu`), Triton on a GPU (the extra `triton`).
+
+Nothing here is needed to understand a model. Each kernel computes what a few lines of torch say
+elsewhere, which are its oracle in the tests, without tensors of all pairs.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit
-
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` on first use, kept on disk where there is a place that can be written."""
+    """Compile `function` with numba on first use, kept on disk where a place can be written."""
+    from numba import njit
+
     options = {
         "nogil": True,
         "error_model": "numpy",  # no branch on a division by zero

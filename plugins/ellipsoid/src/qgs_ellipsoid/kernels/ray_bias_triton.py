@@ -1,10 +1,10 @@
-"""`EllipsoidBias` in Triton, for the kernels of `qgs.components.attention_triton`.
+"""`EllipsoidBias` in Triton, for the kernels of `qgs.kernels.attention_triton`.
 
 Queries are rows: mu, cof(W) and W by rows, gamma / 2, gamma * bias_min. Tokens have nine numbers:
 m, d, d / |d|.
 """
 
-from qgs.components.attention_triton import jit, tl
+from qgs.kernels.attention_triton import jit, tl
 
 
 @jit

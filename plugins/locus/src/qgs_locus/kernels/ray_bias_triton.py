@@ -1,9 +1,9 @@
-"""`RayBias` in Triton, for the kernels of `qgs.components.attention_triton`.
+"""`RayBias` in Triton, for the kernels of `qgs.kernels.attention_triton`.
 
 Queries are rows (x, y, z, gamma / (2 sigma^2), gamma * bias_min); tokens have six numbers, m and d.
 """
 
-from qgs.components.attention_triton import jit, tl
+from qgs.kernels.attention_triton import jit, tl
 
 
 @jit

@@ -12,6 +12,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from copy import copy
+from functools import cache
 from typing import Any, TypeAlias, TypeVar
 
 import torch
@@ -19,8 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from qgs.components.attention_choice import AttentionKernel, chosen_kernel
 from qgs.geometry.precision import full_precision
+from qgs.kernels.attention_choice import AttentionKernel, chosen_kernel
 from qgs.threads import can_compile, in_threads
 
 T = TypeVar("T")
@@ -29,7 +30,8 @@ Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
 """A scene, some of its queries, and buffers (n, M) for them."""
 
 BLOCK = {"cpu": 2**22, "cuda": 2**25}
-"""Numbers that all blocks of a pass may hold at a time, each (n, M)."""
+"""Numbers that all blocks of a pass may hold at a time, each (n, M): what caches hold on a CPU, and
+enough to fill a GPU."""
 
 _kept = threading.local()
 
@@ -61,7 +63,7 @@ class AttentionBias(ABC):
         return None
 
     def triton_functions(self) -> tuple[Any, Any] | None:
-        """`value` and `gradients` for `qgs.components.attention_triton`; None for none."""
+        """`value` and `gradients` for `qgs.kernels.attention_triton`; None for none."""
         return None
 
     @full_precision
@@ -141,13 +143,13 @@ def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
 
 
 def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Memory for `size` numbers. On a CPU it is kept: touching new memory would take as long as
-    computing the bias."""
+    """Memory for `size` numbers."""
     if device.type != "cpu":
         return torch.empty(size, device=device, dtype=dtype)
+    # It is kept: the first touch of new memory takes as long as computing the bias.
     memory = getattr(_kept, "memory", None)
     if memory is None or memory.dtype != dtype or len(memory) < size:
-        with torch.inference_mode(False):
+        with torch.inference_mode(False):  # a later pass may need gradients
             memory = _kept.memory = torch.empty(size, dtype=dtype)
     return memory[:size]
 
@@ -166,7 +168,7 @@ def biased_attention(
         mask_B1NM = bias.dense()[:, None].to(q_BhNd.dtype)
         return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
     if chosen == "triton":
-        from qgs.components.attention_triton import TritonAttention  # needs triton
+        from qgs.kernels.attention_triton import TritonAttention  # needs triton
 
         functions = bias.triton_functions()
         return _outside_graphs(TritonAttention.apply)(*qkv, *of_bias, functions)
@@ -232,7 +234,8 @@ class _BiasedAttention(torch.autograd.Function):
     ) -> Tensor:
         exact = torch.promote_types(q.dtype, torch.float32)
         out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=exact)
-        heads = 0 if q.device.type == "cpu" else q.shape[1]  # whose logits `_attend` makes at once
+        # `_attend` makes the logits of all heads at once, but for the fused kernel of a CPU.
+        heads = 0 if q.device.type == "cpu" else q.shape[1]
         for scene, rows, (bias_nM, *_) in bias.blocks(1 + heads, lse.dtype):
             bias.write(queries[scene, rows], tokens[scene], bias_nM)
             out[scene, :, rows], lse[scene, :, rows] = _attend(
@@ -252,11 +255,25 @@ class _BiasedAttention(torch.autograd.Function):
 
 def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted values (h, n, d) and log-sum-exp (h, n) of some queries of a scene."""
-    if q_hnd.device.type != "cpu":
+    if q_hnd.device.type != "cpu" or (flash := _flash_for_cpu()) is None:
         return _attend_anywhere(q_hnd, k_hMd, v_hMd, bias_nM)
-    flash = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu  # what SDPA calls
     out, lse = flash(q_hnd[None], k_hMd[None], v_hMd[None], attn_mask=bias_nM[None, None])
     return out[0], lse[0]
+
+
+@cache
+def _flash_for_cpu() -> Callable[..., tuple[Tensor, Tensor]] | None:
+    """What torch's attention calls on a CPU; None in a torch that has it no more, or otherwise.
+
+    Only this private operator returns the log-sum-exp, which spares the backward pass a softmax.
+    """
+    x = torch.ones(1, 1, 1, 8, device="cpu")
+    try:
+        flash: Any = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
+        out, lse = flash(x, x, x, attn_mask=x[..., :1])
+        return flash if (out.shape, lse.shape) == (x.shape, x.shape[:3]) else None
+    except (AttributeError, RuntimeError, TypeError, ValueError):
+        return None
 
 
 @full_precision

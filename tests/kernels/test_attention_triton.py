@@ -27,7 +27,7 @@ from qgs_locus.ray_bias import RayBias, ray_tokens
 from torch import Tensor
 
 from qgs.components import AttentionBias
-from qgs.components.attention_bias import biased_attention
+from qgs.kernels.attention_bias import biased_attention
 
 HAS_TRITON = find_spec("triton") is not None
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -264,7 +264,7 @@ def test_kernels_compile_for_gpus_that_are_not_here(
     jit = import_module("triton.runtime.jit").JITFunction
     driver = import_module("triton.runtime.driver").driver
     target = import_module("triton.backends.compiler").GPUTarget("cuda", arch, 32)
-    attention = import_module("qgs.components.attention_triton").TritonAttention
+    attention = import_module("qgs.kernels.attention_triton").TritonAttention
     compiled, run = [], jit.run
 
     def compile_alone(self: Any, *args: Any, grid: Any, warmup: bool, **kwargs: Any) -> None:

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.components import AttentionBias, CrossAttentionCore, attention_bias
-from qgs.components.attention_bias import BLOCK, biased_attention
-from qgs.kernels import kernel
+from qgs.components import AttentionBias, CrossAttentionCore
+from qgs.kernels import attention_bias, kernel
+from qgs.kernels.attention_bias import BLOCK, biased_attention
 
 
 class Nearness(AttentionBias):
@@ -122,7 +122,8 @@ def test_the_bound_holds_for_all_pairs_or_none(lower: float, kind: type[Attentio
 
 
 def test_what_other_devices_compute_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attention_bias, "_attend", attention_bias._attend_anywhere)
+    assert attention_bias._flash_for_cpu() is not None
+    monkeypatch.setattr(attention_bias, "_flash_for_cpu", lambda: None)
     _assert_exact(_case(5), Nearness)
 
 

@@ -1,0 +1,1 @@
+"""`RayBias` compiled: numba for CPUs, Triton for GPUs. The formula is in `qgs_locus.ray_bias`."""

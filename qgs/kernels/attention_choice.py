@@ -1,0 +1,95 @@
+"""What computes attention with a bias that is a function of query and token.
+
+On a CPU: blocks. On CUDA: the plain way, with the bias of all pairs, while one layer needs at most
+1 / SHARE of the GPU's memory for it (every layer keeps its bias for the backward pass); beyond that
+Triton kernels, or blocks where these cannot be used. No path has been timed on a GPU. The choice
+depends on sizes alone, so that layers, steps and processes of a training choose alike.
+"""
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from qgs.kernels.attention_bias import AttentionBias
+
+AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
+"""plain: torch's attention with the bias of all pairs. blocks: torch, block by block."""
+
+SHARE = 16
+
+_forced: list[AttentionKernel] = []
+
+
+@contextmanager
+def attention_kernel(kernel: AttentionKernel) -> Iterator[None]:
+    """What computes attention that leaves it open ("auto"), in all threads: to measure models."""
+    _forced.append(kernel)
+    try:
+        yield
+    finally:
+        _forced.pop()
+
+
+def chosen_kernel(
+    q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
+) -> AttentionKernel:
+    """One that is not "auto". ValueError for "triton" where it cannot compute this."""
+    kernel = _forced[-1] if kernel == "auto" and _forced else kernel
+    if kernel == "triton" and not fits_triton(q_BhNd, bias):
+        raise ValueError(
+            "Triton kernels need triton 3.5, a GPU, a bias with `triton_functions`, tokens "
+            "without gradient, heads of at most 256 channels, and no float64"
+        )
+    if kernel != "auto":
+        return kernel
+    if q_BhNd.device.type != "cuda":
+        return "blocks"
+    if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
+        return "plain"
+    found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
+    _log_once(f"attention with a bias goes through {found}: that of all pairs is too large")
+    return found
+
+
+def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
+    """What the plain way takes besides q, k and v: the bias, and its gradient for each head."""
+    (scenes, heads, queries, _), read = q_BhNd.shape, q_BhNd.element_size()
+    each = bias.queries.element_size() + (read if q_BhNd.dtype != bias.queries.dtype else 0)
+    if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
+        each += heads * read
+    return scenes * queries * bias.tokens.shape[2] * each
+
+
+def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
+    """Whether the Triton kernels are installed and can compute this."""
+    there = q_BhNd.device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
+    return (
+        there
+        and triton_version() >= (3, 5)
+        and bias.triton_functions() is not None
+        and not (bias.tokens.requires_grad and torch.is_grad_enabled())
+        and q_BhNd.dtype in (torch.float32, torch.bfloat16, torch.float16)
+        and q_BhNd.shape[-1] <= 256  # blocks of wider heads fit into no registers
+    )
+
+
+@cache
+def triton_version() -> tuple[int, ...]:
+    """Major and minor; () where triton is not installed."""
+    if find_spec("triton") is None:
+        return ()
+    return tuple(map(int, import_module("triton").__version__.split(".")[:2]))
+
+
+@cache
+def _log_once(message: str) -> None:
+    logging.getLogger(__name__).warning(message)
