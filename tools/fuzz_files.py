@@ -29,7 +29,7 @@ from qgs.data.domain import Domain, verdict
 from qgs.engine.fit import OutOfMemoryError
 from qgs.engine.guard import TrainingError
 from qgs.engine.training import train
-from qgs.io.checkpoint import load_domain, load_step
+from qgs.io.checkpoint import CheckpointFile
 from qgs.io.ply import save_ply
 
 STEPS = 2
@@ -227,8 +227,8 @@ def use_checkpoint(checkpoint: Path) -> None:
     with torch.no_grad():
         gaussians = model.decode(model.queries.start(1))
     save_ply(gaussians, checkpoint.with_suffix(".ply"))
-    load_step(checkpoint)
-    verdict(load_domain(checkpoint), Domain())
+    with CheckpointFile(checkpoint) as file:
+        _ = file.step, verdict(file.domain, Domain())
 
 
 def start_from(checkpoint: Path) -> None:

@@ -28,11 +28,10 @@ from fuzzing import FaultError, Use, fuzz, refused
 
 from qgs.analysis.shown import parameter_counts
 from qgs.composer import PluginError, Recipe, RecipeError, resolve
-from qgs.composer.recipe import annotated, flat
+from qgs.composer.recipe import annotated, differing_options, flat
 from qgs.composer.registry import load_sound_plugins
 from qgs.composer.slots import SLOTS
 from qgs.contracts import MissingExtraError
-from qgs.io.differences import differing_options
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

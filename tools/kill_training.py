@@ -38,7 +38,7 @@ from qgs.engine.checkpoint import read_state
 from qgs.engine.evaluation import evaluate
 from qgs.engine.folder import RunFolder
 from qgs.engine.training import train
-from qgs.io.checkpoint import load_domain, load_recipe
+from qgs.io.checkpoint import CheckpointFile
 from qgs.io.files import is_leftover
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "tokengs.yaml"
@@ -135,7 +135,9 @@ def same(one: Any, other: Any) -> bool:
 def evaluate_run(run: Path, out: Path) -> None:
     """As `qgs eval` does."""
     file = run / "checkpoint.safetensors"
-    evaluate(qgs.load(file), load_recipe(file), trained_on=load_domain(file)).write(out)
+    with CheckpointFile(file) as checkpoint:
+        model, recipe = checkpoint.model(), checkpoint.recipe
+    evaluate(model, recipe, trained_on=model.trained_on).write(out)
 
 
 def pack_rooms(recipe: Recipe, out: Path) -> None:

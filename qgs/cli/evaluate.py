@@ -73,8 +73,8 @@ def evaluate(
     from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
     from qgs.engine.evaluation import SECTIONS
-    from qgs.engine.folder import RunFolder, checkpoint_of
-    from qgs.io.checkpoint import load, load_recipe, load_step
+    from qgs.engine.folder import RunFolder
+    from qgs.io.checkpoint import CheckpointFile
 
     use_threads(threads)
     for setting in settings:
@@ -83,14 +83,13 @@ def evaluate(
                 f"--set {setting} would change the trained model; an evaluation can only set "
                 + ", ".join(SECTIONS)
             )
-    checkpoint = checkpoint_of(runs[0])
-    recipe = load_recipe(checkpoint)
-    if settings:
-        recipe = resolve(recipe.tree, settings)
-    model = load(checkpoint, choose_device(device))
+    with CheckpointFile(runs[0]) as file:
+        checkpoint, recipe, step = file.path, file.recipe, file.step
+        if settings:
+            recipe = resolve(recipe.tree, settings)
+        model = file.model(choose_device(device))
     own = Path(runs[0]).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
-    step = load_step(checkpoint)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch, model.trained_on)
     run = RunFolder(checkpoint.parent)
     if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():

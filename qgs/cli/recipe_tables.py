@@ -5,7 +5,7 @@ from rich.table import Table
 
 from qgs.analysis.shown import parameter_counts
 from qgs.composer import Recipe
-from qgs.io.differences import differing_options
+from qgs.composer.recipe import differing_options
 from qgs.model import QueryGaussianModel
 
 

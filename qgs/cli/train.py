@@ -38,7 +38,7 @@ def train(
     from qgs.engine.guard import TrainingError
     from qgs.engine.protocol import index_of
     from qgs.engine.training import train as train_model
-    from qgs.io.checkpoint import load_domain
+    from qgs.io.checkpoint import CheckpointFile
 
     use_threads(threads)
     console = Console()
@@ -64,7 +64,8 @@ def train(
         elif finished and (run.evaluation / "protocol.json").exists():  # the last file of one
             console.print(f"evaluated before, see {run.evaluation}")
         else:
-            trained_on = load_domain(run.checkpoint)
+            with CheckpointFile(run.checkpoint) as file:
+                trained_on = file.domain
             evaluate_into(
                 result.model, resolved, result.steps, run.evaluation, console, trained_on=trained_on
             )

@@ -10,9 +10,8 @@ from qgs.contracts import SceneSource
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
-from qgs.engine.folder import checkpoint_of
-from qgs.io.checkpoint import load, load_domain, load_recipe, load_step
-from qgs.io.models import about
+from qgs.io.checkpoint import CheckpointFile
+from qgs.io.models import about, checkpoint_path
 from qgs.wording import short_names
 
 WINDOWS = 6
@@ -23,8 +22,8 @@ AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (vie
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
-    """The files of the models `names` (see `checkpoint_of`), by short name."""
-    return dict(zip(short_names(names), map(checkpoint_of, names), strict=True))
+    """The files of the models `names` (see `checkpoint_path`), by short name."""
+    return dict(zip(short_names(names), map(checkpoint_path, names), strict=True))
 
 
 def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[contest.Entry]:
@@ -33,10 +32,10 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
     Raises as `load` and the data do, and ValueError where the recipes do not judge alike.
     """
     recipes, entries = recipes_alike(files, photos), []
-    trained = {name: load_domain(file) for name, file in files.items()}
     for name, recipe in recipes.items():
-        model = load(files[name], choose_device(device))
-        evaluation = evaluate(model, recipe, trained_on=trained[name])
+        with CheckpointFile(files[name]) as file:
+            model = file.model(choose_device(device))
+        evaluation = evaluate(model, recipe, trained_on=model.trained_on)
         parts = name, recipe, evaluation, model, about(files[name]), contest.curves_of(files[name])
         entries.append(contest.entry_of(*parts))
     return entries
@@ -45,9 +44,12 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[co
 def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Recipe]:
     """The recipes of `files`, of `checkpoints`; with the data at `photos` in place of their own.
 
-    Raises as `load_recipe` and the data do, and ValueError where they do not judge alike.
+    Raises as `CheckpointFile` and the data do, and ValueError where they do not judge alike.
     """
-    recipes = {name: load_recipe(file) for name, file in files.items()}
+    recipes = dict[str, Recipe]()
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            recipes[name] = file.recipe
     if photos is not None:
         recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
     first, other = next(iter(recipes.items()))
@@ -69,8 +71,9 @@ def remarks(entries: Sequence[contest.Entry]) -> list[str]:
 def progress(files: Mapping[str, Path]) -> str:
     """How far the training of each model in `files` has come, of the steps of its recipe."""
     told = []
-    for name, file in files.items():
-        step, training = load_step(file), load_recipe(file).training
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            step, training = file.step, file.recipe.training
         of = "" if training.seconds else f" of {training.steps:,}"
         told.append(f"{name}: " + ("not known" if step is None else f"step {step:,}{of}"))
     return "; ".join(told)

@@ -74,30 +74,6 @@ LATENT_RENAMES = (
 )
 """Names in TokenGS 2026.6: times, dynamic queries, the readout of several blocks, latents."""
 
-READ_OPTIONS = (
-    "model.width",
-    "model.heads",
-    "model.encoder.type",
-    "model.encoder.patch_size",
-    "model.encoder.depth",
-    "model.encoder.mlp_ratio",
-    "model.encoder.time_channels",
-    "model.encoder.blocks",
-    "model.encoder.latents",
-    "model.encoder.latent_depth",
-    "model.queries.type",
-    "model.queries.count",
-    "model.queries.dynamic",
-    "model.queries.time_channels",
-    "model.decoder.depth",
-    "model.decoder.cross_attention.type",
-    "model.decoder.self_attention.type",
-    "model.decoder.feed_forward.type",
-    "model.decoder.feed_forward.ratio",
-    "model.decoder.refinement.type",
-    "model.head.type",
-    "model.head.gaussians_per_query",
-)
 """Options that follow from the names and shapes of the parameters."""
 
 
@@ -211,7 +187,6 @@ TOKENGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
     read=_read,
-    read_options=READ_OPTIONS,
     undecided=(
         "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
         "blocks that an encoder of 2026.6 reads: every second one up to the last",

@@ -1,5 +1,6 @@
 """Resolving a recipe: everything that can be said about it before a tensor is allocated."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -366,6 +367,41 @@ def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:
         else:
             values[".".join(below)] = value
     return values
+
+
+def differing_options(
+    a: Mapping[str, Any], b: Mapping[str, Any]
+) -> dict[str, tuple[str | None, str | None]]:
+    """Dotted paths of the options that differ between two recipes, to both values as YAML.
+
+    None stands for an option that a recipe does not have.
+    """
+    of_a, of_b, absent = flat(a), flat(b), object()
+    return {
+        path: (
+            inline(of_a[path]) if path in of_a else None,
+            inline(of_b[path]) if path in of_b else None,
+        )
+        for path in of_a | of_b
+        if of_a.get(path, absent) != of_b.get(path, absent)
+    }
+
+
+_NO_EFFECT_ONCE_TRAINED = re.compile(
+    r"(\b|_)(init|std|layer_scale)(\b|_)|^model\.(supervision|renderer)\."
+)
+
+
+def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """`differing_options` that change what a model with given weights predicts, "none" for None.
+
+    Initial values, supervision and the renderer do not.
+    """
+    return {
+        path: (ours or "none", theirs or "none")
+        for path, (ours, theirs) in differing_options(a, b).items()
+        if path.startswith("model.") and not _NO_EFFECT_ONCE_TRAINED.search(path)
+    }
 
 
 WIDEST = 100

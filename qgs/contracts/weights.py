@@ -44,7 +44,6 @@ class WeightLayout:
     unused: from a published name to that of a parameter stored beside it, which their code ignores.
     read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
         raises LayoutError.
-    read_options: dotted paths of the options that `read` takes from names and shapes.
     undecided: what names and shapes leave open, in words, and what `read` chooses: the published.
     """
 
@@ -54,7 +53,6 @@ class WeightLayout:
     renames: tuple[Rename, ...]
     marks: tuple[str, ...]
     read: Callable[[Shapes], dict[str, Any]]
-    read_options: tuple[str, ...]
     unused: tuple[Rename, ...] = ()
     undecided: tuple[str, ...] = ()
 

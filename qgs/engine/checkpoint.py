@@ -1,12 +1,12 @@
 """What a run saves and continues from."""
 
 import json
+import math
 import os
 import random
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -23,25 +23,16 @@ from qgs.data.domain import KEY, SAMPLES, Domain
 from qgs.data.sampling import Batch
 from qgs.engine.distributed import placed_like, sharded, whole
 from qgs.engine.folder import RunFolder
-from qgs.io.checkpoint import (
+from qgs.io.checkpoint import load_weights, save, unique_tensors
+from qgs.io.tensors import (
     CheckpointError,
-    load_weights,
-    opened_tensors,
-    read_tensors,
-    save,
-    unique_tensors,
-    write_tensors,
-)
-from qgs.io.differences import (
-    CONTENTS,
-    contents,
+    TensorFile,
     differing_tensors,
     differing_types,
     nonfinite,
-    refuse_changed,
     shapes_of,
+    write_tensors,
 )
-from qgs.io.metadata import damaged, mapping_in, refuse_newer, stored_recipe
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
@@ -69,10 +60,11 @@ class Stateful(Protocol):
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state file: the recipe of its run, and the states of its parts."""
+    """A state file: the recipe of its run, the states of its parts, its error for damage."""
 
     recipe: Recipe
     parts: Mapping[str, State]
+    damaged: Callable[[str], CheckpointError]
 
 
 def write_state(
@@ -88,7 +80,6 @@ def write_state(
                 tensors[f"{part}/{key}"] = tensor.cpu().clone(memory_format=torch.contiguous_format)
     metadata = {
         _PARTS: json.dumps(values),
-        CONTENTS: json.dumps(contents(tensors)),
         _RECIPE: json.dumps(recipe),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
@@ -98,24 +89,34 @@ def write_state(
 
 def read_state(path: str | os.PathLike[str]) -> SavedState:
     """What `write_state` wrote; raises FileNotFoundError, CheckpointError, RecipeError."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no training state at {path}")
-    with opened_tensors(path) as file:
-        metadata = file.metadata() or {}
-    if _PARTS not in metadata:
-        raise CheckpointError(f"{path} is no training state; only `qgs train` writes such files")
-    refuse_newer(metadata, {_FORMAT: FORMAT_VERSION}, _VERSION, path)
-    parts, tensors = mapping_in(metadata, _PARTS, path), read_tensors(path)
-    refuse_changed(tensors, mapping_in(metadata, CONTENTS, path), path)
-    for name, tensor in tensors.items():
-        part, slash, key = name.partition("/")
-        if not slash or not isinstance(parts.get(part), dict):
-            raise damaged(path, f"the tensor `{name[:200]}` belongs to no part of a run")
-        parts[part][key] = tensor
-    try:
-        return SavedState(stored_recipe(metadata, _RECIPE, path), parts)
-    except RecipeError as error:
-        raise damaged(path, f"its recipe fails here, or needs other plugins: {error}") from error
+    with TensorFile(path) as file:
+        if _PARTS not in file.metadata:
+            raise CheckpointError(
+                f"{path} is no training state; only `qgs train` writes such files"
+            )
+        file.refuse_newer(_FORMAT, FORMAT_VERSION)
+        parts = file.mapping(_PARTS)
+        for name, tensor in file.read().items():
+            part, slash, key = name.partition("/")
+            if not slash or not isinstance(parts.get(part), dict):
+                raise file.damaged(f"the tensor `{name[:200]}` belongs to no part of a run")
+            parts[part][key] = tensor
+        try:
+            return SavedState(file.stored_recipe(_RECIPE), parts, file.damaged)
+        except RecipeError as error:
+            what = f"its recipe fails here, or needs other plugins: {error}"
+            raise file.damaged(what) from error
+
+
+def number_in(state: State, name: str, kind: type = int) -> Any:
+    """The finite number, 0 or more, of `kind` (int or float) that `state` has under `name`.
+
+    Raises ValueError for anything else, KeyError for nothing.
+    """
+    value = state[name]
+    if type(value) not in (kind, int) or not 0 <= value < math.inf:
+        raise ValueError(f"{name} is {str(value)[:100]!r}")
+    return value
 
 
 class Saver:
@@ -191,7 +192,7 @@ class Saver:
                 known = isinstance(error, CheckpointError)
                 fault = str(error) if known else f"{type(error).__name__}: {error}"
             if fault:
-                raise damaged(self.folder.state, f"its part `{name}` cannot be restored ({fault})")
+                raise saved.damaged(f"its part `{name}` cannot be restored ({fault})")
 
     def _extra(self, step: int) -> dict[str, str]:
         return {"step": str(step), KEY: self.domain.text}

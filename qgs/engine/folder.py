@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TextIO
 
 from qgs.io.files import is_leftover, read_records, told_where_full, write_text
-from qgs.io.models import CHECKPOINT, checkpoint_path
+from qgs.io.models import CHECKPOINT
 
 
 class FolderGoneError(OSError):
@@ -131,14 +131,3 @@ class RunFolder:
         if self._lock is not None:
             os.close(self._lock)
         self._history = self._lock = None
-
-
-def checkpoint_of(name: str | Path) -> Path:
-    """What `checkpoint_path` finds; raises as that does, and FileNotFoundError for no file."""
-    file = checkpoint_path(name)
-    if not file.is_file():
-        raise FileNotFoundError(
-            f"no checkpoint at {file}; give a run folder of `qgs train`, a .safetensors file, its "
-            "URL, or PLUGIN/NAME of a model that `qgs list` shows"
-        )
-    return file

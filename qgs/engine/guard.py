@@ -18,13 +18,12 @@ from torch import Tensor, nn
 from qgs.composer import Recipe
 from qgs.data.sampling import Batch
 from qgs.engine.causes import blamed
-from qgs.engine.checkpoint import Saver, Weights
+from qgs.engine.checkpoint import Saver, Weights, number_in
 from qgs.engine.distributed import whole
 from qgs.engine.objective import TrainingPass
-from qgs.io.checkpoint import save, unique_tensors, write_tensors
-from qgs.io.differences import nonfinite
+from qgs.io.checkpoint import save, unique_tensors
 from qgs.io.files import replacing_entries
-from qgs.io.metadata import number_in
+from qgs.io.tensors import nonfinite, write_tensors
 from qgs.types import named_tensors
 from qgs.wording import listed
 

@@ -6,46 +6,37 @@ import torch
 from torch import Tensor
 
 from qgs.composer import Recipe
-from qgs.engine.folder import checkpoint_of
-from qgs.io.checkpoint import (
-    CheckpointError,
-    load_recipe,
-    load_weights,
-    read_tensors,
-    refuse_damaged,
-    unique_tensors,
-)
-from qgs.io.differences import differing_tensors, options_beside_weights, shapes_of
+from qgs.composer.recipe import differing_predictions
+from qgs.io.checkpoint import CheckpointFile, load_weights, unique_tensors
+from qgs.io.tensors import CheckpointError, differing_tensors, shapes_of
 from qgs.model import QueryGaussianModel
 
 _QUERIES, _ENCODER = "queries.", "encoder."
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
-    """Give `model`, freshly built from `recipe`, the weights that `recipe.init_from` names, if any.
+    """Give `model`, freshly built from `recipe`, the weights of `recipe.init_from`, if any.
 
-    `init_from` is a checkpoint, the folder of a run, a shipped model or a URL. Queries
-    grow or shrink by their own rule (`Queries.resized`) with random numbers of the recipe's seed,
-    the encoder adapts weights to its patches (`Encoder.adapted`); everything else must have the
-    same names and shapes.
+    `init_from` is a name as `CheckpointFile` takes it. Queries grow or shrink by their own rule
+    (`Queries.resized`) with random numbers of the recipe's seed, the encoder adapts weights to its
+    patches (`Encoder.adapted`); everything else must have the same names and shapes.
 
-    Returns what was done, line by line, with the options that make the same weights predict other
-    Gaussians. Raises FileNotFoundError, CheckpointError with every difference and what would fit.
+    Returns lines about weights of another size, and about options that make the same weights
+    predict other Gaussians. Raises FileNotFoundError, CheckpointError with every difference.
     """
     if recipe.init_from is None:
         return []
-    path = checkpoint_of(recipe.init_from)
-    learned_by = load_recipe(path)
-    stored = read_tensors(path)
+    with CheckpointFile(recipe.init_from) as file:
+        path, theirs, stored = file.path, file.recipe, file.tensors
     learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
     options = [
-        f"{option}: {theirs} (here {ours})"
-        for option, (theirs, ours) in options_beside_weights(learned_by.tree, recipe.tree).items()
+        f"{option}: {their} (here {ours})"
+        for option, (their, ours) in differing_predictions(theirs.tree, recipe.tree).items()
         if option != "model.queries.count"
     ]
-    adapted = model.encoder.adapted(_of(_ENCODER, learned))
+    adapted = model.encoder.adapted(_part(_ENCODER, learned))
     weights = learned | {_ENCODER + name: values for name, values in adapted.items()}
-    found = _differences(weights, model, learned_by.build_model("meta").queries.count)
+    found = _differences(weights, model, theirs.build_model("meta").queries.count)
     if found:
         first = (
             f"init_from: {path} does not fit this recipe; only the number of queries and, to a "
@@ -54,26 +45,23 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         trained = "options of the model that the checkpoint was trained with:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
     generator = torch.Generator().manual_seed(recipe.seed)
-    resized = model.queries.resized(_of(_QUERIES, learned), generator)
+    resized = model.queries.resized(_part(_QUERIES, learned), generator)
     weights |= {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, str(path))
-    refuse_damaged(stored, path)
     changes = [
         _change(name, learned[name], values)
         for name, values in weights.items()
         if values.shape != learned[name].shape
     ]
-    learned_with = [f"learned with {option}" for option in options]
-    return [f"weights start from {path}", *changes, *learned_with]
+    return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
 
 
-def _of(part: str, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The weights of one part of the model, by their names in it."""
-    return {k.removeprefix(part): v for k, v in learned.items() if k.startswith(part)}
+    return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
 def _change(name: str, old: Tensor, new: Tensor) -> str:
-    """In words, how a weight was brought to another shape."""
     if not name.startswith(_QUERIES):
         return f"{name}: {tuple(old.shape)} -> {tuple(new.shape)}"
     before, after = len(old), len(new)
@@ -84,7 +72,7 @@ def _change(name: str, old: Tensor, new: Tensor) -> str:
 def _differences(
     learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int | None
 ) -> list[str]:
-    """In what the weights of a model of `count` queries differ, besides that number."""
+    """Differences from the weights of a model of `count` queries, except in that number."""
     own, theirs = shapes_of(unique_tensors(model)), shapes_of(learned)
     for name in own.keys() & theirs.keys():
         ours, shape = own[name], theirs[name]

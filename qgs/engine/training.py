@@ -28,6 +28,7 @@ from qgs.engine.checkpoint import (
     OptimizerState,
     RandomStates,
     Saver,
+    number_in,
     refuse_other_data,
     saved_state,
 )
@@ -52,7 +53,6 @@ from qgs.engine.parameters import MovingAverage, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.io.files import write_text
-from qgs.io.metadata import number_in
 from qgs.model import QueryGaussianModel
 
 MAX_REASONS = 100

@@ -21,35 +21,45 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 def checkpoint_path(name: str | os.PathLike[str]) -> Path:
-    """The local path that `name` stands for; anything that exists under that name comes first.
+    """The local file that `name` stands for; anything that exists under that name comes first.
 
     name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
     plugin ships (`qgs list`), or a URL that fsspec opens, whose file is kept in `cache_folder` and
-    its SHA-256 told on standard error.
-    Raises FileNotFoundError for a model that a plugin does not ship, PluginError for a plugin that
-    cannot be used, OSError for a download that fails; a path that does not exist is returned.
+    its SHA-256 printed to standard error.
+    Raises FileNotFoundError, PluginError for a plugin that cannot be used, OSError for a download
+    that fails.
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
-    if path.exists():
-        return path / CHECKPOINT if path.is_dir() else path
-    if "://" in text:
-        return _downloaded(text)
     plugin, slash, model = text.partition("/")
-    known = available_plugins().keys() | DISTRIBUTIONS[ENTRY_POINT_GROUP].keys()
-    if plugin not in known or not slash or "/" in model or path.suffix == ".safetensors":
-        return path
-    installed = load_plugin(plugin)
-    if text not in installed.models:
-        hint = did_you_mean(text, installed.models, "models") if installed.models else "it has none"
+    if path.exists():
+        path = path / CHECKPOINT if path.is_dir() else path
+    elif "://" in text:
+        return _downloaded(text)
+    elif slash and "/" not in model and path.suffix != ".safetensors":
+        known = available_plugins().keys() | DISTRIBUTIONS[ENTRY_POINT_GROUP].keys()
+        if plugin in known:
+            return _shipped(plugin, text)
+    if not path.is_file():
         raise FileNotFoundError(
-            f"there is no file {text}, and {installed.released_as} ships no model of that name; "
+            f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "
+            "URL, or PLUGIN/NAME of a model that `qgs list` shows"
+        )
+    return path
+
+
+def _shipped(plugin: str, name: str) -> Path:
+    installed = load_plugin(plugin)
+    if name not in installed.models:
+        hint = did_you_mean(name, installed.models, "models") if installed.models else "it has none"
+        raise FileNotFoundError(
+            f"there is no file {name}, and {installed.released_as} ships no model of that name; "
             f"{hint}"
         )
-    file = installed.models[text]
+    file = installed.models[name]
     if not file.is_file():
         raise FileNotFoundError(
-            f"{installed.released_as} should ship the model {text}, but {file} is not there; "
+            f"{installed.released_as} should ship the model {name}, but {file} is not there; "
             f"install {installed.released_as} again"
         )
     return file

@@ -1,19 +1,29 @@
-"""Published state dicts and ours: which parameter is which, and which recipe fits."""
+"""Import of published weights: names of their parameters, recipe that fits, checkpoint."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer.recipe import differing_predictions
 from qgs.composer.registry import load_registry, load_sound_plugins
 from qgs.composer.yaml_text import dump
 from qgs.contracts import LayoutError, WeightLayout
 from qgs.contracts.weights import Shapes
-from qgs.io.checkpoint import unique_tensors
-from qgs.io.differences import differing_options, differing_tensors, shapes_of
-from qgs.io.weight_file import WeightFile
+from qgs.io.checkpoint import (
+    new_checkpoint_path,
+    refuse_nonfinite,
+    unique_tensors,
+    write_checkpoint,
+)
+from qgs.io.files import refuse_existing, write_text
+from qgs.io.tensors import differing_tensors, shapes_of
+from qgs.io.weight_file import WeightFile, read_weight_file
 from qgs.wording import listed
 
 
@@ -35,32 +45,22 @@ class Names:
     unnamed: tuple[str, ...]
     unused: tuple[str, ...]
 
-    def mismatches(self, shapes: Shapes) -> list[str]:
-        """Problems of a published state dict of these `shapes` with this recipe, line by line."""
-        found = [f"no published name: {name}" for name in self.unnamed]
-        return found + differing_tensors(shapes, self.published_shapes(), set(self.unused))
-
-    def published_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Published names of our parameters to their shapes."""
-        return {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
-
-    def from_published(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def from_published(
+        self, weights: Mapping[str, Tensor], origin: object = "the file"
+    ) -> dict[str, Tensor]:
         """A published state dict under our names, `unused` left out.
 
-        Raises PublishedError that lists every name that is missing or unexpected, and every shape
-        that is another one.
+        Raises PublishedError with every difference in names and shapes.
         """
-        found = self.mismatches(shapes_of(weights))
-        if found:
+        wanted = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
+        found = [f"no published name: {name}" for name in self.unnamed]
+        if found := found + differing_tensors(shapes_of(weights), wanted, self.unused):
             raise PublishedError(
-                f"the weights do not fit the recipe, {len(found)} differences:\n  "
-                + "\n  ".join(found)
+                f"{origin} does not fit the recipe, whose model is a {self.layout.name} "
+                f"(`--recipe auto` writes one that fits), {len(found)} differences:\n  "
+                + listed(found, 20, "\n  ")
             )
         return {ours: weights[theirs] for ours, theirs in self.published.items()}
-
-    def to_published(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Our parameters under their published names; the inverse of `from_published`."""
-        return {theirs: weights[ours] for ours, theirs in self.published.items()}
 
 
 def names_of(recipe: Recipe) -> Names:
@@ -76,33 +76,6 @@ def names_of(recipe: Recipe) -> Names:
             return _names_in(recipe, layout)
         reasons += [f"\n  {layout.name}: {line}" for line in found]
     raise PublishedError("no published layout can hold this model:" + "".join(reasons))
-
-
-def exact_names_of(recipe: Recipe) -> Names:
-    """`names_of` for a model that has exactly the parameters that the codebase builds.
-
-    Raises PublishedError that lists what the codebase lacks, and what it has besides.
-    """
-    names = names_of(recipe)
-    layout, extra, theirs, problems = names.layout, names.unnamed, names.shapes, []
-    if not extra:
-        try:
-            theirs = _names_in(resolve(layout.read(names.published_shapes())), layout).shapes
-        except ValueError as error:  # a LayoutError or RecipeError
-            problems.append(str(error))
-        extra = [name for name in names.shapes if name not in theirs]
-    problems += [f"{name}: {layout.name} has no such parameter" for name in extra]
-    problems += [
-        f"{name}: {layout.name} has it with the shape {shape}, this model has "
-        f"{names.shapes.get(name, 'no such parameter')}"
-        for name, shape in theirs.items()
-        if names.shapes.get(name) != shape
-    ]
-    if problems:
-        raise PublishedError(
-            f"the layout of {layout.name} cannot hold this model:\n  " + "\n  ".join(problems)
-        )
-    return names
 
 
 def _layouts(plugins: Any) -> list[WeightLayout]:
@@ -199,42 +172,102 @@ def recipe_text(
     return "\n".join(lines) + "\n" + dump(dict(tree))
 
 
-def advice(recipe: Recipe, expected: WeightLayout | None, shapes: Shapes) -> list[str]:
-    """What a recipe that does not fit a state dict would have to say, line by line.
+@dataclass(frozen=True)
+class Transfer:
+    """What `import_weights` did.
 
-    expected: the layout of the recipe's own model.
+    count: parameters taken over. unused: names in the file that the published code never reads.
+    settings: paths of options that weights do not show and in which the model differs from the
+    published one, to both values. notes: how the file was read and converted.
+    recipe_file: the recipe that was written, if one was.
     """
-    layout, _ = recognise(shapes)
-    if layout is None:
-        return ["these are the names of no published model that is known here"]
-    lines = []
-    if expected is not None and expected.name != layout.name:
-        lines.append(f"these are weights of {layout.name}, the recipe composes {expected.name}")
+
+    layout: WeightLayout
+    recipe: Recipe
+    count: int
+    unused: tuple[str, ...]
+    settings: Mapping[str, tuple[str, str]]
+    notes: tuple[str, ...] = ()
+    recipe_file: Path | None = None
+
+
+def import_weights(
+    weights: str | Path,
+    recipe: Recipe | None,
+    out: str | Path,
+    *,
+    overrides: Sequence[str] = (),
+    to_float32: bool = False,
+) -> Transfer:
+    """Write a checkpoint of `recipe` with published weights.
+
+    recipe: None for the one that fits, changed by `overrides` (such as "data.image_size=[64, 64]"),
+        which is then also written beside `out`, as .yaml.
+    out: a new .safetensors file.
+    to_float32: convert weights of other floating-point types instead of refusing them.
+    Raises FileNotFoundError, FileExistsError, ValueError for another suffix, RecipeError about
+    `overrides`, CheckpointError and PublishedError; nothing is written then.
+    """
+    out = new_checkpoint_path(out)
+    recipe_file = out.with_suffix(".yaml") if recipe is None else None
+    if recipe_file:
+        refuse_existing(recipe_file)
+    file = without_prefix(read_weight_file(weights))
+    shapes = shapes_of(file.tensors)
+    text = ""
+    if recipe is None:
+        layout, tree = fitting_recipe(shapes, str(weights))
+        recipe = resolve(tree, overrides)
+        text = recipe_text(recipe.tree if overrides else tree, layout, file.path.name, overrides)
     try:
-        fitting = resolve(layout.read(shapes))
-    except (LayoutError, RecipeError) as error:
-        return [*lines, f"no recipe fits the shapes: {error}"]
-    differing = differing_options(recipe.tree, fitting.tree)
-    options = []
-    for path in layout.read_options:
-        has, wanted = differing.get(path, (None, None))
-        if wanted is not None:
-            found = f"the recipe has {has}" if has else "not in it"
-            options.append(f"  {path}: {wanted} ({found})")
-    if options:
-        lines += ["options that would fit, by names and shapes:", *options]
-        lines += ["names and shapes cannot tell:", *(f"  {line}" for line in layout.undecided)]
-        lines.append("`--recipe auto` writes a recipe that fits")
-    remaining = _names_in(fitting, layout).mismatches(shapes)
-    count = len(remaining)
-    if remaining and all(line.startswith("unexpected: ") for line in remaining):
-        keys = "key" if count == 1 else "keys"
-        lines.append(
-            f"whatever the recipe says, the file has {count} {keys} that {layout.name} has not"
+        names = names_of(recipe)
+    except PublishedError as error:
+        raise PublishedError(f"{file.path} does not fit the recipe: {error}") from error
+    tensors, converted = _as_float32(file, names, to_float32)
+    origin = {"imported": f"{names.layout.name} weights {file.path.name}"}
+    settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
+    write_checkpoint(out, tensors, recipe.tree, origin)
+    if recipe_file:
+        try:
+            write_text(recipe_file, text)
+        except BaseException:
+            out.unlink()
+            raise
+    dropped = tuple(name for name in names.unused if name in file.tensors)
+    notes = (*file.notes, *converted)
+    return Transfer(names.layout, recipe, len(tensors), dropped, settings, notes, recipe_file)
+
+
+def _as_float32(
+    file: WeightFile, names: Names, allowed: bool
+) -> tuple[dict[str, Tensor], list[str]]:
+    """Contiguous float32 tensors under our names, and a note of what was converted.
+
+    Raises PublishedError for other types, where they are not `allowed`, and for NaN and infinity.
+    """
+    given = names.from_published(file.tensors, file.path)
+    others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
+    kinds = Counter(str(dtype).removeprefix("torch.") for dtype in others.values())
+    report = ", ".join(f"{count} of {len(given)} are {kind}" for kind, count in kinds.items())
+    strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
+    if strange:
+        raise PublishedError(
+            f"{file.path} holds weights that are no real numbers: {listed(strange)} ({report})"
         )
-    elif remaining:
-        lines.append(
-            f"{count} of the differences stay whatever the recipe says: the file is no whole "
-            f"state dict of {layout.name}, or more than one"
-        )
-    return lines
+    if others and not allowed:
+        fix = "--to-float32 rounds them to the float32 that models here compute in"
+        if any(dtype.itemsize < torch.float32.itemsize for dtype in others.values()):
+            fix = (
+                "half precision has lost digits that no conversion brings back. Take the float32 "
+                "file, or convert with --to-float32"
+            )
+        raise PublishedError(f"{file.path} holds weights that are not float32 ({report}); {fix}")
+    tensors: dict[str, Tensor] = {}
+    stored: set[int] = set()
+    for name, tensor in given.items():
+        tensor = tensor.to(torch.float32).contiguous()
+        # A torch file may store several names once; a checkpoint holds each on its own.
+        tensors[name] = tensor.clone() if tensor.data_ptr() in stored else tensor
+        stored.add(tensor.data_ptr())
+    refuse_nonfinite({names.published[name]: t for name, t in tensors.items()}, file.path)
+    return tensors, [f"converted to float32: {report}"] if others else []

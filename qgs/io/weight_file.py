@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.io.checkpoint import CheckpointError, opened_tensors, pickle_kind, read_tensors
+from qgs.io.tensors import CheckpointError, TensorFile, pickle_kind
 from qgs.wording import listed
 
 SAFETENSORS = (".safetensors",)
@@ -58,19 +58,15 @@ def read_weight_file(path: str | Path) -> WeightFile:
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    kind = pickle_kind(path)
-    if kind:
+    if kind := pickle_kind(path):
         raise CheckpointError(
             f"{path} is {kind}, whatever its name says; if it holds weights, name it .pt: it is "
             "then read without running code in it"
         )
-    with opened_tensors(path) as file:
-        if "qgs.recipe" in (file.metadata() or {}):
-            raise CheckpointError(
-                f"{path} is a qgs checkpoint, no published weights; qgs.load reads it, and "
-                "`qgs export` writes published weights from it"
-            )
-    tensors = read_tensors(path)
+    with TensorFile(path) as file:
+        if "qgs.recipe" in file.metadata:
+            raise CheckpointError(f"{path} is a qgs checkpoint, no published weights")
+        tensors = file.read()
     if not tensors:
         raise CheckpointError(f"{path} holds no tensors")
     return tensors

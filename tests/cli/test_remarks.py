@@ -100,7 +100,7 @@ def test_samples_where_none_are_drawn_are_said_to_change_nothing(
 
 def only_scene(checkpoint: Path) -> str:
     """The name of the only scene."""
-    recipe = qgs.io.checkpoint.load_recipe(checkpoint)
+    recipe = qgs.io.checkpoint.CheckpointFile(checkpoint).recipe
     return EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation).wanted[0]
 
 

@@ -14,7 +14,8 @@ from qgs.composer import resolve
 from qgs.data.domain import KEY, Domain, trained_domain, verdict
 from qgs.engine.training import train
 from qgs.geometry.poses import look_at
-from qgs.io.checkpoint import CheckpointError, load_domain, save
+from qgs.io.checkpoint import CheckpointFile, save
+from qgs.io.tensors import CheckpointError
 from qgs.types import Cameras
 
 RECIPE = {
@@ -99,7 +100,7 @@ def test_a_damaged_domain_is_one_error_with_the_file(told: str, tmp_path: Path) 
     file = tmp_path / "a.safetensors"
     save(resolve(RECIPE).build_model(), file, extra={KEY: told})
     with pytest.raises(CheckpointError, match=r"a\.safetensors is damaged: .*trained_on"):
-        load_domain(file)
+        _ = CheckpointFile(file).domain
 
 
 def test_the_sentence() -> None:
@@ -120,12 +121,12 @@ def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued
     recipe = resolve(RECIPE)
     whole = train(recipe, tmp_path / "whole").folder
     half = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "half").folder
-    told = load_domain(half.checkpoint)
+    told = CheckpointFile(half.checkpoint).domain
     assert told.samples == 6
     shutil.copy(whole.checkpoint, half.checkpoint)  # as after a kill before the state was written
     train(recipe, tmp_path / "half", resume=True)
-    found = load_domain(whole.checkpoint)
-    assert load_domain(half.checkpoint) == found != told
+    found = CheckpointFile(whole.checkpoint).domain
+    assert CheckpointFile(half.checkpoint).domain == found != told
     first = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
     assert found.samples == 12
     assert first.samples == 256
@@ -136,4 +137,4 @@ def test_a_cut_checkpoint_does_not_hinder_going_on(tmp_path: Path) -> None:
     folder = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "run").folder
     folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:1000])
     train(resolve(RECIPE), tmp_path / "run", resume=True)
-    assert load_domain(folder.checkpoint).samples == 12
+    assert CheckpointFile(folder.checkpoint).domain.samples == 12

@@ -25,7 +25,7 @@ from qgs.engine.guard import (
 from qgs.engine.objective import measure
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
-from qgs.io.checkpoint import load_extra
+from qgs.io.checkpoint import CheckpointFile
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
 DEAD = dict.fromkeys(ALIVE, 0.0)
@@ -109,7 +109,7 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
         assert cause not in message
     folder = RunFolder(tmp_path / "run")
     history = folder.history()
-    kept = int(load_extra(folder.checkpoint)["step"])
+    kept = CheckpointFile(folder.checkpoint).step
     last_alive = max(record["step"] for record in history if record["alpha"] >= EMPTY_ALPHA)
     assert len(history) <= last_alive + 100
     assert last_alive - 50 < kept <= last_alive < len(history) < 300
@@ -201,7 +201,7 @@ def test_one_dead_step_at_the_end_fails_no_run(
             trainer.guard.detector.observe(DEAD)
 
     result = run_calling(die_at_the_end, tiny("tokengs", "training.steps=3"), tmp_path / "run")
-    assert load_extra(result.folder.checkpoint)["step"] == "3"
+    assert CheckpointFile(result.folder.checkpoint).step == 3
     assert "for the last 1 steps" in caplog.text
 
 

@@ -123,7 +123,7 @@ def test_a_full_disk_is_told_with_what_to_do(
     run(tiny("tokengs", "training.steps=3"), folder)
     whole = Folder(folder).state.read_bytes()
     with monkeypatch.context() as patched:
-        patched.setattr("qgs.io.checkpoint.save_file", full)
+        patched.setattr("qgs.io.tensors.save_file", full)
         with pytest.raises(OSError, match=r"It takes \d+\.\d MB .* --resume"):
             run(recipe, folder, resume=True)
     assert Folder(folder).state.read_bytes() == whole

@@ -16,9 +16,9 @@ from qgs.composer import Recipe, resolve
 from qgs.contracts import Queries
 from qgs.engine.initial import initialise
 from qgs.engine.training import train
-from qgs.io.checkpoint import CheckpointError, save
-from qgs.io.published import exact_names_of
-from qgs.io.transfer import import_weights
+from qgs.io.checkpoint import save
+from qgs.io.published import import_weights, names_of
+from qgs.io.tensors import CheckpointError
 from qgs.model import QueryGaussianModel
 
 COUNT = 24
@@ -209,7 +209,8 @@ def test_imported_weights_grow_too(tmp_path: Path) -> None:
     small = {"width": 16, "heads": 2, "queries": {"count": 6}, "decoder": {"depth": 1},
              "supervision": {"layers": [1]}}  # fmt: skip
     recipe = resolve({"recipe": 1, "model": small})
-    weights = exact_names_of(recipe).to_published(recipe.build_model().state_dict())
+    ours, names = recipe.build_model().state_dict(), names_of(recipe).published
+    weights = {names[name]: tensor for name, tensor in ours.items()}
     save_file(weights, tmp_path / "w.safetensors")
     import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
     grown = resolve(

@@ -10,7 +10,7 @@ from training_runs import TWO, Tiny, losses, read_jsonl, run, run_calling, same,
 import qgs
 from qgs.engine.distributed import StopRequest
 from qgs.engine.training import Trainer
-from qgs.io.checkpoint import load_step
+from qgs.io.checkpoint import CheckpointFile
 from qgs.losses import Photometric
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
@@ -67,14 +67,14 @@ def test_a_checkpoint_has_the_numbers_of_its_step(tiny: Tiny, tmp_path: Path) ->
     model = qgs.load(result.folder.checkpoint)
     assert model.renderer.config.dilation == 2
     qgs.save(model, tmp_path / "again.safetensors")
-    assert load_step(tmp_path / "again.safetensors") == 2
+    assert CheckpointFile(tmp_path / "again.safetensors").step == 2
     assert qgs.load(tmp_path / "again.safetensors").renderer.config.dilation == 2
     fresh = tiny("tokengs", *SCHEDULED).build_model()
     qgs.save(fresh, tmp_path / "fresh.safetensors")
     assert qgs.load(tmp_path / "fresh.safetensors").renderer.config.dilation == 4
     plain = tiny("tokengs").build_model()
     qgs.save(plain, tmp_path / "plain.safetensors")
-    assert load_step(tmp_path / "plain.safetensors") is None
+    assert CheckpointFile(tmp_path / "plain.safetensors").step is None
 
 
 def test_the_renderer_that_auto_chooses_follows(tiny: Tiny) -> None:

@@ -15,8 +15,9 @@ from qgs.composer import resolve
 from qgs.data.stream import training_batches
 from qgs.engine import distributed as interrupt
 from qgs.engine.distributed import stop_requests
-from qgs.engine.folder import RunFolder, checkpoint_of
-from qgs.io.checkpoint import load_extra
+from qgs.engine.folder import RunFolder
+from qgs.io.checkpoint import CheckpointFile
+from qgs.io.models import checkpoint_path
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
@@ -38,7 +39,7 @@ def test_a_run_leaves_recipe_history_and_checkpoint(tiny: Tiny, tmp_path: Path) 
     assert terms | {"loss", "psnr", "lr", "seconds", "gradient"} <= history[0].keys()
     for record in history:
         assert record["loss"] == pytest.approx(sum(record[term] for term in terms))
-    assert load_extra(result.folder.checkpoint)["step"] == "4"
+    assert CheckpointFile(result.folder.checkpoint).step == 4
     loaded = qgs.load(result.folder.checkpoint)
     batch = next(training_batches(recipe.build_data(), recipe.views, 1, seed=1))
     with torch.no_grad():
@@ -100,7 +101,7 @@ def test_a_signal_saves_and_ends(tiny: Tiny, tmp_path: Path, number: signal.Sign
     thread.join(timeout=60)
     assert result.stopped_by == number.name
     assert result.steps == len(result.folder.history())
-    assert load_extra(result.folder.checkpoint)["step"] == str(result.steps)
+    assert CheckpointFile(result.folder.checkpoint).step == result.steps
     assert signal.getsignal(number) is before
 
 
@@ -147,8 +148,8 @@ def test_only_a_later_second_ctrl_c_is_not_caught(
     assert capfd.readouterr().err.count(told) == 1
 
 
-def test_the_checkpoint_of_a_run_is_found(tmp_path: Path) -> None:
+def test_the_checkpoint_path_a_run_is_found(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="give a run folder"):
-        checkpoint_of(tmp_path)
+        checkpoint_path(tmp_path)
     (tmp_path / "checkpoint.safetensors").touch()
-    assert checkpoint_of(tmp_path) == checkpoint_of(tmp_path / "checkpoint.safetensors")
+    assert checkpoint_path(tmp_path) == checkpoint_path(tmp_path / "checkpoint.safetensors")

@@ -26,7 +26,7 @@ from qgs.data.sampling import Batch
 from qgs.engine import tracking as trackers
 from qgs.engine.checkpoint import read_state
 from qgs.engine.guard import MAX_SKIPPED, NonFiniteError
-from qgs.io.checkpoint import load_domain
+from qgs.io.checkpoint import CheckpointFile
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_a_bad_step_is_skipped_on_demand(
     with caplog.at_level(logging.WARNING):
         result = run(recipe, tmp_path / "run")
     assert result.steps == 4
-    assert load_domain(result.folder.checkpoint).samples == 2 * recipe.training.batch_size
+    assert CheckpointFile(result.folder.checkpoint).domain.samples == 2 * recipe.training.batch_size
     told = [r.message for r in caplog.records if "is skipped" in r.message]
     assert [message.split(" is skipped")[0] for message in told] == ["step 2", "step 4"]
     folder = result.folder.path

@@ -15,7 +15,7 @@ from torch import Tensor
 from qgs.composer import resolve
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.io.checkpoint import unique_tensors
-from qgs.io.published import exact_names_of
+from qgs.io.published import names_of
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
@@ -63,7 +63,7 @@ def write(path: Path, config: dict[str, Any], sizes: Sizes) -> Path:
             views = replace(views, times=times[:, 1:], target_time=times[:, :1])
         tuned = torch.randn_like(model.encoder(views).features) if model.encoder.tunable else None
     weights = {name: tensor.clone() for name, tensor in unique_tensors(model).items()}
-    published = exact_names_of(recipe).to_published(weights)
+    published = {theirs: weights[ours] for ours, theirs in names_of(recipe).published.items()}
     if not config["options"].get("use_multiscale_encoder"):
         published = {name.replace(READ_NORM, LAST_NORM): x for name, x in published.items()}
     exact = None if tuned is None else tuned.double()

@@ -15,9 +15,8 @@ import qgs
 from qgs.composer import resolve
 from qgs.composer.registry import load_sound_plugins
 from qgs.engine.initial import initialise
-from qgs.io.checkpoint import load_extra, save
+from qgs.io.checkpoint import CheckpointFile, export_checkpoint, save
 from qgs.io.models import checkpoint_path
-from qgs.io.transfer import export_half
 
 RECIPE = {
     "recipe": 1,
@@ -139,7 +138,7 @@ def test_half_precision_halves_the_file_and_loads_as_float32(shipped: Path) -> N
     assert {tensor.dtype for tensor in model.parameters()} == {torch.float32}
     for name, tensor in model.named_parameters():
         torch.testing.assert_close(tensor, whole[name].half().float(), rtol=0, atol=0)
-    assert load_extra("half.safetensors")["step"] == "7"
+    assert CheckpointFile("half.safetensors").step == 7
     assert os.path.getsize("half.safetensors") < os.path.getsize(shipped)
 
 
@@ -149,7 +148,5 @@ def test_weights_beyond_half_precision_are_refused(shipped: Path) -> None:
         model.queries.features.fill_(1e6)
     save(model, "large.safetensors")
     with pytest.raises(ValueError, match=r"float16 cannot hold .*: queries\.features"):
-        export_half("large.safetensors", "half.safetensors")
+        export_checkpoint("large.safetensors", "half.safetensors", half=True)
     assert not Path("half.safetensors").exists()
-    with pytest.raises(ValueError, match="one of --layout published and --half"):
-        raise run_qgs("export", "large.safetensors", "--out", "x.safetensors").exception

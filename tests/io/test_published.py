@@ -1,47 +1,81 @@
-"""Published state dicts under our names and back; what no layout can hold is refused."""
+"""Published weights become checkpoints: every tensor accounted for, or nothing is written."""
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from golden_weights import published
+from safetensors.torch import load_file, save, save_file
+from torch import Tensor
 
+import qgs
+from qgs.cli import main
 from qgs.components import TOKENGS
-from qgs.composer import Recipe, resolve
-from qgs.io.differences import options_beside_weights, shapes_of
-from qgs.io.published import PublishedError, exact_names_of, fitting_recipe, names_of
+from qgs.composer import resolve
+from qgs.composer.recipe import differing_predictions
+from qgs.io.checkpoint import CheckpointFile
+from qgs.io.published import PublishedError, fitting_recipe, import_weights, names_of
+from qgs.io.tensors import shapes_of
 
 RECIPES = Path(__file__).parents[2] / "recipes"
+LOCUS = published("locus_full_a")
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "model.decoder.depth=2")
-TOKENGS_MODEL: dict[str, Any] = {"recipe": 1}
-LOCUS_MODEL: dict[str, Any] = {
-    "recipe": 1,
-    "plugins": ["locus"],
-    "model": {
-        "queries": {"type": "locus/anchored"},
-        "decoder": {
-            "cross_attention": {"type": "locus/ray_biased"},
-            "self_attention": {"type": "locus/anchor_aware"},
-            "refinement": {"type": "locus/refine"},
-        },
-        "centers": {"type": "locus/radius_scaled"},
-    },
-}
+GOLDEN = ["tokengs_a", "tokengs_latent_a", "tokengs_multiscale_a", "tokengs_dynamic_a",
+          "locus_full_a", "locus_no_radius_state_a", "locus_content_cross_attn_a"]  # fmt: skip
 
 
-def small(tree: dict[str, Any], *overrides: str) -> Recipe:
-    return resolve(tree, [*SMALL, "model.supervision.layers=[2]", *overrides])
+@pytest.fixture
+def imported(tmp_path: Path) -> Callable[..., Path]:
+    """`imported("tokengs_a", recipe=None)`: the checkpoint that its weights make."""
+
+    def make(name: str, recipe: Any = None, **changed: Tensor) -> Path:
+        weights = tmp_path / f"{name}.safetensors"
+        save_file(published(name) | changed, weights)
+        out = tmp_path / "made" / f"{name}.safetensors"
+        import_weights(weights, recipe, out)
+        return out
+
+    return make
 
 
-@pytest.mark.parametrize("file", ["a", "latent_a", "multiscale_a", "dynamic_a"])
-def test_names_survive_both_ways(file: str) -> None:
-    weights = published(f"tokengs_{file}")
-    recipe = resolve(TOKENGS.read(shapes_of(weights)))
-    ours = names_of(recipe).from_published(weights)
-    back = exact_names_of(recipe).to_published(ours)
-    assert back.keys() == weights.keys()
-    assert all(back[name] is weights[name] for name in weights)
+def published_shapes(recipe: Any) -> dict[str, tuple[int, ...]]:
+    names = names_of(recipe)
+    return {theirs: names.shapes[ours] for ours, theirs in names.published.items()}
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_every_tensor_arrives_bit_equal_or_is_known_as_unused(
+    imported: Callable[..., Path], name: str
+) -> None:
+    given, ours = published(name), load_file(imported(name))
+    recipe = resolve(fitting_recipe(shapes_of(given), name)[1])
+    names = names_of(recipe)
+    assert ours.keys() == names.published.keys()
+    assert given.keys() == {*names.published.values(), *names.unused}
+    assert all(torch.equal(ours[key], given[theirs]) for key, theirs in names.published.items())
+
+
+def test_an_imported_checkpoint_is_like_any_other(imported: Callable[..., Path]) -> None:
+    path = imported("locus_full_a")
+    model = qgs.load(path)
+    assert torch.equal(model.queries.get_parameter("center"), LOCUS["gs_anchor_xyz_raw"])
+    assert CheckpointFile(path).extra == {"imported": "LocusGS weights locus_full_a.safetensors"}
+    text = path.with_suffix(".yaml").read_text(encoding="utf-8")
+    assert model.recipe == resolve(path.with_suffix(".yaml")).tree
+    assert "queries:\n    type: locus/anchored\n    count: 12\n" in text
+    assert "#   losses: photometric, visibility, and anchor visibility" in text
+
+
+def test_unused_tensors_may_be_absent(tmp_path: Path) -> None:
+    unused = sorted(name for name in LOCUS if "_norm." in name and "anchor" in name)
+    save_file({k: v for k, v in LOCUS.items() if k not in unused}, tmp_path / "w.safetensors")
+    done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "o.safetensors")
+    assert len(unused) == 4
+    assert len(done.unused) == 18 - 4
+    assert done.count + len(done.unused) + len(unused) == len(LOCUS)
 
 
 LATENT_PRESETS = [f"latent_{n}views_{loss}" for n in (2, 4, 6) for loss in ("ssim", "lpips")]
@@ -64,18 +98,13 @@ def test_a_latent_checkpoint_gives_the_recipe_of_its_preset(
         sizes = {**sizes, "queries.dynamic": 2, "queries.patch_size": 4}
     overrides = [f"model.{option}={value}" for option, value in sizes.items()]
     recipe = resolve(RECIPES / f"tokengs/{preset}.yaml", overrides)
-    names = exact_names_of(recipe)
-    theirs = names.published_shapes()
-    assert theirs["enc_dec_backbone.latents"] == (
-        sizes.get("encoder.latents", 4096),
-        names.shapes["queries.features"][1],
-    )
+    theirs = published_shapes(recipe)
+    assert theirs["enc_dec_backbone.latents"][0] == sizes.get("encoder.latents", 4096)
     layout, tree = fitting_recipe(theirs, "file")
     assert layout is TOKENGS
     read = resolve(tree)
-    assert (
-        options_beside_weights({"model": recipe.tree["model"]}, {"model": read.tree["model"]}) == {}
-    )
+    models = ({"model": one.tree["model"]} for one in (recipe, read))
+    assert differing_predictions(*models) == {}
     assert read.views.frame == recipe.views.frame == "mean_cam"
     assert read.views.scale_factor == recipe.views.scale_factor
     assert read.evaluation.tuning == "latents"
@@ -84,7 +113,7 @@ def test_a_latent_checkpoint_gives_the_recipe_of_its_preset(
 def test_a_readout_of_more_blocks_than_there_are_fits_no_recipe() -> None:
     shapes = shapes_of(published("tokengs_latent_a"))
     shapes |= {f"enc_dec_backbone.multiscale_norms.{n}.weight": (32,) for n in range(2, 5)}
-    with pytest.raises(PublishedError, match="5 norms, one for each block read, of 4 blocks"):
+    with pytest.raises(PublishedError, match="5 norms"):
         fitting_recipe(shapes, "file")
 
 
@@ -92,10 +121,10 @@ def test_latents_of_the_last_block_are_read_once_its_norm_is_renamed() -> None:
     """The release with `use_multiscale_encoder: False`, which parity is checked with."""
     recipe = resolve(RECIPES / "tokengs/latent_2views_ssim.yaml", [*SMALL, "model.encoder.depth=1",
                      "model.encoder.blocks=[1]", "model.supervision.layers=[2]"])  # fmt: skip
-    renamed = exact_names_of(recipe).published_shapes()
+    renamed = published_shapes(recipe)
     one, other = "enc_dec_backbone.multiscale_norms.0", "enc_dec_backbone.encoder_norm"
     shapes = {name.replace(one, other): shape for name, shape in renamed.items()}
-    with pytest.raises(PublishedError, match=f"without {one}: .* name its norm {other}; rename"):
+    with pytest.raises(PublishedError, match=other):
         fitting_recipe(shapes, "file")
     encoder = resolve(fitting_recipe(renamed, "file")[1]).tree["model"]["encoder"]
     assert (encoder["type"], encoder["blocks"]) == ("qgs/latent_bottleneck", [1])
@@ -103,17 +132,14 @@ def test_latents_of_the_last_block_are_read_once_its_norm_is_renamed() -> None:
 
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("ablations/*.yaml")), ids=lambda p: p.stem)
 def test_every_ablation_has_a_published_name_for_each_parameter(recipe: Path) -> None:
-    resolved = resolve(recipe)
-    names = exact_names_of(resolved)
+    names = names_of(resolve(recipe))
     assert not names.unnamed
     assert names.published.keys() == names.shapes.keys()
-    assert not names.mismatches(names.published_shapes())
     assert not set(names.unused) & set(names.published.values())
 
 
 def test_the_published_size_counts_its_unused_parameters() -> None:
-    recipe = resolve(RECIPES / "locus/dl3dv_4096_4views.yaml")
-    names = names_of(recipe)
+    names = names_of(resolve(RECIPES / "locus/dl3dv_4096_4views.yaml"))
     width, head, layers = 1024, 64, 12
     sizes = {"_pos_norm": head, "anchor_norm": width, "plucker_norm": width, "tau_sample": 1}
     unused = sum(size for n in names.unused for part, size in sizes.items() if part in n)
@@ -122,75 +148,189 @@ def test_the_published_size_counts_its_unused_parameters() -> None:
 
 def test_every_difference_is_listed_at_once() -> None:
     weights = published("tokengs_a")
-    recipe = resolve(TOKENGS.read(shapes_of(weights)))
-    del weights["gs_tokens"], weights["patch_embed.norm.bias"]
+    names = names_of(resolve(TOKENGS.read(shapes_of(weights))))
+    del weights["gs_tokens"]
     weights["activation_head.deconv.bias"] = torch.zeros(3)
-    weights["stranger"] = torch.zeros(1)
+    weights |= {"stranger": torch.zeros(1), "gs_anchor_xyz_raw": torch.zeros(1)}
     with pytest.raises(PublishedError) as caught:
-        names_of(recipe).from_published(weights)
-    for words in (
-        "4 differences",
+        names.from_published(weights)
+    assert [line.strip() for line in str(caught.value).splitlines()[1:]] == [
         "missing: gs_tokens",
-        "missing: patch_embed.norm.bias",
         "unexpected: stranger",
+        "unexpected: gs_anchor_xyz_raw",
         "shape of activation_head.deconv.bias: (3,) in the file, (56,) in the recipe",
-    ):
-        assert words in str(caught.value)
-
-
-def test_a_tokengs_recipe_accepts_no_key_of_an_anchor() -> None:
-    weights = published("tokengs_a")
-    recipe = resolve(TOKENGS.read(shapes_of(weights)))
-    stray = ("gs_anchor_xyz_raw", "enc_dec_backbone.decoder_blocks.0.gs_cross_attn.tau_sample")
-    with pytest.raises(PublishedError, match="2 differences") as caught:
-        names_of(recipe).from_published(weights | {name: torch.zeros(1) for name in stray})
-    assert all(f"unexpected: {name}" in str(caught.value) for name in stray)
+    ]
 
 
 @pytest.mark.parametrize(
-    ("tree", "overrides", "words"),
+    ("name", "wrong", "words"),
     [
-        (TOKENGS_MODEL, ["model.head.norm=true"], ["head.norm.weight", "no such parameter"]),
         (
-            LOCUS_MODEL,
-            ["model.decoder.refinement.center=false"],
-            ["refinements.0.center_mlp.fc1.weight", "this model has no such parameter"],
+            "locus_full_a",
+            "model.queries.count=13",
+            "shape of gs_tokens: (12, 64) in the file, (13, 64)",
         ),
+        ("locus_full_a", "model.decoder.depth=3", "missing: enc_dec_backbone.decoder_blocks.2."),
+        ("locus_full_a", "model.head.norm=true", "no published name: head.norm.weight"),
+        ("locus_full_a", "model.decoder.refinement.radius=false", "unexpected: "),
         (
-            LOCUS_MODEL,
-            ["model.decoder.layers={1: {refinement: {zero_init: true}}}"],
-            ["refinements.1.center_mlp.fc1.weight: LocusGS has no such parameter"],
-        ),
-        (
-            LOCUS_MODEL,
-            ["model.decoder.layers={0: {self_attention: {type: qgs/content}}}"],
-            ["TokenGS: model.queries is locus/anchored", "layers differ in their self_attention"],
-        ),
-        (
-            {
-                **TOKENGS_MODEL,
-                "model": {"decoder": {"layers": {1: {"feed_forward": {"ratio": 2}}}}},
-            },
-            [],
-            ["decoder.1.feed_forward.mlp.fc1.weight", "(64, 16), this model has (32, 16)"],
+            "locus_full_a",
+            "model.decoder.layers={0: {self_attention: {type: qgs/content}}}",
+            "layers differ in their self_attention",
         ),
     ],
 )
-def test_models_that_no_layout_holds_are_refused(
-    tree: dict[str, Any], overrides: list[str], words: list[str]
+def test_weights_of_another_recipe_are_refused(
+    imported: Callable[..., Path], tmp_path: Path, name: str, wrong: str, words: str
 ) -> None:
+    fitting = resolve(imported(name).with_suffix(".yaml")).tree
+    weights, out = tmp_path / f"{name}.safetensors", tmp_path / "x.safetensors"
     with pytest.raises(PublishedError) as caught:
-        exact_names_of(small(tree, *overrides))
-    for part in words:
-        assert part in str(caught.value)
+        import_weights(weights, resolve(fitting, [wrong]), out)
+    assert str(caught.value).startswith(str(weights))
+    assert words in str(caught.value)
+    assert not out.exists()
 
 
-@pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_tiny_models_leave_and_come_back(name: str) -> None:
-    recipe = resolve(RECIPES / f"tiny/{name}.yaml", ["model.head.norm=false", *SMALL[:3]])
-    model = recipe.build_model()
-    weights = dict(model.state_dict())
-    names = exact_names_of(recipe)
-    back = names.from_published(names.to_published(weights))
-    assert back.keys() == weights.keys()
-    assert all(back[key] is weights[key] for key in weights)
+def test_names_of_no_published_model(tmp_path: Path) -> None:
+    save_file({"some.layer": torch.zeros(3)}, tmp_path / "w.safetensors")
+    with pytest.raises(PublishedError, match=r"some\.layer"):
+        import_weights(tmp_path / "w.safetensors", None, tmp_path / "o.safetensors")
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_other_precisions_are_converted_only_on_demand(tmp_path: Path, dtype: torch.dtype) -> None:
+    weights = {name: tensor.to(dtype) for name, tensor in published("tokengs_a").items()}
+    path, out = tmp_path / "w.safetensors", tmp_path / "o.safetensors"
+    save_file(weights, path)
+    kind = str(dtype).removeprefix("torch.")
+    with pytest.raises(PublishedError, match=f"{len(weights)} are {kind}"):
+        import_weights(path, None, out)
+    assert list(tmp_path.iterdir()) == [path]
+    done = import_weights(path, None, out, to_float32=True)
+    assert any(kind in note for note in done.notes)
+    assert torch.equal(load_file(out)["queries.features"], weights["gs_tokens"].float())
+
+
+def test_parameters_that_share_memory_or_lie_in_strides(tmp_path: Path) -> None:
+    weights = published("tokengs_a")
+    tied = [name for name in weights if name.endswith("q_norm.weight")]
+    weights |= dict.fromkeys(tied, weights[tied[0]])
+    turned = weights["enc_dec_backbone.kv_proj.weight"].t().contiguous().t()
+    assert not turned.is_contiguous()
+    weights["enc_dec_backbone.kv_proj.weight"] = turned
+    torch.save(weights, tmp_path / "w.pt")
+    done = import_weights(tmp_path / "w.pt", None, tmp_path / "c.safetensors")
+    ours = load_file(tmp_path / "c.safetensors")
+    for name, theirs in names_of(done.recipe).published.items():
+        assert torch.equal(ours[name], weights[theirs]), name
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(
+    imported: Callable[..., Path], tmp_path: Path, value: float
+) -> None:
+    broken = published("tokengs_a")["gs_tokens"].clone()
+    broken[3, 5] = value
+    with pytest.raises(ValueError, match="gs_tokens"):
+        imported("tokengs_a", gs_tokens=broken)
+    with pytest.raises(PublishedError, match="gs_tokens"):
+        imported("tokengs_a", gs_tokens=broken.nan_to_num(0, 0).long())
+    assert not (tmp_path / "made").exists()
+
+
+def test_nothing_is_overwritten(imported: Callable[..., Path]) -> None:
+    checkpoint = imported("tokengs_a")
+    with pytest.raises(FileExistsError, match=r"tokengs_a\.safetensors"):
+        imported("tokengs_a")
+    checkpoint.unlink()
+    with pytest.raises(FileExistsError, match=r"tokengs_a\.yaml"):
+        imported("tokengs_a")
+
+
+@pytest.mark.parametrize("name", ["bla.yaml", "bla"])
+def test_a_checkpoint_is_named_safetensors(tmp_path: Path, name: str) -> None:
+    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match=r"\.safetensors"):
+        import_weights(tmp_path / "w.safetensors", None, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_no_checkpoint_stays_without_its_recipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, text: str) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("qgs.io.published.write_text", full)
+    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
+    with pytest.raises(OSError, match="no space left"):
+        import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
+    assert [path.name for path in tmp_path.iterdir()] == ["w.safetensors"]
+
+
+def test_the_recipe_that_fits_takes_overrides(tmp_path: Path) -> None:
+    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
+    out = tmp_path / "c.safetensors"
+    options = ["data={type: qgs/photos, path: photos, image_size: [16, 24]}", "views.inputs=3"]
+    done = import_weights(tmp_path / "w.safetensors", None, out, overrides=options)
+    written = resolve(out.with_suffix(".yaml"))
+    assert written.tree == done.recipe.tree == qgs.load(out).recipe
+    assert (written.views.inputs, written.tree["data"]["image_size"]) == (3, [16, 24])
+
+
+def test_options_that_no_weight_shows_are_listed(
+    imported: Callable[..., Path], tmp_path: Path
+) -> None:
+    fitting = resolve(imported("tokengs_a").with_suffix(".yaml")).tree
+    weights = tmp_path / "tokengs_a.safetensors"
+    changed = ["model.head.quat_eps=1e-4", "model.queries.std=0.5", "seed=3"]
+    done = import_weights(weights, resolve(fitting, changed), tmp_path / "o.safetensors")
+    assert done.settings == {"model.head.quat_eps": ("0.0001", "1.0e-12")}
+    assert import_weights(weights, resolve(fitting), tmp_path / "p.safetensors").settings == {}
+
+
+@pytest.mark.parametrize("prefix", ["model.", "ema_model.module.", "net._orig_mod."])
+def test_one_prefix_of_all_names_is_removed(tmp_path: Path, prefix: str) -> None:
+    weights = {prefix + name: tensor for name, tensor in LOCUS.items()}
+    save_file(weights, tmp_path / "w.safetensors")
+    done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")
+    assert prefix in done.notes[0]
+    assert done.count == 109
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """`run("import", ..., code=0)`: the output of the command; its exit code is checked."""
+
+    def call(*words: object, code: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", ["qgs", *map(str, words)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        assert (stopped.value.code or 0) == code
+        told = capsys.readouterr()
+        return told.err if code else told.out
+
+    return call
+
+
+def test_the_command_lists_every_tensor_and_setting(
+    run: Callable[..., str], tmp_path: Path
+) -> None:
+    weights, out = tmp_path / "locus.safetensors", tmp_path / "c.safetensors"
+    save_file(LOCUS, weights)
+    option = "model.head.scale_cap=0.1"
+    told = run("import", weights, "--recipe", "auto", "--out", out, "--set", option)
+    assert "LocusGS (leo-frank/LocusGS): 109 tensors used" in told
+    assert "  enc_dec_backbone.decoder_blocks.1.gs_cross_attn.tau_sample\n" in told
+    assert "model.head.scale_cap: 0.1 (LocusGS: 0.075)" in told
+    again = tmp_path / "again.safetensors"
+    run("import", weights, "--recipe", out.with_suffix(".yaml"), "--out", again)
+    assert qgs.load(again).recipe == qgs.load(out).recipe
+    half = tmp_path / "half.safetensors"
+    half.write_bytes(save({name: tensor.half() for name, tensor in LOCUS.items()}))
+    before = sorted(tmp_path.iterdir())
+    words = ("import", half, "--recipe", "auto", "--out", tmp_path / "new" / "x.safetensors")
+    assert run(*words, code=2).count("error:") == 1
+    assert sorted(tmp_path.iterdir()) == before
+    assert "converted to float32: 109 of 109 are float16" in run(*words, "--to-float32")

@@ -177,7 +177,7 @@ def test_a_model_is_not_fetched_on_the_word_of_a_file(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr("qgs_viewer.sources.checkpoint_of", asked.append)
+    monkeypatch.setattr("qgs_viewer.sources.CheckpointFile", asked.append)
     url = "https://example.org/model.safetensors"
     source = open_source(str(changed_copy(finished, tmp_path, model=url)), Wanted())
     assert f"`qgs view {url} PHOTOS`" in source.notes[0]

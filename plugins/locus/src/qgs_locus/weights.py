@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from qgs.components.weights import BACKBONE_RENAMES, DECODER, READ_OPTIONS, backbone
+from qgs.components.weights import BACKBONE_RENAMES, DECODER, backbone
 from qgs.contracts.weights import Rename, Shapes, WeightLayout
 
 _CROSS = DECODER + "{}.gs_cross_attn."
@@ -58,7 +58,6 @@ LOCUSGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_content_proj.weight",),
     read=_read,
-    read_options=(*READ_OPTIONS, "model.queries.radius", "model.decoder.refinement.radius"),
     unused=(
         *(Rename(_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
         Rename(_CROSS + "geo_scale", _CROSS + "tau_sample"),

@@ -19,10 +19,11 @@ from qgs.composer.recipe import annotated, flat
 from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import OptionError
 from qgs.data.evaluation import EvaluationIndex, EvaluationPlan, IndexEntry
-from qgs.engine.folder import RunFolder, checkpoint_of
+from qgs.engine.folder import RunFolder
 from qgs.engine.guard import CollapseError, NonFiniteError
 from qgs.engine.protocol import index_of
 from qgs.io.files import write_text
+from qgs.io.models import checkpoint_path
 from qgs.wording import counted, listed
 from qgs_studies.hypotheses import MAIN
 from qgs_studies.study import Study
@@ -294,7 +295,7 @@ def _build_all(study: Study, recipes: Mapping[str, Recipe]) -> None:
             recipe.build_losses()
             recipe.build_objective()
             if recipe.init_from:
-                checkpoint_of(recipe.init_from)
+                checkpoint_path(recipe.init_from)
         except (ValueError, OSError) as error:
             error.add_note(f"in the variant `{name}`, {study.origins[name]}")
             raise

@@ -71,7 +71,7 @@ def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: 
     from qgs.composer import resolve
     from qgs.engine.evaluation import evaluate
     from qgs.engine.training import train
-    from qgs.io.checkpoint import load_domain
+    from qgs.io.checkpoint import CheckpointFile
 
     torch.set_num_threads(threads)
     recipe = resolve(recipe_file(folder, run.variant), [f"seed={run.seed}"])
@@ -79,13 +79,14 @@ def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: 
     result = train(recipe, run.folder, console=console, device=device, resume=True)
     if result.stopped_by:
         return 128 + signal.Signals[result.stopped_by]
+    with CheckpointFile(result.folder.checkpoint) as file:
+        seen = file.domain
     for name in ("", *evaluations):
         if run.judged(name):
             continue
         judged = (
             judged_by(recipe, read_evaluation(evaluation_file(folder, name))) if name else recipe
         )
-        seen = load_domain(result.folder.checkpoint)
         evaluation = evaluate(result.model, judged, result.steps, trained_on=seen)
         evaluation.write(run.evaluation(name))
         console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)

@@ -16,9 +16,8 @@ from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
 from qgs.data.sampling import make_sample, own_world, views_in
-from qgs.engine.folder import checkpoint_of
 from qgs.geometry.poses import relative_to, scaled
-from qgs.io.checkpoint import load, load_recipe
+from qgs.io.checkpoint import CheckpointFile
 from qgs.io.ply import load_ply
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
@@ -152,8 +151,8 @@ def _of_finished(folder: Path, device: str) -> Source:
     if note := _no_queries(found, folder):
         return FixedSource(plain, title, (note, *beside))
     try:
-        file = checkpoint_of(found.model)
-        model, recipe = load(file, device), load_recipe(file)
+        with CheckpointFile(found.model) as file:
+            model, recipe = file.model(device), file.recipe
         fixed = _finished_views(found, recipe.views)
         source = ModelSource(model, found.scene, fixed, found.inputs, title, beside)
         means = source.look(found.inputs).gaussians.means
@@ -223,8 +222,8 @@ def _difference(means: Tensor, others: Tensor) -> str:
 
 
 def _of_model(name: str, wanted: Wanted) -> Source:
-    file = checkpoint_of(name)
-    model, recipe = load(file, wanted.device), load_recipe(file)
+    with CheckpointFile(name) as file:
+        model, recipe = file.model(wanted.device), file.recipe
     if wanted.overrides:
         recipe = resolve(recipe.tree, wanted.overrides)
     scene = _scene(recipe, wanted)
