@@ -13,12 +13,11 @@ has none, `held_out`, the frames that training is not to see, and `times` (V,) f
 """
 
 import io
-import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +26,7 @@ from upath import UPath
 
 from qgs.data.images import decode_mask, encoded_size
 from qgs.data.lenses import Intrinsics, Size
-from qgs.data.paths import StoreError, is_local, listing, open_file, read_json, stays_inside
+from qgs.data.paths import is_local, listing, open_file, read_json, stays_inside
 from qgs.data.photos.checks import (
     LARGEST_SIDE,
     FrameProblem,
@@ -42,7 +41,6 @@ INDEX = "index.json"
 SUFFIX = ".torch"
 _RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
 _IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
-_OBJECTS = ("Unsupported", "unsupported", "Trying to call reduce", "Can only", "must be imported")
 _DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
 
 
@@ -101,41 +99,37 @@ def parse_record(file: str, data: Any) -> Record:
     """The scene in an entry of the chunk `file`. Raises ValueError for another structure."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
-            f"{file} holds {_described(data)}, expected a mapping with 'key', 'cameras' and "
-            "'images': is it a chunk of RealEstate10K's format?"
+            f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
+            "is it a chunk of RealEstate10K's format?"
         )
     where = f"{file}: scene {data['key']!r}"
     images = _files(where, "images", data.get("images"))
     count = len(images)
     _expect(count > 0, where, "there are no frames")
     cameras = _tensor(where, "cameras", data.get("cameras"), (count, 18))
-    of_floats = cameras.is_floating_point()
-    _expect(of_floats, where, f"'cameras' are {cameras.dtype}, expected float32")
-    sizes, masks, names = data.get("sizes"), data.get("masks"), data.get("names")
+    _expect(cameras.is_floating_point(), where, f"'cameras' are {cameras.dtype}, expected float32")
+    sizes, masks, names, times = (data.get(key) for key in ("sizes", "masks", "names", "times"))
     if sizes is not None:
         sizes = _tensor(where, "sizes", sizes, (count, 2))
-        sound = not (sizes.is_floating_point() or sizes.is_complex())
-        sound = sound and bool(((sizes >= 1) & (sizes <= LARGEST_SIDE)).all())
-        _expect(sound, where, f"'sizes' must be whole pixels from 1 to {LARGEST_SIDE}")
+        fits = bool(((sizes >= 1) & (sizes <= LARGEST_SIDE)).all())
+        _expect(fits, where, f"'sizes' must be pixels from 1 to {LARGEST_SIDE}")
     if masks is not None:
         masks = _files(where, "masks", masks)
         _expect(len(masks) == count, where, f"{len(masks)} masks for {count} images")
-    if not isinstance(names, list):
+    if names is None:  # RealEstate10K's: the time of a frame in its video
         stamps = data.get("timestamps")
-        names = stamps.flatten().tolist() if _is_plain(stamps) else ()
-        names = names if len(names) == count else range(count)
-    _expect(len(names) == count, where, f"{len(names)} names for {count} images")
-    given = data.get("held_out")
-    given = given.flatten().tolist() if _is_plain(given) else () if given is None else given
-    held_out = tuple(given) if isinstance(given, list | tuple) else (given,)
-    of_frames = all(isinstance(frame, int) and 0 <= frame < count for frame in held_out)
-    wanted = f"'held_out' must list frames from 0 to {count - 1}"
-    _expect(of_frames, where, f"{wanted}, got {listed(map(_said, held_out))}")
-    names, times = [str(name) for name in names], data.get("times")
+        names = stamps.flatten().tolist() if isinstance(stamps, Tensor) else range(count)
+    fits = isinstance(names, list | range) and len(names) == count
+    _expect(fits, where, f"'names', or 'timestamps', must be {count}")
+    held_out = data.get("held_out", ())
+    held_out = held_out.flatten().tolist() if isinstance(held_out, Tensor) else held_out
+    fits = isinstance(held_out, list | tuple) and {*held_out} <= {*range(count)}
+    _expect(fits, where, f"'held_out' must list frames from 0 to {count - 1}")
     if times is not None:
         times = _tensor(where, "times", times, (count,)).to(torch.float64, copy=True)
         _expect(bool(times.isfinite().all()), where, "'times' must be finite numbers")
-    return Record(where, data["key"], cameras, images, names, sizes, masks, held_out, times)
+    names = [str(name) for name in names]
+    return Record(where, data["key"], cameras, images, names, sizes, masks, tuple(held_out), times)
 
 
 def _expect(valid: bool, where: str, reason: str) -> None:
@@ -150,46 +144,22 @@ def a_type(value: object) -> str:
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
 
 
-def _said(frame: Any) -> str:
-    return repr(frame) if isinstance(frame, int | str) else _described(frame)
-
-
-def _described(data: Any) -> str:
-    if isinstance(data, Mapping):
-        return f"a mapping with the keys {listed(map(repr, data)) or 'none'}"
-    if isinstance(data, list | tuple):
-        return f"a list of {listed(dict.fromkeys(map(a_type, data))) or 'nothing'}"
-    if isinstance(data, Tensor) and not _is_plain(data):
-        return "a sparse, quantised or expanded tensor"
-    return a_type(data)
-
-
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
-    if isinstance(data, np.ndarray) and data.dtype.kind in "fiu":
+    if isinstance(data, np.ndarray):
         data = torch.from_numpy(data)
-    found = list(data.shape) if _is_plain(data) else _described(data)
+    found = list(data.shape) if isinstance(data, Tensor) else a_type(data)
     wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
     _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
     assert isinstance(data, Tensor)
     return data.detach()
 
 
-def _is_plain(data: Any) -> TypeGuard[Tensor]:
-    """Whether `data` is a tensor of numbers that are there: not sparse, quantised or expanded."""
-    return (
-        isinstance(data, Tensor)
-        and (data.layout, data.device.type) == (torch.strided, "cpu")
-        and not (data.is_quantized or data.is_nested)
-        and data.numel() * data.element_size() <= data.untyped_storage().nbytes()
-    )
-
-
 def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
     valid = isinstance(data, list | tuple) and all(
-        _is_plain(item) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
+        isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
     )
     wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
-    _expect(valid, where, f"{name!r} must be {wanted}, got {_described(data)}")
+    _expect(valid, where, f"{name!r} must be {wanted}, got {a_type(data)}")
     return data
 
 
@@ -215,14 +185,15 @@ def require_usable(record: Record) -> None:
     rotation = record.w2c[:, :3, :3]
     error = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
     focal = record.cameras[:, :2]
-    sound = (
+    usable = (
         torch.isfinite(record.cameras).all()
         and error.abs().max() < _RIGID
         and torch.linalg.det(rotation).min() > 0
         and focal.min() > 0
         and focal.max() < _IN_PIXELS
     )
-    for frame in () if sound else range(len(record)):  # all frames at once are much faster
+    # checking all frames at once first is ten times as fast as one by one
+    for frame in () if usable else range(len(record)):
         for problem in camera_problems(record, frame):
             if problem.fatal:
                 raise ValueError(f"{record.place(frame)}: {problem}")
@@ -257,22 +228,21 @@ def load_chunk(path: UPath) -> list[Any]:
 
     Raises FileNotFoundError, and ValueError for a file that is no list.
     """
-    try:
-        file = open_file(path)  # raises for what is no file
-        if is_local(path):
-            file.close()
-            file = str(path)
-        mapped = is_local(path) and path.stat().st_size > 0 and zipfile.is_zipfile(file)
-        data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
-    except StoreError:
-        raise
-    except FileNotFoundError:
+    if not path.is_file():
         raise FileNotFoundError(
             f"chunk {path} does not exist: download it, or take its scenes out of index.json"
-        ) from None
-    except Exception as error:
+        )
+    try:
+        file = str(path) if is_local(path) else open_file(path)
+        mapped = is_local(path) and zipfile.is_zipfile(file)
+        # weights_only refuses Python objects, whose loading could run code
+        data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+    except Exception as error:  # damaged files raise anything
+        reason = "damaged, or with Python objects, whose loading could run code"
+        if type(error).__name__ != "UnpicklingError":  # whose text advises to trust the file
+            reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(
-            f"{path} cannot be read as a torch file of tensors and lists ({_why(error)}): copy or "
+            f"{path} cannot be read as a torch file of tensors and lists ({reason}): copy or "
             "pack it again"
         ) from error
     if not isinstance(data, list):
@@ -281,16 +251,6 @@ def load_chunk(path: UPath) -> list[Any]:
             "RealEstate10K's format?"
         )
     return data
-
-
-def _why(error: Exception) -> str:
-    """Why torch refuses a file, without its advice to trust it and without its colours."""
-    said = str(error)
-    if any(words in said for words in _OBJECTS):
-        return "it holds Python objects, whose reading could run code"
-    if type(error).__name__ in ("UnpicklingError", "EOFError") or "central directory" in said:
-        return "it is cut off or no torch file"
-    return re.sub(r"\x1b\[[0-9;]*m", "", said or type(error).__name__).splitlines()[0]
 
 
 class Chunk:
@@ -305,10 +265,7 @@ class Chunk:
             if not isinstance(key, str):
                 parse_record(f"{path}: entry {place}", entry)  # raises
             elif key in self.entries:
-                raise ValueError(
-                    f"{path} holds the scene {key!r} twice: pack the data set again with "
-                    "`qgs data pack`"
-                )
+                raise ValueError(f"{path} holds the scene {key!r} twice: pack the data set again")
             else:
                 self.entries[key] = entry
 
@@ -316,9 +273,8 @@ class Chunk:
         """A scene. Raises ValueError when it is not in this chunk or is malformed."""
         if key not in self.entries:
             raise ValueError(
-                f"{self.path} does not hold the scene {key!r}, which index.json places there: it "
-                f"holds {listed(self.entries)}. Remove index.json to have the chunks read instead, "
-                "or pack the data set again"
+                f"{self.path} does not hold the scene {key!r}, which index.json places there: "
+                "remove index.json to have the chunks read instead, or pack the data set again"
             )
         if key not in self._parsed:
             self._parsed[key] = parse_record(str(self.path), self.entries[key])
@@ -333,16 +289,16 @@ def has_chunks(folder: UPath) -> bool:
 
 
 def read_chunk_index(path: UPath) -> dict[str, str]:
-    """An index.json: key to file name. Raises ValueError for what it cannot mean."""
+    """An index.json: key to file name. Raises ValueError for a file outside the folder."""
     index = read_json(path, "copy it again, or remove it to have the chunks read instead")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
-    of_files = {n for n in set(index.values()) if stays_inside(n) and len(n) < 256}
+    inside = {name for name in set(index.values()) if stays_inside(name)}
     for key, name in index.items():
-        if name not in of_files:
+        if name not in inside:
             raise ValueError(
                 f"{path} places the scene {name_shown(key)} in {name_shown(name)!r}, outside its "
-                "own folder or no name of a file: such an index is not read"
+                "own folder: correct the index, or remove it to have the chunks read instead"
             )
     return index
 
@@ -356,10 +312,10 @@ def list_scenes(folder: UPath) -> dict[str, UPath]:
     if not (folder / INDEX).is_file():
         return _scanned(folder)
     index = read_chunk_index(folder / INDEX)
+    # one listing of the folder; asking a store for each of a thousand files takes minutes
     present = {item.name for item in listing(folder)}
-    chunks = {name: folder / name for name in set(index.values())}
-    there = {name for name in chunks if name in present or chunks[name].is_file()}
-    here = {key: chunks[name] for key, name in index.items() if name in there}
+    there = {n for n in set(index.values()) if n in present or ("/" in n and (folder / n).exists())}
+    here = {key: folder / name for key, name in index.items() if name in there}
     missing = [f"{key} ({name})" for key, name in index.items() if name not in there]
     if not here:
         raise FileNotFoundError(
@@ -391,7 +347,7 @@ def _scanned(folder: UPath) -> dict[str, UPath]:
                 )
             files[key] = path
     warn_once(
-        f"{folder} has no {INDEX}: all of its {len(paths)} chunks were opened to list {len(files)} "
-        "scenes, which happens at every start"
+        f"{folder} has no {INDEX}, so that all of its {len(paths)} chunks are opened at every "
+        f"start to list {len(files)} scenes"
     )
     return files

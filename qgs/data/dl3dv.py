@@ -1,16 +1,16 @@
 """`qgs/dl3dv`: DL3DV's scenes, from archives or folders."""
 
 import re
-from collections import Counter
+import zipfile
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, ClassVar, TypeAlias, cast
+from typing import Any, ClassVar
 
 from pydantic import Field
 from upath import UPath
 
 from qgs.contracts import SceneSource
-from qgs.data.paths import ArchivePath, opened_path, read_file, read_json
+from qgs.data.paths import opened_archive, opened_path, read_file, read_json
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
 from qgs.data.scenes import LazyScenes, LazySource, warn_once
@@ -20,9 +20,6 @@ LISTING = "transforms.json"
 _INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
 _DEPTH = 2  # folders between the data set's and a scene
 _HASH = re.compile(r"[0-9a-f]{64}")
-
-Place: TypeAlias = UPath | ArchivePath
-"""An archive's top or a folder: what a scene is published as."""
 
 
 class Dl3dvConfig(SceneSource.Config):
@@ -67,8 +64,8 @@ class Dl3dvSource(LazySource):
             test = {name: places[name] for name in named if name in places}
             train = {name: place for name, place in places.items() if name not in test}
             if absent:
-                told = f"{len(absent)} of {len(named)} test scenes are not there"
-                warn_once(f"{told}: {listed(absent, 3)}")
+                count = f"{len(absent)} of {len(named)}"
+                warn_once(f"{count} test scenes are missing in the data: {listed(absent, 3)}")
         same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
         photos = PhotosConfig(format="nerfstudio", **same)
         opener = partial(_opened, config=photos, cache=image_cache(0))
@@ -85,45 +82,46 @@ class Dl3dvSource(LazySource):
         if path.is_file():
             return path.suffix == ".zip"
         return not formats_of(path) and any(
-            isinstance(place, ArchivePath) or _HASH.fullmatch(name) or not formats_of(place)
+            place.suffix == ".zip" or _HASH.fullmatch(name) or not formats_of(place)
             for name, place in _places(path, _DEPTH)
         )
 
 
-def _opened(name: str, place: Place, **options: Any) -> PhotoScene:
+def _opened(name: str, place: UPath, **options: Any) -> PhotoScene:
     return PhotoScene(name, scene_folder(place), **options)
 
 
-def find_scenes(path: UPath) -> dict[str, Place]:
-    """Scenes at or below `path` by name, folders before archives. Raises FileNotFoundError."""
+def find_scenes(path: UPath) -> dict[str, UPath]:
+    """Folders and archives of scenes at or below `path` by name, folders before archives.
+
+    Raises FileNotFoundError for none.
+    """
     if not path.exists():
         raise FileNotFoundError(
             f"the DL3DV folder {path} does not exist: give the folder that holds 1K/, {{hash}}.zip "
             "or {hash}/"
         )
-    scenes: dict[str, Place] = {}
-    found = sorted(_places(path, _DEPTH), key=lambda item: (item[0], str(item[1])))
+    found = sorted(_places(path, _DEPTH), key=lambda item: (item[1].suffix == ".zip", str(item[1])))
+    scenes: dict[str, UPath] = {}
     for name, place in found:
-        if name not in scenes or isinstance(scenes[name], ArchivePath):
-            scenes[name] = place
+        scenes.setdefault(name, place)
     if not scenes:
         inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
         raise FileNotFoundError(
             f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING}, also "
             f"in folders such as 1K/, found {inside}"
         )
-    again = [name for name, times in Counter(name for name, _ in found).items() if times > 1]
-    if again:
+    if len(found) > len(scenes):
         warn_once(
-            f"{len(again)} scenes of {path} are there more than once, as folders or archives; one "
-            f"of each is read: {listed((f'{name} ({scenes[name]})' for name in again), 3)}"
+            f"{len(found) - len(scenes)} scenes of {path} are there more than once, as folders or "
+            "archives; one of each is read, the folder if there is one"
         )
-    return scenes
+    return dict(sorted(scenes.items()))
 
 
-def _places(path: UPath, depth: int) -> Iterator[tuple[str, Place]]:
+def _places(path: UPath, depth: int) -> Iterator[tuple[str, UPath]]:
     if path.suffix == ".zip" and path.is_file():
-        yield path.stem, ArchivePath(path)
+        yield path.stem, path
     elif not path.is_dir():
         return
     elif any((path / inside / LISTING).is_file() for inside in _INSIDE):
@@ -134,28 +132,29 @@ def _places(path: UPath, depth: int) -> Iterator[tuple[str, Place]]:
                 yield from _places(item, depth - 1)
 
 
-def scene_folder(place: Place) -> UPath:
-    """The folder with transforms.json. Raises FileNotFoundError; ValueError for a bad archive."""
-    tops: list[Place] = [place]
-    if isinstance(place, ArchivePath):
-        tops += [item for item in place.iterdir() if item.is_dir() and item.name not in _INSIDE]
-    found: dict[str, Place] = {}  # name of the top to its first folder with a listing
+def scene_folder(place: UPath) -> UPath:
+    """The folder with transforms.json of a folder or an archive.
+
+    Raises FileNotFoundError without it, ValueError for an archive that cannot be read.
+    """
+    tops = [place]
+    if place.suffix == ".zip":
+        try:
+            top = opened_archive(place)
+            folders = (item for item in top.iterdir() if item.is_dir())
+            tops = [top, *(item for item in folders if item.name not in _INSIDE)]
+        except (zipfile.BadZipFile, OSError) as error:
+            reason = f"{place} is no zip archive or is cut off ({error})"
+            raise ValueError(f"{reason}: download it again") from error
     for top in tops:
-        for folder in (top / inside if inside else top for inside in _INSIDE):
+        for inside in _INSIDE:
+            folder = top / inside if inside else top
             if (folder / LISTING).is_file():
-                found.setdefault(top.name, folder)
-    if not found:
-        raise FileNotFoundError(
-            f"{place} holds no {LISTING}, at its top or in gaussian_splat/ or nerfstudio/: "
-            "download the scene again, or remove it"
-        )
-    if len(found) > 1:
-        first, second, *_ = found
-        raise ValueError(
-            f"{place} holds {len(found)} scenes, {first} and {second} among them, "
-            "and one is expected in an archive: unpack it, and give the folder"
-        )
-    return cast(UPath, next(iter(found.values())))
+                return folder
+    raise FileNotFoundError(
+        f"{place} holds no {LISTING}, at its top or in gaussian_splat/ or nerfstudio/: download "
+        "the scene again, or remove it"
+    )
 
 
 def read_scene_list(file: UPath) -> list[str]:
@@ -169,12 +168,8 @@ def read_scene_list(file: UPath) -> list[str]:
                 f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
             )
     else:
-        try:
-            text = read_file(file).decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{file} is no text in UTF-8 ({error}): save it in UTF-8") from error
-        lines = (line.partition("#")[0].strip() for line in text.splitlines())
-        names = [line for line in lines if line]
+        lines = read_file(file).decode("utf-8-sig").splitlines()
+        names = [name for line in lines if (name := line.partition("#")[0].strip())]
     if not names:
         raise ValueError(f"the list of scenes {file} names no scene: write one on each line")
     return list(dict.fromkeys(names))

@@ -1,4 +1,4 @@
-"""Image, mask and depth files to pixels of the wanted size, and the intrinsics that follow them."""
+"""Image, mask and depth files as arrays, and crops with their intrinsics."""
 
 import math
 from collections.abc import Iterator
@@ -14,9 +14,9 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene
-from qgs.data.paths import LARGEST, StoreError, open_file
+from qgs.data.paths import LARGEST, open_file
 from qgs.data.scenes import warn_once
-from qgs.memory import is_out_of_memory
+from qgs.memory import in_words, is_out_of_memory
 from qgs.wording import name_shown
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
@@ -26,7 +26,7 @@ _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"
 # of photos; others, such as EPS, would start programs
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA")
 _MOST_PIXELS = 120_000_000  # which take 2 GB with transparency; the largest phones make 108
-_ORIENTATION, _PHOTOMETRIC = 0x0112, 262  # tags of EXIF and TIFF
+_ORIENTATION = 0x0112  # tag of EXIF
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class CropResize:
 
 
 def framing(scene: Scene, frame: int) -> str:
-    """A sentence on what a model sees of a photo; "" where that is all, as it is stored."""
+    """A sentence on crop and scale of a photo; "" for one that is delivered as stored."""
     stored, size = scene.stored_size(frame), scene.cameras.size
     if stored is None or stored == size:
         return ""
@@ -80,14 +80,12 @@ def framing(scene: Scene, frame: int) -> str:
 
 @contextmanager
 def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
-    """`path`, open. Raises StoreError, else ValueError for whatever a decoder raises inside."""
+    """`path`, open. Raises ValueError for whatever a decoder raises inside."""
     try:
         with open_file(path) as file:
             yield file
-    except StoreError:
-        raise
     except Exception as error:
-        if is_out_of_memory(error):
+        if is_out_of_memory(error):  # no fault of the file
             raise
         reason = str(error) or type(error).__name__
         raise ValueError(
@@ -111,8 +109,8 @@ def encoded_size(file: IO[bytes]) -> tuple[int, int]:
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
     """The file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
 
-    Pixels stay where they are stored, as COLMAP and nerfstudio read them; an EXIF orientation that
-    says otherwise is logged.
+    Pixels stay where they are stored, as COLMAP and nerfstudio read them; another EXIF orientation
+    is logged.
     """
     with _readable(path, "an image") as file:
         image = decode_rgb(file, background)
@@ -122,10 +120,10 @@ def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Imag
 
 
 def orientation(image: Image.Image) -> int:
-    """How EXIF would turn a decoded image; 1 for not at all, and for EXIF that is damaged."""
+    """How EXIF would turn a decoded image; 1 for not at all."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
-    except Exception:
+    except Exception:  # damaged EXIF, of which Pillow raises anything, does not matter
         return 1
 
 
@@ -150,10 +148,7 @@ def open_depth(path: UPath, unit: float) -> np.ndarray:
         if path.suffix.lower() == ".npy":
             depth = load_array(file).squeeze()
         else:
-            image = _decoded(file)
-            depth = np.array(image)
-            if image.mode == "P":
-                raise OSError("its numbers are those of a palette")
+            depth = np.array(_decoded(file))
         if depth.ndim != 2 or depth.dtype.kind not in "fiu":
             wanted = "it must hold one number for each pixel, as 16-bit images do"
             raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
@@ -163,16 +158,13 @@ def open_depth(path: UPath, unit: float) -> np.ndarray:
 
 
 def load_array(file: IO[bytes]) -> np.ndarray:
-    """The array of a .npy file. Raises ValueError for objects and for a header that is not true."""
+    """The array of a .npy file. Raises ValueError for objects and for one that is too large."""
+    # NumPy allocates what the header promises, so that a few bytes could ask for all memory
     version = np.lib.format.read_magic(file)
     of_version = {(1, 0): np.lib.format.read_array_header_1_0}
     shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
-    count = math.prod(shape)
-    held, promised = -file.tell() + file.seek(0, 2), count * dtype.itemsize
-    if max(count / _MOST_PIXELS, promised / LARGEST) > 1:
-        raise ValueError(f"it has {count} numbers of {dtype}: scale it down")
-    if held < promised or min(shape, default=0) < 0:
-        raise ValueError(f"its header promises {promised} bytes, and {held} follow")
+    if (size := math.prod(shape) * dtype.itemsize) > LARGEST:
+        raise ValueError(f"it has {in_words(size)}: scale it down")
     file.seek(0)
     return np.load(file, allow_pickle=False)
 
@@ -188,15 +180,15 @@ def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """`image` with 8 bits a channel; its header is enough unless it has 16 bits of grey.
+    """`image` with 8 bits a channel.
 
-    Raises OSError for numbers of which none is known to be white: float, 32-bit and LAB files.
+    Raises OSError where no number is known to be white: float, 32-bit and LAB files.
     """
-    if not image.mode.startswith("I;16"):
-        if image.mode not in _EIGHT_BITS:
-            raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
-        return image
-    return Image.fromarray(_scaled(np.array(image)))
+    if image.mode.startswith("I;16"):
+        return Image.fromarray(_scaled(np.array(image)))
+    if image.mode not in _EIGHT_BITS:
+        raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
+    return image
 
 
 def _scaled(numbers: np.ndarray) -> np.ndarray:
@@ -206,18 +198,15 @@ def _scaled(numbers: np.ndarray) -> np.ndarray:
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:
     """As `open_mask`, for an open file. Raises OSError for no image, and for one with colours."""
-    image = _decoded(file)
-    if image.mode.startswith("I;16"):
-        numbers = np.array(image)
-        grey = _scaled(numbers) if numbers.max() > 255 else numbers.astype(np.uint8)
-    elif image.mode in ("1", "L") and not image.has_transparency_data:
+    image = eight_bits(_decoded(file))
+    if image.mode in ("1", "L") and not image.has_transparency_data:
         grey = np.array(image.convert("L"))
     else:
-        rgba = np.array(eight_bits(image).convert("RGBA"))
+        rgba = np.array(image.convert("RGBA"))
         grey = rgba[..., 0]
         if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
             raise OSError("it has colours or transparency: give a grey image, white on the object")
-    return grey * np.uint8(255) if grey.max() == 1 else grey
+    return grey * np.uint8(255) if grey.max() == 1 else grey  # some tools write 0 and 1
 
 
 def _decoded(file: IO[bytes]) -> Image.Image:
@@ -233,9 +222,6 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
         with Image.open(file, formats=_FORMATS) as image:
             if image.width * image.height > _MOST_PIXELS:
                 raise OSError(f"it has {image.width} x {image.height} pixels: scale it down")
-            inverted = getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == 0
-            if image.mode[0] == "I" and (inverted or "transparency" in image.info):
-                raise OSError("its 16 bits are inverted, or one value is transparent: rewrite it")
             yield image
     except UnidentifiedImageError as error:
         raise OSError("its header is none of a known image format") from error

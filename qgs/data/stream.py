@@ -18,28 +18,26 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from qgs.contracts import Scene, SceneSource, ViewsConfig
+from qgs.contracts import SceneSource, ViewsConfig
 from qgs.data.evaluation import one_line
-from qgs.data.paths import StoreError
-from qgs.data.sampling import Batch, Frames, Sample, collate, draw_frames, make_sample
+from qgs.data.sampling import Batch, Sample, collate, draw_frames, make_sample
 from qgs.memory import is_out_of_memory
-from qgs.wording import listed
 
 
 @dataclass(frozen=True)
 class Share:
-    """Which part of every global batch is one process's own: slice `rank` of `processes`."""
+    """The part of every global batch that one process makes: slice `rank` of `processes`."""
 
     rank: int = 0
     processes: int = 1
 
 
 MAX_REPLACED = 10
-"""Samples that may take the place of one that cannot be made; then training stops."""
+"""Scenes that are tried instead of one that fails; then training stops."""
 
 
 class SampleError(ValueError):
-    """A training sample that cannot be made; the message names the scene and the frame."""
+    """A training sample that cannot be made; the message names the scene."""
 
 
 class WorkerError(ChildProcessError):
@@ -70,7 +68,7 @@ def training_batches(
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
-    """Equal where `training_batches` visits equally many training scenes, stored alike."""
+    """Hash of the number of training scenes and of their groups."""
     digest = hashlib.sha256()
     for group in filter(len, source.groups("train")):
         digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())
@@ -107,10 +105,9 @@ class SceneOrder:
 
 
 class SampleStream:
-    """Samples by number, each of (seed, number) alone. Raises ValueError without scenes.
+    """Samples by number, each a function of (seed, number) alone. Raises ValueError without scenes.
 
-    skips: a sample that cannot be made gives way to one of the next scene, the first of
-    MAX_REPLACED that can be made; not where a remote store failed, which says nothing of a sample.
+    skips: replace a failing sample by one of the next scene, at most MAX_REPLACED times.
     """
 
     def __init__(
@@ -133,7 +130,7 @@ class SampleStream:
             try:
                 return self._made(number, attempt)
             except Exception as error:
-                if not self._skips or is_out_of_memory(error) or _is_of_store(error):
+                if not self._skips or is_out_of_memory(error):
                     raise
                 left_out.append(one_line(error))
         raise SampleError(
@@ -141,7 +138,8 @@ class SampleStream:
         )
 
     def _made(self, number: int, attempt: int) -> Sample:
-        """Sample `number`, or what takes its place after so many failed attempts."""
+        """Sample `number`, or its replacement after `attempt` failures."""
+        # the first attempt draws from (seed, 1, number), whether others were replaced or not
         rng = np.random.default_rng([self._seed, 1, number, *[attempt] * bool(attempt)])
         scene = self._scenes[self.order.scene(number + attempt)]
         mirror = bool(rng.random() < self._views.mirror)
@@ -149,35 +147,14 @@ class SampleStream:
         try:
             return make_sample(scene, inputs, targets, self._views, mirror, rng)
         except Exception as error:
-            raise SampleError(_what_failed(scene, (*inputs, *targets), error)) from error
-
-
-def _what_failed(scene: Scene, frames: Frames, error: Exception) -> str:
-    """The first of `frames` that fails by itself, and why; else all. No memory is raised."""
-    if is_out_of_memory(error):
-        raise error
-    if _is_of_store(error):
-        return f"scene {scene.name!r}: {error}"
-    for frame in frames:
-        try:
-            scene.images([frame])
-            scene.masks([frame])
-        except Exception as own:
-            if is_out_of_memory(own):
+            if is_out_of_memory(error):
                 raise
-            return f"scene {scene.name!r}, frame {scene.label(frame)}: {one_line(own)}"
-    told = listed(map(scene.label, sorted({*frames})))
-    return f"scene {scene.name!r}, frames {told}: {one_line(error)}"
-
-
-def _is_of_store(error: Exception) -> bool:
-    """Whether a store failed: no sample is bad, and another would not be better."""
-    return isinstance(error, StoreError) or isinstance(error.__cause__, StoreError)
+            raise SampleError(f"scene {scene.name!r}: {one_line(error)}") from error
 
 
 @dataclass(frozen=True)
 class _Failure:
-    """An error of a worker, as text: exceptions need not survive the way between processes."""
+    """An error of a worker as text; exceptions with arguments of their own cannot be pickled."""
 
     message: str
     trace: str
@@ -185,7 +162,7 @@ class _Failure:
 
 
 class _Batches(Dataset[Batch | _Failure]):
-    """The batches of one process; a copy in a worker opens the data itself when first used."""
+    """The batches of one process; a copy in a worker opens the data itself on first use."""
 
     def __init__(
         self,
@@ -267,7 +244,7 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
 
 
 def _prepare_worker(number: int) -> None:
-    """Leave stopping to the training process, though signals go to all processes of a job."""
+    """Ignore signals, which go to all processes of a job; the training process ends workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     logging.getLogger("qgs.data.scenes").setLevel(logging.ERROR)  # reported when data was opened
@@ -278,7 +255,7 @@ def _prepare_worker(number: int) -> None:
 class Feed:
     """The batches of the next optimiser step, or the error that fetching them raised.
 
-    Fetched within the present step, so that processes tell each other of failures at its end.
+    Fetched during a step, so that processes can agree on failures at its end.
     """
 
     def __init__(self, stream: Iterator[Batch], count: int) -> None:

@@ -94,7 +94,7 @@ def test_the_published_axes(tmp_path):
 def test_rows_and_images_must_agree(tmp_path, photos):
     write_llff(tmp_path, photos)
     (tmp_path / "images" / "view_003.png").unlink()
-    with pytest.raises(ValueError, match=r"6 poses, but .*images has 5 images.*\(they skip 3\)"):
+    with pytest.raises(ValueError, match=r"6 poses, but .*images has 5 images"):
         read(tmp_path)
 
 

@@ -202,7 +202,7 @@ BROKEN = {
     "times": ([record("s0", times=torch.tensor([0, 1, 2, math.nan]))], "'times' must be finite"),
     "no images": ([record("s0", images=None)], "'images' must be a list of one-dimensional uint8"),
     "no frames": ([record("s0", 0)], "scene 's0': there are no frames"),
-    "another key": ([record("s9")], "does not hold the scene 's0'.*it holds s9"),
+    "another key": ([record("s9")], "does not hold the scene 's0'"),
     "one key twice": ([record("s0"), record("s0")], "'s0' twice"),
 }
 
@@ -283,13 +283,13 @@ def test_code_in_a_chunk_is_not_run(tmp_path):
     assert not (tmp_path / "made").exists()
 
 
-def test_a_chunk_with_python_objects_is_told_without_torchs_advice(tmp_path):
+def test_a_chunk_that_cannot_be_read_is_named_without_torchs_advice(tmp_path):
     file = tmp_path / "0.torch"
     torch.save([UPath(tmp_path)], file)
-    with pytest.raises(ValueError, match="holds Python objects, whose reading could run code") as e:
-        load_chunk(UPath(file))
-    assert "\x1b" not in str(e.value)
-    assert "cut off" not in str(e.value)
-    file.write_bytes(file.read_bytes()[:300])
-    with pytest.raises(ValueError, match="it is cut off or no torch file"):
-        load_chunk(UPath(file))
+    for content in (file.read_bytes(), file.read_bytes()[:300], b""):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match=r"0\.torch") as error:
+            load_chunk(UPath(file))
+        assert "trust" not in str(error.value)
+    with pytest.raises(FileNotFoundError, match=r"1\.torch"):
+        load_chunk(UPath(tmp_path / "1.torch"))

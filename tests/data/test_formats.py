@@ -21,11 +21,11 @@ from photo_formats import (
     write_nerfstudio,
 )
 from PIL import Image
+from pydantic import ValidationError
 from upath import UPath
 
 from qgs.data import PhotosSource
 from qgs.data import photos as formats
-from qgs.data.photos.reader import Listing, PhotoReader
 from qgs.data.photos.source import PhotoScene
 from qgs.data.scenes import warn_once
 
@@ -175,22 +175,38 @@ def test_sources_travel_to_workers_without_their_cache(tmp_path):
     assert torch.equal(again.images(range(6)), images)
 
 
-def test_another_format_is_one_class(tmp_path, monkeypatch):
-    class Csv(PhotoReader):
-        name, listing, poses = "csv", "poses.csv", "opencv"
+CSV = """
+from qgs.data.photos.reader import Listing, PhotoReader
 
-        @classmethod
-        def read(cls, folder, images):
-            return Listing(folder / cls.listing, [])
 
-    choices = PhotosSource.Config.model_json_schema()["properties"]["format"]["enum"]
-    assert choices == ["auto", *(reader.name for reader in formats.READERS)]
-    monkeypatch.setattr(formats, "READERS", (*formats.READERS, Csv))
-    with pytest.raises(FileNotFoundError, match=r"one of transforms\.json.*poses\.csv \(csv\)"):
-        formats.read_listing(UPath(tmp_path))
-    (tmp_path / "poses.csv").touch()
-    assert formats.formats_of(UPath(tmp_path)) == ["csv"]
-    assert formats.read_listing(UPath(tmp_path)).file.name == "poses.csv"
+class Csv(PhotoReader):
+    name, listing, poses = "csv", "poses.csv", "opencv"
+
+    @classmethod
+    def read(cls, folder, images):
+        return Listing(folder / cls.listing, [])
+"""
+
+
+def test_a_distribution_adds_a_format(tmp_path, monkeypatch, caplog):
+    info = tmp_path / "site" / "csv_photos-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: csv-photos\nVersion: 1.0\n")
+    offered = "csv = csv_photos:Csv\nnerfstudio = csv_photos:Csv\nnone = csv_photos:None_\n"
+    (info / "entry_points.txt").write_text(f"[{formats.GROUP}]\n{offered}")
+    (tmp_path / "site" / "csv_photos.py").write_text(CSV)
+    (folder := UPath(tmp_path / "photos")).mkdir()
+    with pytest.raises(ValidationError, match="csv"):
+        PhotosSource.Config(path="photos", format="csv")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    assert PhotosSource.Config(path="photos", format="csv").format == "csv"
+    with pytest.raises(FileNotFoundError, match=r"transforms\.json.*poses\.csv \(csv\)"):
+        formats.read_listing(folder)
+    (folder / "poses.csv").touch()
+    assert formats.formats_of(folder) == ["csv"]
+    assert formats.read_listing(folder).file.name == "poses.csv"
+    assert formats.readers()["nerfstudio"] in formats.READERS, "installing changes no other format"
+    assert "csv-photos 1.0" in caplog.text, "what cannot be loaded is logged with its distribution"
 
 
 def test_photos_in_memory_and_in_archives(tmp_path):

@@ -116,7 +116,7 @@ def test_what_cannot_be_meant_is_refused(tmp_path, frame, top, message):
         opened(folder(tmp_path, frame=frame, **top))
 
 
-def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
+def test_folders_and_files_that_are_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         opened(tmp_path / "nothing")
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
@@ -124,22 +124,8 @@ def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
         opened(tmp_path)
     (tmp_path / "images").mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "images" / "b.png")
-    (tmp_path / "secret").mkdir()
-    calls: list[str] = []
-    iterdir = type(UPath(tmp_path)).iterdir
-
-    def counted(place):
-        calls.append(place.name)
-        if place.name == "secret":
-            raise PermissionError(13, "Permission denied", str(place))
-        return iterdir(place)
-
-    monkeypatch.setattr(type(UPath(tmp_path)), "iterdir", counted)
-    said = r"images: 1 in it, 1 in images/, secret/ may not be read\)"
-    with pytest.raises(FileNotFoundError, match=said):
+    with pytest.raises(FileNotFoundError, match=r"images: 1 in it, 1 in images/\)"):
         read_listing(UPath(tmp_path))
-    assert calls.count("images") == 1
-    monkeypatch.undo()
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(ValueError, match="not valid JSON"):
         opened(tmp_path)

@@ -25,7 +25,7 @@ from qgs.engine.fit import OutOfMemoryError, explained, refuse_unfit
 from qgs.engine.folder import FolderGoneError, RunFolder
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.tensors import CheckpointError
-from qgs.memory import TooLargeError, _left_by_groups, in_words, refuse_beyond_memory
+from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -230,33 +230,6 @@ def test_what_fits_is_not_refused() -> None:
     with pytest.raises(TooLargeError, match=r"11 bytes .* 10 bytes are available: b 7 bytes, a 4"):
         refuse_beyond_memory("this", {"a": 4, "b": 7}, "Less.", 10)
     assert [in_words(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]
-
-
-@pytest.mark.parametrize(
-    ("line", "folder", "files"),
-    [
-        ("0::/a/b", "a", ("memory.max", "memory.current", "inactive_file")),
-        ("0::/a/b", "", ("memory.max", "memory.current", "inactive_file")),
-        ("0::/../c", "", ("memory.max", "memory.current", "inactive_file")),
-        (
-            "3:cpu,memory:/not/seen/here",
-            "memory",
-            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-        ),
-    ],
-)
-def test_the_limit_of_a_control_group_is_found(
-    tmp_path: Path, line: str, folder: str, files: tuple[str, str, str]
-) -> None:
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text(f"5:pids:/x\n{line}\n")
-    group = tmp_path / "sys/fs/cgroup" / folder
-    (group / "b").mkdir(parents=True)
-    (group / "b" / files[0]).write_text("max\n")
-    for name, text in zip(files[:2], ("1000\n", "300\n"), strict=True):
-        (group / name).write_text(text)
-    (group / "memory.stat").write_text(f"anon 3\n{files[2]} 100\n")
-    assert list(_left_by_groups(tmp_path)) == [800]
 
 
 def test_out_of_memory_is_told_and_the_run_is_saved(

@@ -1,12 +1,10 @@
 """LLFF: `poses_bounds.npy` beside a folder of photos (Mildenhall et al., 2019)."""
 
-import re
-
 import numpy as np
 from upath import UPath
 
 from qgs.data.images import load_array
-from qgs.data.paths import StoreError, open_file
+from qgs.data.paths import open_file
 from qgs.data.photos.checks import listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_files, image_folder
 
@@ -28,23 +26,12 @@ class Llff(PhotoReader):
         file, photos = folder / cls.listing, image_folder(folder, images)
         rows = _rows(file)
         files = image_files(photos)
-        skipped = _skipped([item.name for item in files])
         if len(files) != len(rows):
             raise ValueError(
                 f"{file} has {len(rows)} poses, but {photos} has {len(files)} images: they belong "
-                f"together in the order of the names{skipped}, so give all images and no "
-                "others"
+                "together in the order of the names, so give all images and no others"
             )
         return Listing(file, [_frame(*pair) for pair in zip(files, rows, strict=True)])
-
-
-def _skipped(names: list[str]) -> str:
-    """Which numbers the names skip, in words; empty where they count on or have no numbers."""
-    numbers = [int(found[1]) for name in names if (found := re.search(r"(\d+)\.\w+$", name))]
-    if len(numbers) < max(2, len(names)):
-        return ""
-    absent = sorted(set(range(min(numbers), max(numbers))) - set(numbers))
-    return f" (they skip {', '.join(map(str, absent))})" if 0 < len(absent) <= 5 else ""
 
 
 def _rows(file: UPath) -> np.ndarray:
@@ -52,16 +39,12 @@ def _rows(file: UPath) -> np.ndarray:
     try:
         with open_file(file) as opened:
             rows = load_array(opened)
-    except StoreError:
-        raise
     except Exception as error:  # NumPy raises anything on damaged headers
         raise ValueError(
             f"{file} is no NumPy file of numbers ({error}): export it again"
         ) from error
-    numeric = isinstance(rows, np.ndarray) and rows.dtype.kind in "fiu"
-    if not numeric or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
-        shape = getattr(rows, "shape", ())
-        raise ValueError(f"{file} must have shape (N, 17), got {shape}: export it again")
+    if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        raise ValueError(f"{file} must have shape (N, 17), got {rows.shape}: export it again")
     return rows.astype(np.float64)
 
 

@@ -100,7 +100,7 @@ def numbers(value: object) -> np.ndarray:
     """Nested lists as float64; an empty array for what is no array of numbers."""
     try:
         return np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
 
 

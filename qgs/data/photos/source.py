@@ -6,17 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
 from operator import attrgetter
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import torch
 from PIL import Image
-from pydantic import Field
+from pydantic import Field, field_validator
 from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import SceneSource, SceneSourceConfig
+from qgs.contracts import OptionError, SceneSource, SceneSourceConfig
 from qgs.data.images import (
     CropResize,
     alpha_mask,
@@ -27,8 +26,8 @@ from qgs.data.images import (
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted
-from qgs.data.paths import ArchivePath, opened_path, read_file
-from qgs.data.photos import Format, formats_of, read_listing
+from qgs.data.paths import is_local, opened_path, read_file
+from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.checks import require_sound, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.scenes import (
@@ -49,8 +48,9 @@ class PhotosConfig(SceneSource.Config):
     path: str
     """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
     relative to the working directory, or an fsspec URL."""
-    format: Format = "auto"
-    """How cameras are listed; auto takes the first of the formats that a folder holds."""
+    format: str = "auto"
+    """How cameras are listed: nerfstudio, blender, colmap, llff, cameras, or a format of a plug-in;
+    auto takes the first that a folder holds."""
     images: str | None = None
     """Folder of photos to read instead of the listed one, such as images_4."""
     holdout: int = Field(default=8, ge=0)
@@ -62,6 +62,13 @@ class PhotosConfig(SceneSource.Config):
     """RGB in [0, 1] behind transparent pixels."""
     depth_unit: float = Field(default=1e-3, gt=0)
     """World units per number of a depth map; nerfstudio writes millimetres (0.001)."""
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, format: str) -> str:
+        if format not in (known := ("auto", *readers())):
+            raise OptionError(f"must be a format of photos, got {format!r}", f"use {listed(known)}")
+        return format
 
 
 def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
@@ -148,9 +155,10 @@ class PhotoScene(EncodedScene):
     ) -> np.ndarray:
         """(F, H, W, ...) of what `read` makes of the frames, or made before."""
         made = partial(self._made, read)
-        if all(isinstance(self._frames[frame].path, Path | ArchivePath) for frame in frames):
+        paths = [self._frames[frame].path for frame in frames]
+        if all(is_local(path) or path.protocol == "zip" for path in paths):
             return np.stack([made(frame) for frame in frames])
-        with ThreadPoolExecutor(8) as pool:  # photos that a store sends at a time
+        with ThreadPoolExecutor(8) as pool:  # a store answers slowly, but several at a time
             return np.stack(list(pool.map(made, frames)))
 
     def _made(self, read: Callable[[PhotoFrame], np.ndarray], frame: int) -> np.ndarray:
@@ -270,7 +278,7 @@ def folder_name(folder: UPath) -> str:
 
 
 def present_frames(
-    folder: UPath, format: Format = "auto", images: str | None = None
+    folder: UPath, format: str = "auto", images: str | None = None
 ) -> tuple[list[PhotoFrame], list[str]]:
     """The frames of the listing's splits whose image files exist, and the paths of the others.
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from upath import UPath
 
-from qgs.data.photos import READERS, Format, read_listing
+from qgs.data.photos import read_listing, readers
 from qgs.geometry.poses import look_at_depth
 from qgs.wording import listed
 from qgs_datatools.cameras import camera_findings, sharing_findings
@@ -23,9 +23,6 @@ from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
 from qgs_datatools.indices import Held, found_indices, index_findings
 from qgs_datatools.sources import kind_of, left_out, source_scenes, sources
-
-_PHOTO_FORMATS = {reader.name: reader.listing for reader in READERS}
-_LISTINGS = {**_PHOTO_FORMATS, "dl3dv": "transforms.json", "chunks": "the chunk"}
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,13 @@ def check(
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError without a
     data set or an index, MissingExtraError for the format, ValueError for an unknown one.
     """
-    formats = ("auto", *_LISTINGS, *(kind for kind in sources() if not kind.startswith("qgs/")))
+    formats = (
+        "auto",
+        *readers(),
+        "dl3dv",
+        "chunks",
+        *(kind for kind in sources() if not kind.startswith("qgs/")),
+    )
     if options.format not in formats:
         told = "; ".join([", ".join(formats), *left_out()])
         raise ValueError(f"there is no format {options.format!r}: use one of {told}")
@@ -186,8 +189,8 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
     )
 
 
-def _photo_format(options: Options) -> Format:
-    return options.format if options.format in _PHOTO_FORMATS else "auto"
+def _photo_format(options: Options) -> str:
+    return options.format if options.format in readers() else "auto"
 
 
 def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]:
@@ -224,7 +227,9 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     if (there := sum(photo.exists for photo in photos)) < 2:
         fix = "add photos, or take the scene out"
         absent.append(Finding(name, f"{there} photos are there, and a scene needs 2", fix))
-    files = list(file_findings(scene, _LISTINGS.get(candidate.kind, "the data set")))
+    listings = {name: reader.listing for name, reader in readers().items()}
+    listings |= {"dl3dv": "transforms.json", "chunks": "the chunk"}
+    files = list(file_findings(scene, listings.get(candidate.kind, "the data set")))
     sizes = list(size_findings(scene))
     poses, others = camera_findings(scene, _frames(sizes))
     placed = [

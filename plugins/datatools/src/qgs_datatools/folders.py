@@ -7,7 +7,7 @@ from upath import UPath
 
 from qgs.data.dl3dv import find_scenes, scene_folder
 from qgs.data.paths import read_file
-from qgs.data.photos import READERS, Format, formats_of, read_listing
+from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.reader import existing
 from qgs.data.photos.source import folder_name
 from qgs_datatools.candidates import Candidate, Photo
@@ -16,10 +16,9 @@ from qgs_datatools.findings import Finding
 from qgs_datatools.sources import kind_of
 
 _POSES = {"opengl": OPENGL, "opencv": OPENCV, "opencv c2w": OPENCV_C2W, "llff": LLFF}
-_CONVENTIONS = {reader.name: _POSES[reader.poses] for reader in READERS}
 
 
-def photo_folders(root: UPath, wanted: Format, images: str | None) -> Iterator[Candidate | Finding]:
+def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
     """The scenes of format `wanted` in `root`: itself, its folders, or those in train and test."""
     if formats_of(root):
         yield from _listings(root, folder_name(root), wanted, images)
@@ -37,13 +36,13 @@ def photo_folders(root: UPath, wanted: Format, images: str | None) -> Iterator[C
             yield from photo_folders(folder, wanted, images)
 
 
-def _listings(folder: UPath, name: str, wanted: Format, images: str | None) -> Iterator[Candidate]:
+def _listings(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
     """A candidate for each of the listings that a folder holds, or for the wanted one."""
     held = [kind for kind in formats_of(folder) if wanted in ("auto", kind)]
     for kind in held:
         label = f"{name} ({kind})" if len(held) > 1 else name
         photos = partial(_photos, folder, kind, images)
-        yield Candidate(label, name, kind, _CONVENTIONS[kind], photos)
+        yield Candidate(label, name, kind, _POSES[readers()[kind].poses], photos)
 
 
 def _no_scene(folder: UPath) -> Finding:
@@ -67,7 +66,7 @@ def dl3dv_scenes(path: UPath, images: str | None) -> list[Candidate]:
     ]  # fmt: skip
 
 
-def _photos(folder: UPath, kind: Format, images: str | None) -> list[Photo]:
+def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
     frames = read_listing(folder, kind, images).frames
     there = existing(frame.path for frame in frames if frame.name)
     masks = existing(frame.mask for frame in frames if frame.mask is not None)

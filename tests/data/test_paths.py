@@ -1,0 +1,75 @@
+import threading
+import zipfile
+from functools import partialmethod
+from pathlib import Path
+
+import pytest
+import torch
+from photo_formats import opened, scene, synthetic, write_nerfstudio
+from upath import UPath
+
+from qgs.contracts import ViewsConfig
+from qgs.data.paths import (
+    is_local,
+    open_file,
+    opened_archive,
+    opened_path,
+    read_file,
+    read_json,
+    stays_inside,
+)
+from qgs.data.stream import SampleStream
+
+
+def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert is_local(opened_path("~/a"))
+    assert str(opened_path("~/a")) == str(tmp_path / "a")
+    assert str(opened_path(f"file://{tmp_path}/a")) == str(tmp_path / "a")
+    assert not is_local(opened_path("memory://a"))
+    with pytest.raises(ValueError, match="nosuch://a"):
+        opened_path("nosuch://a")
+
+
+@pytest.mark.parametrize("name", ["a", "a/b.torch", "a..b", ".hidden", "a\\b"])
+def test_names_that_stay_inside(name):
+    assert stays_inside(name)
+
+
+@pytest.mark.parametrize("name", ["..", "a/../b", "/a", "\\a", "a\\..\\..\\b", "c:/a", "", "C:a"])
+def test_names_that_lead_outside(name):
+    assert not stays_inside(name)
+
+
+def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
+    folder, url = tmp_path / "scene", f"memory://{tmp_path.name}"
+    write_nerfstudio(folder, synthetic(tmp_path / "photos"))
+    for file in filter(Path.is_file, folder.rglob("*")):
+        place = UPath(url) / file.relative_to(folder).as_posix()
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(file.read_bytes())
+    expected, photos = scene(folder).images([0, 2, 1]), scene(url)
+    source, views = opened(url, holdout=0), ViewsConfig(inputs=2, targets=1, gap=(1, 3))
+    assert SampleStream(source, views, 0).batch([0]).scenes
+    store, together = type(UPath(url).fs), threading.Barrier(3)
+    whole = store._open
+
+    def waiting(self, path, *given, **options):
+        together.wait(30)
+        return whole(self, path, *given, **options)
+
+    monkeypatch.setattr(store, "_open", partialmethod(waiting))
+    assert torch.equal(photos.images([0, 2, 1]), expected)
+
+
+def test_files_that_are_read_whole_have_a_limit(tmp_path):
+    with (tmp_path / "huge.json").open("wb") as file:
+        file.truncate(2 * 10**9)
+    with pytest.raises(ValueError, match=r"huge\.json .*50 MB"):
+        read_json(UPath(tmp_path / "huge.json"), "")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("large", bytes(10**6))
+    member = opened_archive(UPath(tmp_path / "a.zip")) / "large"
+    assert len(open_file(member).read()) == 10**6
+    with pytest.raises(OSError, match=r"large.*a\.zip is larger than 1 kB"):
+        read_file(member, 1000)
