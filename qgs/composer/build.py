@@ -1,7 +1,8 @@
-"""From chosen components to a model."""
+"""From chosen components to a model, and the learning-rate factors of its parameters."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -10,27 +11,24 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from qgs.composer.decode import Chosen
-from qgs.composer.errors import RecipeError, RecipeProblem
-from qgs.composer.flow import fits
-from qgs.composer.nodes import KeyPath
-from qgs.composer.registry import BUILTIN, component_error, component_failure, place_of
+from qgs.composer.errors import Problems, RecipeError, RecipeProblem
+from qgs.composer.places import near_pattern
+from qgs.composer.registry import BUILTIN, component_failure
 from qgs.composer.slots import SUBLAYER_SLOTS
+from qgs.composer.yaml_text import KeyPath, MapNode, find
 from qgs.contracts import (
-    MEMORY_FIELDS,
     Component,
-    DecoderLayer,
     LayerParts,
     ModelComponent,
     ModelDims,
     Optimizer,
-    Queries,
+    OptimizerConfig,
     Refinement,
     SceneSource,
 )
 from qgs.contracts.component import MissingExtraError
 from qgs.memory import is_out_of_memory
 from qgs.model import QueryGaussianModel
-from qgs.types import ImageMemory, QueryState
 
 
 def build_model(
@@ -61,9 +59,10 @@ def build_model(
     with (
         torch.random.fork_rng(devices=()),
         torch.device("meta" if on_meta else "cpu"),
-        ShapesAlone() if on_meta else nullcontext(),
+        OnMeta() if on_meta else nullcontext(),
     ):
         torch.default_generator.manual_seed(seed)
+        # The order is fixed: each component draws its parameters after the one before it.
         encoder, queries = at("encoder"), at("queries")
         decoder, refinements = [], []
         for index in map(str, range(dims.depth)):
@@ -84,86 +83,57 @@ def build_model(
     return model if on_meta or device is None else model.to(device)
 
 
-class ShapesAlone(TorchFunctionMode):
-    """On "meta", makes the results of `randn`, `cat` and arithmetic from their shapes.
+class OnMeta(TorchFunctionMode):
+    """The meta device as constructors need it.
 
-    torch's own way to do so (its `broadcast_shapes` too) imports its compiler or sympy, which
-    takes longer than everything else that `qgs compose` does. It is left all but plain float32.
+    `linspace` has numbers, which DINO's constructor reads. `randn` and arithmetic give float32
+    tensors by shape alone: torch's own way imports its compiler, for a second.
     """
 
     names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
     arithmetic = frozenset(getattr(Tensor, name) for name in names)
-    plain = (Tensor, "meta", torch.float32, True, False)
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
-        if func is torch.randn and not kwargs:
-            func = torch.empty
-        elif func is torch.linspace:  # DINO's constructors read its numbers, which meta has not
+        if func is torch.linspace:
             kwargs = {"device": "cpu", **(kwargs or {})}
-        elif (func is torch.cat or func in self.arithmetic) and len(args) == 2 and not kwargs:
-            joined = func is torch.cat
-            tensors = args[0] if joined else [x for x in args if type(x) not in (int, float)]
-            if isinstance(tensors, list | tuple) and set(map(_kind, tensors)) == {self.plain}:
-                shapes = [list(x.shape) for x in tensors]
-                with suppress(ValueError, IndexError):  # what does not fit, torch refuses itself
-                    shape = _joined(shapes, args[1]) if joined else np.broadcast_shapes(*shapes)
-                    return torch.empty(shape, device="meta", dtype=torch.float32)
+        elif func is torch.randn and not kwargs:
+            func = torch.empty
+        elif (func is torch.cat or func in self.arithmetic) and not kwargs:
+            tensors = [x for x in (args[0] if func is torch.cat else args) if isinstance(x, Tensor)]
+            shapes = [x.shape for x in tensors]
+            if all(x.is_meta and x.dtype is torch.float32 for x in tensors):
+                if func is not torch.cat:
+                    return torch.empty(np.broadcast_shapes(*shapes))
+                dim = args[1] % len(shapes[0]) if len(args) > 1 else 0
+                length = sum(shape[dim] for shape in shapes)
+                return torch.empty(*shapes[0][:dim], length, *shapes[0][dim + 1 :])
         return func(*args, **(kwargs or {}))
 
 
-def _kind(x: Any) -> tuple[Any, ...]:
-    plain = isinstance(x, Tensor)
-    return (type(x), x.device.type, x.dtype, x.is_contiguous(), x.requires_grad) if plain else ()
-
-
-def _joined(shapes: Sequence[list[int]], dim: int) -> list[int]:
-    length = sum(shape.pop(dim) for shape in shapes)
-    if shapes.count(shapes[0]) < len(shapes):
-        raise ValueError
-    shapes[0].insert(dim % (len(shapes[0]) + 1), length)
-    return shapes[0]
-
-
 def build(chosen: Chosen, *arguments: Any) -> Any:
-    """The component itself. arguments: what its constructor takes besides its Config.
+    """The component itself. arguments: those of its constructor after its Config.
 
-    What a plugin's constructor raises is reported with its distribution, except mistakes of the
-    user: missing packages, data, training too short for its optimiser.
+    Raises RecipeError, with the plugin's distribution, where a plugin's constructor fails; a user's
+    mistakes pass: missing packages or data, training too short for its optimiser.
     """
     component: Any = chosen.component
     try:
         built = component(chosen.config, *arguments)
-    except MissingExtraError:
-        raise
     except Exception as error:
-        if is_out_of_memory(error):  # no fault of the component
-            raise
-        users_mistake = isinstance(error, ValueError | OSError) and issubclass(
-            component, SceneSource | Optimizer
+        users_mistake = isinstance(error, MissingExtraError) or (
+            isinstance(error, ValueError | OSError)
+            and issubclass(component, SceneSource | Optimizer)
         )
-        where = chosen.place.origin.file, chosen.place.origin.line
-        if issubclass(component, ModelComponent) and _too_large(error):
-            reason = f"`{chosen.type}` with these options has tensors that no machine can hold"
-            problem = RecipeProblem(chosen.path, reason, "make the numbers in it smaller", *where)
-            raise RecipeError([problem]) from error
-        if chosen.installed.plugin is BUILTIN or users_mistake:
+        if users_mistake or is_out_of_memory(error) or chosen.installed.plugin is BUILTIN:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
+        where = chosen.place.origin.file, chosen.place.origin.line
         problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
         raise RecipeError([problem]) from error
     if chosen.schedules:
         built.schedules = chosen.schedules
-    if issubclass(component, Queries | Refinement | DecoderLayer):
-
-        def check(module: nn.Module, arguments: tuple[Any, ...], state: Any) -> None:
-            if fault := _state_fault(chosen, arguments, state):
-                place = place_of(getattr(component, "start", component.forward))
-                raise component_error(chosen.installed, f"`{chosen.type}` {fault}", place)
-            hook.remove()  # the state is checked until it has once been what it must be
-
-        hook = built.register_forward_hook(check)
     return built
 
 
@@ -179,42 +149,44 @@ def load_pretrained(*parts: nn.Module) -> None:
                 raise MissingExtraError(f"{what} cannot be used: {error}") from error
 
 
-def _too_large(error: Exception) -> bool:
-    """Whether torch or Python refused the size of a tensor; torch has no type for that."""
-    words = "Storage size calculation overflowed", "Overflow when unpacking"
-    return isinstance(error, OverflowError) or any(word in str(error) for word in words)
+def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
+    """Factor of the learning rate for every parameter of `module`, by name; 1 where none is given.
 
-
-def _state_fault(chosen: Chosen, arguments: tuple[Any, ...], state: Any) -> str:
-    """What is wrong with a state that a component returned; "" if nothing is.
-
-    A layer returns it with the memory. Neither loses what it was given.
+    module: a model, which leaves patterns of `losses` unchecked, or what holds both. A shared
+    parameter goes by its first name. Raises RecipeError.
     """
-    memory = None
-    if issubclass(chosen.component, DecoderLayer):
-        pair = state if isinstance(state, tuple) and len(state) == 2 else (state, None)
-        state, memory = pair
-        if not isinstance(memory, ImageMemory):
-            kinds = ", ".join(type(item).__name__ for item in pair if item is not None)
-            return f"returns {kinds}, not a QueryState and an ImageMemory"
-    if not isinstance(state, QueryState):
-        return f"returns {type(state).__name__}, not a QueryState"
-    found = ", ".join(state.fields) or "no field at all"
-    for name, spec in chosen.component.fields_written(chosen.config).items():
-        says = f"says that it provides {name} ({spec}), but"
-        if name not in state.fields:
-            return f"{says} the state that it returns has {found}"
-        shape = tuple(state.fields[name].shape[2:])
-        if not fits(shape, spec.shape):
-            return f"{says} it returns one of trailing shape {shape}"
-    given = {name for argument in arguments for name in getattr(argument, "fields", ())}
-    advice = "`state.replace(...)` keeps what it does not change"
-    if lost := ", ".join(sorted(given - state.fields.keys())):
-        return f"loses {lost}: the state that it returns has {found}; {advice}"
-    if state.mask is None and any(getattr(x, "mask", None) is not None for x in arguments):
-        return f"loses the mask of the state, so that places without a query count; {advice}"
-    parts = [name.removeprefix("memory.") for name in MEMORY_FIELDS]
-    before = next((x for x in arguments if memory and isinstance(x, ImageMemory)), None)
-    gone = [n for n in parts if getattr(before, n, None) is not None and getattr(memory, n) is None]
-    advice = "`dataclasses.replace(memory, features=...)` keeps what it does not change"
-    return f"loses {', '.join(gone)} of the image memory; {advice}" if gone else ""
+    config, node, problems = optimizer.config, optimizer.place.node, Problems()
+    written = node if isinstance(node, MapNode) else MapNode(optimizer.place.origin)
+    model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
+    factors = {name: 1.0 for name, _ in module.named_parameters()}
+    known: dict[int, dict[KeyPath, list[str]]] = {}  # names below a path, by its length
+    for name in factors:
+        for path in _paths(name.removeprefix("model."), model):
+            for end in range(1, len(path) + 1):
+                known.setdefault(end, {}).setdefault(path[:end], []).append(name)
+    for pattern, factor in config.parts.items() if isinstance(config, OptimizerConfig) else ():
+        wanted = pattern.removeprefix("model.").split(".")
+        below = known.get(len(wanted), {}).items()
+        named = [n for p, names in below if all(map(fnmatchcase, p, wanted)) for n in names]
+        factors |= dict.fromkeys(named, factor)
+        if not named and (module is not model or wanted[0] != "losses"):
+            parts = [path for paths in known.values() for path in paths]
+            reason = f"the pattern `{pattern}` matches no parameter of the model"
+            outermost = ", ".join(dict.fromkeys(path[0] for path in parts))
+            fix = near_pattern(pattern, parts) or f"its parts: {outermost}"
+            _, origin, _ = find(written, ("parts", pattern))
+            problems.add(origin, f"optimizer.parts.{pattern}", reason, fix)
+    problems.raise_any()
+    return factors
+
+
+def _paths(name: str, model: QueryGaussianModel) -> list[KeyPath]:
+    """Paths of a parameter: its own, and those under which a recipe has its component."""
+    path = tuple(name.split("."))
+    if path[0] == "decoder":
+        return [path, ("decoder", "layers", *path[1:]), ("decoder", *path[2:])]
+    if path[0] != "refinements":
+        return [path]
+    below = ("refinement", *path[2:])
+    layers = [str(n) for n, at in enumerate(model.refinement_of) if str(at) == path[1]]
+    return [path, ("decoder", *below), *(("decoder", "layers", n, *below) for n in layers)]

@@ -11,12 +11,11 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
-from qgs.composer.errors import Problems, RecipeError, did_you_mean, nearest
-from qgs.composer.nodes import LARGEST, KeyPath, ListNode, MapNode, find, kind_of
+from qgs.composer.errors import Problems, did_you_mean, nearest
 from qgs.composer.places import Place
 from qgs.composer.registry import InstalledPlugin, Registry, available_plugins, component_failure
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, MOVED, SECTIONS, SLOTS, type_at
-from qgs.composer.yaml_text import inline
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, type_at
+from qgs.composer.yaml_text import KeyPath, ListNode, MapNode, find, inline, kind_of
 from qgs.contracts import (
     Component,
     ComponentConfig,
@@ -140,8 +139,6 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
     installed = registry.plugins[name.partition("/")[0]]
     try:
         found = _decode_options(component, name, node.without("type"), place.source, problems)
-    except RecipeError:
-        raise
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
         problems.add(origin, path, failure.reason, failure.fix, error)
@@ -180,9 +177,7 @@ def _decode_options(
     for step in corners(schedules) if sound else ():
         numbers = {n: s.number(step) for n, s in schedules.items()}
         # Whole ones without a point, since whole options take no others.
-        written = {
-            n: int(x) if x.is_integer() and abs(x) < LARGEST else x for n, x in numbers.items()
-        }
+        written = {n: int(x) if x.is_integer() else x for n, x in numbers.items()}
         entries = ((n, written.get(n, value), at) for n, value, at in node.entries())
         config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
         if config is None:
@@ -206,8 +201,6 @@ def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[s
         return reason, f"add `type:`, one of {', '.join(sorted(installed))}"
     if not isinstance(name, str):
         return f"`type` names a component, got {kind_of(name)}", choice
-    if name in MOVED:
-        return f"`{name}` has another name today", f"write `{MOVED[name]}`"
     plugin, slash, _ = name.partition("/")
     if not slash and ("." in name or ":" in name):
         reason = f"`{name}` is an import path; `type` only names installed components"
@@ -256,8 +249,6 @@ def decode_config(
             steps += [loc[-1]] if kind == "missing" else []
             reason, fix = _explain(detail, given, config)
         name = ".".join([*path, *map(str, steps)])
-        if kind == "extra_forbidden" and name in MOVED:
-            reason, fix = f"`{name}` has moved", f"write `{MOVED[name]}`"
         field = config.model_fields.get(str(loc[0])) if loc else None
         if field and not field.is_required() and not isinstance(field.default, BaseModel):
             fix += f" (default: {inline(to_jsonable_python(field.get_default()))})"

@@ -4,8 +4,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 
-from qgs.composer.nodes import Origin, shortened
 from qgs.contracts import Problem
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where something was written; line 0 where lines mean nothing."""
+
+    file: str
+    line: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}" if self.line else self.file
 
 
 @dataclass(frozen=True)
@@ -25,12 +35,8 @@ class RecipeProblem(Problem):
         return f"{place}\n  why: {self.reason}\n  fix: {self.fix}"
 
 
-MAX_PROBLEMS = 50
-"""After so many a recipe is not read further: nobody reads more at once."""
-
-
 class RecipeError(ValueError):
-    """A recipe that cannot work. `problems` holds what was found, by file and line.
+    """A recipe that cannot work. `problems` holds all of them, by file and line.
 
     what: the kind of file that was read.
     """
@@ -39,8 +45,7 @@ class RecipeError(ValueError):
         ordered = sorted(set(problems), key=lambda p: (p.file, p.line, p.option, p.reason, p.fix))
         self.problems = tuple(ordered)
         title = "1 problem" if len(ordered) == 1 else f"{len(ordered)} problems"
-        more = ", and perhaps more: mend these first" if len(ordered) == MAX_PROBLEMS else ""
-        super().__init__("\n".join([f"{title} in the {what}{more}", *map(str, ordered)]))
+        super().__init__("\n".join([f"{title} in the {what}", *map(str, ordered)]))
 
 
 class Problems:
@@ -51,7 +56,7 @@ class Problems:
 
     def __init__(self, what: str = "recipe") -> None:
         self._what = what
-        self._found: dict[RecipeProblem, None] = {}
+        self._found: list[RecipeProblem] = []
         self._stopped = False
 
     def stop(self, origin: Origin, path: str, reason: str, fix: str) -> None:
@@ -62,11 +67,8 @@ class Problems:
     def add(
         self, origin: Origin, path: str, reason: str, fix: str, cause: Exception | None = None
     ) -> None:
-        """Note a mistake and go on; raises RecipeError when there are MAX_PROBLEMS."""
-        place = shortened(path), shortened(reason, 2000), shortened(fix, 2000)
-        self._found[RecipeProblem(*place, shortened(origin.file, 1000), origin.line, cause)] = None
-        if len(self._found) == MAX_PROBLEMS:
-            self.raise_any()
+        """Note a mistake and go on."""
+        self._found.append(RecipeProblem(path, reason, fix, origin.file, origin.line, cause))
 
     def raise_if_stopped(self) -> None:
         """Raise RecipeError if part of the recipe could not be read."""
@@ -75,13 +77,10 @@ class Problems:
 
     def raise_any(self) -> None:
         """Raise RecipeError if anything was found, chained to what plugins raised."""
-        if not self._found:
-            return
-        error = RecipeError(self._found, self._what)
-        causes = [problem.cause for problem in error.problems if problem.cause]
-        if not causes:
-            raise error
-        raise error from causes[0] if len(causes) == 1 else ExceptionGroup("of plugins", causes)
+        if self._found:
+            error = RecipeError(self._found, self._what)
+            causes = [problem.cause for problem in error.problems if problem.cause]
+            raise error from (ExceptionGroup("of plugins", causes) if causes else None)
 
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:

@@ -4,10 +4,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
-from qgs.composer.errors import Problems, nearest
+from qgs.composer.errors import Origin, Problems, nearest
 from qgs.composer.files import merge
-from qgs.composer.nodes import KeyPath, MapNode, Node, Origin, kind_of
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, Slot, slot_at
+from qgs.composer.yaml_text import KeyPath, MapNode, Node, kind_of
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import torch
 from torch import nn
 
 from qgs import contracts
-from qgs.composer.build import build, build_model, load_pretrained
+from qgs.composer.build import build, build_model, load_pretrained, rate_factors
 from qgs.composer.decode import Chosen, DecoderSettings, check_tree, decode_place, decode_settings
-from qgs.composer.errors import Problems
-from qgs.composer.files import MAX_BYTES, apply_overrides, merge, read_recipe, refuse_beyond_reading
+from qgs.composer.errors import Origin, Problems
+from qgs.composer.files import apply_overrides, merge, read_recipe
 from qgs.composer.flow import (
     Parts,
     check_flow,
@@ -22,17 +22,13 @@ from qgs.composer.flow import (
     unfinished,
     without_idle_sublayers,
 )
-from qgs.composer.nodes import Count, KeyPath, ListNode, MapNode, Origin, from_plain
 from qgs.composer.places import apply_swaps, expand
-from qgs.composer.rates import rate_factors
 from qgs.composer.registry import Registry, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
-from qgs.composer.yaml_text import inline
+from qgs.composer.yaml_text import KeyPath, ListNode, MapNode, from_plain, inline
 from qgs.contracts.schedule import Schedule
 from qgs.memory import refuse_beyond_memory
 from qgs.model import QueryGaussianModel
-
-SMALLER_MODEL = "Lower the option of the model that makes the largest of them."
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,8 @@ class Recipe:
         if device is None or torch.device(device).type != "meta":
             state = build_model(*arguments, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
-            refuse_beyond_memory("the model with its weights", sizes, SMALLER_MODEL)
+            fix = "Lower the option of the model that makes the largest of them."
+            refuse_beyond_memory("the model with its weights", sizes, fix)
         model = build_model(*arguments, device)
         if pretrained:
             load_pretrained(model)
@@ -143,8 +140,7 @@ def resolve(
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
-    count = Count()
-    tree = apply_overrides(read_recipe(recipe, problems, count), overrides, problems, count)
+    tree = apply_overrides(read_recipe(recipe, problems), overrides, problems)
     tree = check_tree(tree, problems)
     problems.raise_if_stopped()
     tree = _with_defaults(tree)
@@ -176,8 +172,6 @@ def resolve(
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     out = _spell_out(tree, settings, registry, chosen)
-    refuse_beyond_reading(out.values, tree.origin, problems)
-    problems.raise_any()
     return Recipe(
         tree=out.values,
         provenance=out.provenance,
@@ -263,7 +257,7 @@ def _with_defaults(tree: MapNode) -> MapNode:
         for name, section in SECTIONS.items()
         if section.named and (section.defaults_stay or name not in tree)
     }
-    defaults = from_plain(missing, Origin("default"), Count())
+    defaults = from_plain(missing, Origin("default"))
     assert isinstance(defaults, MapNode)
     return merge(defaults, tree)
 
@@ -404,15 +398,8 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
     }
 
 
-WIDEST = 100
-"""Characters of a line beyond which a comment is not aligned to it: files have a size."""
-
-
 def annotated(recipe: Recipe) -> str:
-    """The resolved recipe in YAML; comments, aligned at the right, say what set each value.
-
-    One that would be too long to be read again has no comments.
-    """
+    """The resolved recipe in YAML; comments, aligned at the right, say what set each value."""
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():
@@ -424,6 +411,5 @@ def annotated(recipe: Recipe) -> str:
                 yield f"{name}: {inline(value)}", recipe.provenance[".".join(below)]
 
     lines = list(lines_of(recipe.tree, ()))
-    width = min(max(len(text) for text, _ in lines), WIDEST)
-    text = "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)
-    return text if len(text.encode()) < MAX_BYTES else inline(recipe.tree)
+    width = min(max(len(text) for text, _ in lines), 100)  # one long list must not move them all
+    return "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)

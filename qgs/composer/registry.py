@@ -1,19 +1,10 @@
 """Installed components: found by metadata, imported when a recipe or a command asks for them."""
 
-import inspect
-import json
-import re
 import sys
-import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
-
-from torch.nn import Module
 
 import qgs
 import qgs.components
@@ -22,20 +13,15 @@ import qgs.losses
 import qgs.metrics
 import qgs.renderers
 from qgs import extensions
-from qgs.composer.errors import Problems
-from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
+from qgs.composer.errors import Origin, Problems
 from qgs.composer.slots import SLOTS
+from qgs.composer.yaml_text import ListNode, MapNode, kind_of
 from qgs.contracts import (
     Component,
     ComponentConfig,
-    Metric,
-    Objective,
     OptionError,
-    Renderer,
-    WeightLayout,
 )
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
-from qgs.contracts.schedule import number_kinds
 
 BUILTIN = Plugin(
     name="qgs",
@@ -56,8 +42,6 @@ BUILTIN = Plugin(
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
     ),
 )
-RENDERER_DEVICES = ("cpu", "cuda", "mps")
-"""Types of the devices that a renderer can render on."""
 
 
 class PluginError(OptionError):
@@ -66,15 +50,11 @@ class PluginError(OptionError):
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A sound plugin and its distribution, "" for none.
-
-    editable: installed by its author, with `pip -e`. folder: of the module that holds the Plugin.
-    """
+    """A plugin and its distribution, "" for none. folder: of the module that holds the Plugin."""
 
     plugin: Plugin
     distribution: str = ""
     version: str = "0"
-    editable: bool = False
     folder: Path = Path()
 
     @property
@@ -87,11 +67,6 @@ class InstalledPlugin:
         """`PLUGIN/NAME` of every model that it ships to its file, which may be missing."""
         models = self.plugin.models.items()
         return {f"{self.plugin.name}/{name}": self.folder / file for name, file in models}
-
-    def repair(self, place: str) -> str:
-        """What its user can do about a fault. place: FILE:LINE of it."""
-        own = self.editable or not self.distribution
-        return f"correct {place}" if own else f"update {self.released_as}"
 
 
 @dataclass(frozen=True)
@@ -184,40 +159,25 @@ def load_plugin(name: str) -> InstalledPlugin:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
         raise PluginError(reason, "uninstall all of them but one")
-    entry = entries[0]
+    entry, release = entries[0], _release(entries[0])
     assert entry.dist is not None
-    # The record of where a distribution came from (PEP 610): whether by `pip install -e`.
-    record = json.loads(entry.dist.read_text("direct_url.json") or "{}")
-    editable = bool(record.get("dir_info", {}).get("editable"))
-    empty = Plugin(name, CONTRACT_VERSION, ())
-    installed = InstalledPlugin(empty, entry.dist.name, entry.dist.version, editable)
-    named = f"the plugin `{name}` of {installed.released_as}"
+    named = f"the plugin `{name}` of {release}"
     try:
         plugin = entry.load()
     except (Exception, SystemExit) as error:
-        package = entry.module.partition(".")[0]
-        spec = find_spec(package)
-        place = place_in(error, [package_of(spec.origin)] if spec and spec.origin else [])
-        message = f"{type(error).__name__}: {error}{f' (at {place})' if place else ''}"
-        reason = f"{named} cannot be imported from `{entry.value}`: {message}"
-        fix = installed.repair(place or f"`{entry.value}`")
+        message = f"cannot be imported from `{entry.value}`: {type(error).__name__}: {error}"
         missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+        fix = f"update or correct {release}"
         if missing == entry.module:
-            fix = f"install {installed.released_as} again, its files are gone"
-        elif missing.partition(".")[0] not in ("", "qgs", package):
-            fix = f"install `{missing.partition('.')[0]}`, which {installed.released_as} needs"
-        raise PluginError(reason, f"{fix}, or do without the plugin") from error
-    for fault in _plugin_faults(plugin, name):
-        version = getattr(plugin, "contract_version", None)
-        newer = type(version) is int and version > CONTRACT_VERSION
-        fix = "update qgs" if newer else installed.repair(f"`{entry.value}`")
-        raise PluginError(f"{named} {fault}", f"{fix}, or do without the plugin")
-    return replace(installed, plugin=plugin, folder=_folder_of(entry.module))
-
-
-def _folder_of(module: str) -> Path:
-    file = sys.modules[module].__file__
-    return Path(file).parent if file else Path()
+            fix = f"install {release} again, its files are gone"
+        elif missing.partition(".")[0] not in ("", "qgs", entry.module.partition(".")[0]):
+            fix = f"install `{missing.partition('.')[0]}`, which {release} needs"
+        raise PluginError(f"{named} {message}", f"{fix}, or do without the plugin") from error
+    if fault := _plugin_fault(plugin, name):
+        raise PluginError(f"{named} {fault}", f"update or correct {release}, or do without it")
+    file = sys.modules[entry.module].__file__
+    folder = Path(file).parent if file else Path()
+    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, folder)
 
 
 def _release(entry: EntryPoint) -> str:
@@ -225,92 +185,19 @@ def _release(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}"
 
 
-def _plugin_faults(plugin: object, name: str) -> Iterator[str]:
-    """Faults of what the entry point `name` leads to, each the rest of "the plugin X ..."."""
+def _plugin_fault(plugin: object, name: str) -> str:
+    """Why the plugin at the entry point `name` cannot be used, as the end of a sentence; or ""."""
     if not isinstance(plugin, Plugin):
-        kind = type(plugin).__name__
-        yield f"is no qgs.Plugin: its entry point leads to an object of type {kind}"
-        return
-    version: object = plugin.contract_version
-    if type(version) is not int:
-        yield f"must give `contract_version` as a whole number, not {version!r}"
-    elif version != CONTRACT_VERSION:
-        yield f"was written for contract version {version}; this qgs has version {CONTRACT_VERSION}"
+        return f"is no qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
+    if plugin.contract_version != CONTRACT_VERSION:
+        versions = f"version {plugin.contract_version}; this qgs has version {CONTRACT_VERSION}"
+        return f"was written for contract {versions}"
     if plugin.name != name:
-        yield f"calls itself `{plugin.name}`; the two names must be one"
-    for attribute in ("components", "layouts", "examples"):
-        value = getattr(plugin, attribute)
-        if not isinstance(value, Sequence):
-            comma = ", written `(Mine,)` for a single one" if inspect.isclass(value) else ""
-            yield f"must give `{attribute}` as a tuple or a list{comma}, not {value!r}"
-            return
-    for attribute in ("models", "exemptions"):
-        value = getattr(plugin, attribute)
-        if not isinstance(value, Mapping):
-            yield f"must give `{attribute}` as a mapping, not {value!r}"
-            return
-    if not plugin.components and not plugin.layouts and not plugin.models:
-        yield "is empty: it lists no `components`, `layouts` or `models`"
-    for model, file in plugin.models.items():
-        if not isinstance(file, str) or not re.fullmatch(r"[^\s/]+", str(model)):
-            yield f"ships {model!r}: {file!r}; models are file names by names without / and blank"
-    taken: set[tuple[str, str]] = set()
+        return f"calls itself `{plugin.name}`; the two names must be one"
     for component in plugin.components:
-        fault = component_fault(component)
-        if fault:
-            yield f"lists {getattr(component, '__qualname__', repr(component))}, {fault}"
-            return
-        if (component.slot, component.name) in taken:
-            yield f"registers `{component.name}` twice in the slot `{component.slot}`"
-        taken.add((component.slot, component.name))
-    for layout in plugin.layouts:
-        if not isinstance(layout, WeightLayout):
-            yield f"lists {layout!r}, which is no WeightLayout"
-
-
-def component_fault(component: object) -> str:
-    """Why nothing can be built of `component`; "" if it can."""
-    if not (inspect.isclass(component) and issubclass(component, Component)):
-        return "which is no qgs component"
-    slot, name = SLOTS.get(getattr(component, "slot", "")), getattr(component, "name", None)
-    if slot is None or not issubclass(component, slot.contract):
-        return "which implements no slot's contract"
-    if not isinstance(name, str):
-        return "which has no `name`"
-    if not re.fullmatch(r"[^\s/]+", name):  # else `type: PLUGIN/NAME` could not be told apart
-        return f"whose name {name!r} is empty or has a slash or a blank"
-    if inspect.isabstract(component):
-        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
-    if issubclass(component, Renderer):
-        given: object = component.devices
-        if not (isinstance(given, tuple) and given and set(given) <= set(RENDERER_DEVICES)):
-            return f"whose `devices` is {given!r}; give some of {RENDERER_DEVICES} as a tuple"
-    if issubclass(component, Metric) and not getattr(component, "definition", ""):
-        return "which gives no `definition`; say in words what it measures, since protocols hash it"
-    config: object = component.Config
-    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
-        return "whose Config is no ComponentConfig"
-    if not config.model_config.get("frozen"):
-        return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
-    if "type" in config.model_fields:
-        return "whose Config has an option `type`, which names the component itself"
-    fields: Mapping[str, Any] = config.model_fields
-    scheduled: object = component.scheduled
-    known = {n for n, option in fields.items() if number_kinds(option.annotation)}
-    if not (isinstance(scheduled, frozenset) and scheduled <= known):
-        return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
-    if scheduled and not issubclass(component, Module | Objective):
-        return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
-    return _schema_fault(config)
-
-
-@cache
-def _schema_fault(config: type[ComponentConfig]) -> str:
-    try:
-        config.model_json_schema()
-        return ""
-    except Exception as error:
-        return f"whose Config has options that YAML cannot express: {str(error).splitlines()[0]}"
+        if not (isinstance(component, type) and getattr(component, "slot", None) in SLOTS):
+            return f"lists {component!r}, which implements no slot's contract"
+    return ""
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
@@ -321,51 +208,11 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
         return None
 
 
-def component_error(installed: InstalledPlugin, fault: str, place: str = "") -> PluginError:
-    """A component of `installed` breaks its contract. place: FILE:LINE in its code, or ""."""
-    origin = f" of {installed.released_as}" if installed.distribution else ""
-    at = f" (at {place})" if place else ""
-    reason = f"the plugin `{installed.plugin.name}`{origin} fails: {fault}{at}"
-    return PluginError(reason, f"{installed.repair(place or 'it')}, or choose another component")
-
-
 def component_failure(
-    kind: str, what: str, error: Exception, installed: InstalledPlugin
+    kind: str, called: str, error: Exception, installed: InstalledPlugin
 ) -> PluginError:
-    """The code of `kind`, a PLUGIN/NAME, raised `error` when asked for `what`."""
-    files = filter(None, map(file_of, installed.plugin.components))
-    roots = {package_of(file) for file in files} - {package_of(qgs.__file__)}
-    fault = f"`{what}` of `{kind}` raises {type(error).__name__}: {error}"
-    return component_error(installed, fault, place_in(error, roots))
-
-
-def file_of(component: type) -> str | None:
-    """The file that defines a class; None for one that was defined in no file."""
-    return getattr(sys.modules.get(component.__module__), "__file__", None)
-
-
-def package_of(file: str) -> Path:
-    """The outermost package folder that holds the module `file`, or the file itself."""
-    path = Path(file).resolve()
-    while (path.parent / "__init__.py").exists():
-        path = path.parent
-    return path
-
-
-def place_of(function: Callable[..., Any]) -> str:
-    """FILE:LINE where a function starts; "" for one that is not written in Python."""
-    code = getattr(inspect.unwrap(function), "__code__", None)
-    return f"{code.co_filename}:{code.co_firstlineno}" if code else ""
-
-
-def place_in(error: BaseException, roots: Iterable[Path]) -> str:
-    """FILE:LINE of the last place below one of `roots` that `error` passed; "" for none."""
-    frames = traceback.extract_tb(error.__traceback__)
-    passed = [(frame.filename, frame.lineno) for frame in frames]
-    if isinstance(error, SyntaxError) and error.filename:
-        passed.append((error.filename, error.lineno))
-    inside = tuple(roots)
-    for file, line in reversed(passed):
-        if any(Path(file).resolve().is_relative_to(root) for root in inside):
-            return f"{file}:{line}"
-    return ""
+    """`called`, a function of the component `kind`, raised `error`; names the distribution."""
+    release = installed.released_as
+    origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
+    reason = f"{origin} fails: `{called}` of `{kind}` raises {type(error).__name__}: {error}"
+    return PluginError(reason, f"update or correct {release or 'it'}, or choose another component")

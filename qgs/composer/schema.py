@@ -4,9 +4,9 @@ import inspect
 from typing import Any
 
 from qgs.composer.decode import SETTINGS
-from qgs.composer.nodes import KeyPath
 from qgs.composer.registry import Registry
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS
+from qgs.composer.yaml_text import KeyPath
 from qgs.contracts import Component, ComponentConfig
 from qgs.contracts.schedule import SCHEDULES, Schedule
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from qgs import contracts
-from qgs.composer.nodes import KeyPath, MapNode
+from qgs.composer.yaml_text import KeyPath, MapNode
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,6 @@ SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 SECTIONS = {name: SLOTS[name] for name in ("losses", "objective", "data", "metrics", "optimizer")}
 """Slots that are top-level sections of a recipe."""
-_RATE = ("learning_rate", "warmup", "initial_divisor", "final_divisor")
-_OF_OPTIMIZER = (*_RATE, "betas", "weight_decay")
-MOVED = {
-    "evaluation.metrics": "metrics: {lpips: {type: qgs/lpips}}",
-    "evaluation.ssim_covariance": "metrics: {ssim: {covariance: ...}}",
-    "evaluation.lpips_weights": "metrics: {lpips: {type: qgs/lpips, weights: ...}}",
-    **{f"training.{key}": f"optimizer: {{{key}: ...}}" for key in _OF_OPTIMIZER},
-    "qgs/rooms": "type: rooms/procedural` and, at the top, `plugins: [rooms]",
-}
-"""Keys and types of older recipes, and what to write in their place."""
 
 
 def slot_at(path: KeyPath) -> Slot | None:

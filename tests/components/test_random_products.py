@@ -6,12 +6,12 @@ from typing import Any
 
 import torch
 from qgs_plugintools import Case
+from qgs_plugintools.exercise import variants
 from qgs_plugintools.inputs import Maker, Sizes
 from qgs_plugintools.plugins import cases_of
 
 from qgs.components import LatentQueries
 from qgs.composer import Recipe, RecipeError, registry, resolve
-from qgs.composer.flow import variants
 from qgs.composer.slots import SLOTS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import Component

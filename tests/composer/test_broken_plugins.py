@@ -1,6 +1,7 @@
-"""Plugins that are broken, and components that cannot stand together."""
+"""Plugins that cannot be used and components that fail: the distribution is named."""
 
 import sys
+import traceback
 from pathlib import Path
 
 import pytest
@@ -8,219 +9,77 @@ from refusals import refused
 from typer.testing import CliRunner
 
 from qgs.cli import app
-from qgs.composer.recipe import resolve
+from qgs.composer import RecipeError, compose, resolve
 from qgs.composer.registry import available_plugins, load_sound_plugins
-
-CHAIN = """
-from qgs.contracts import CrossAttention, FieldSpec, Plugin, LearnedQueries, Refinement
-
-class Start(LearnedQueries):
-    name = "start"
-    count = 3
-    @classmethod
-    def fields_written(cls, config):
-        return {"place": FieldSpec((3,))}
-    def start(self, batch_size):
-        raise NotImplementedError
-
-class Reader(CrossAttention):
-    name = "reader"
-    fields_read = Start.fields_written
-    def forward(self, state, memory):
-        return state.features
-
-class Refine(Refinement):
-    name = "refine"
-    fields_read = fields_written = Start.fields_written
-    def forward(self, state):
-        return state
-
-class Late(Refinement):
-    name = "late"
-    fields_written = Start.fields_written
-    def forward(self, state):
-        return state
-
-plugin = Plugin("chain", 1, (Reader, Refine, Late, Start))
-"""
-
-
-@pytest.mark.parametrize(
-    ("decoder", "too_late"),
-    [
-        ("{cross_attention: {type: chain/reader}}", False),
-        ("{refinement: {type: chain/refine}}", False),
-        ("{cross_attention: {type: chain/reader}, refinement: {type: chain/late}}", True),
-    ],
-)
-def test_what_reads_a_field_is_no_provider_of_it(decoder, too_late, write, install):
-    install("qgs-chain", "chain", CHAIN)
-    problem = refused(write(f"recipe: 1\nplugins: [chain]\nmodel: {{decoder: {decoder}}}\n"))
-    assert "needs place" in problem.reason
-    assert ("too late" in problem.reason) is too_late
-    assert problem.fix.startswith("use `chain/start` in the slot `queries`")
-
+from qgs.contracts import CONTRACT_VERSION, LearnedQueries, Plugin
 
 IMPORTS = """
-from collections.abc import Callable
-from qgs.components import LatentQueries
-from qgs.contracts import Centers, ComponentConfig, Plugin, LearnedQueries
-from qgs.metrics.images import Psnr
-from qgs.renderers import TorchRenderer
+from qgs.components import TOKENGS, LatentQueries
+from qgs.contracts import CONTRACT_VERSION, Plugin
 """
-BROKEN_PLUGINS = {
+BROKEN = {
     "raises at import": ("raise RuntimeError('no luck')", "RuntimeError: no luck"),
-    "is no Plugin": (
-        "plugin = {}",
-        "is no qgs.Plugin: its entry point leads to an object of type dict",
-    ),
-    "no object at its entry point": ("other = 1", "has no attribute 'plugin'"),
-    "unlisted component": (
-        "plugin = Plugin('bad', 1, LatentQueries)",
-        "must give `components` as a tuple or a list, written `(Mine,)` for a single one",
-    ),
-    "nameless component": (
-        "class Nameless(LatentQueries):\n    name = ''\nplugin = Plugin('bad', 1, (Nameless,))",
-        "whose name '' is empty or has a slash or a blank",
-    ),
-    "option that no recipe can give": (
-        "class Odd(Centers):\n    name = 'odd'\n"
-        "    class Config(ComponentConfig):\n        function: Callable = print\n"
-        "    def forward(self, offsets, state):\n        return offsets\n"
-        "plugin = Plugin('bad', 1, (Odd,))",
-        "lists Odd, whose Config has options that YAML cannot express",
-    ),
-    "options that can be changed": (
-        "class Soft(LatentQueries):\n    name = 'soft'\n"
-        "    class Config(LatentQueries.Config):\n        model_config = {'frozen': False}\n"
-        "plugin = Plugin('bad', 1, (Soft,))",
-        "lists Soft, whose Config is not frozen; leave `frozen` of its `model_config` at True",
-    ),
-    "metric that does not say what it measures": (
-        "class Mute(Psnr):\n    name = 'mute'\n    definition = ''\n"
-        "plugin = Plugin('bad', 1, (Mute,))",
-        "lists Mute, which gives no `definition`; say in words what it measures, since protocols "
-        "hash it",
-    ),
-    "wrong contract version": ("plugin = Plugin('bad', 0, ())", "contract version 0"),
-    "contract version that is a text": (
-        "plugin = Plugin('bad', '1', ())",
-        "must give `contract_version` as a whole number, not '1'",
-    ),
-    "contract version that is a truth": (
-        "plugin = Plugin('bad', True, ())",
-        "must give `contract_version` as a whole number, not True",
-    ),
-    "nothing in it": (
-        "plugin = Plugin('bad', 1, ())",
-        "is empty: it lists no `components`, `layouts` or `models`",
-    ),
-    "other name": ("plugin = Plugin('qgs', 1, ())", "calls itself `qgs`"),
-    "taken component name": (
-        "plugin = Plugin('bad', 1, (LatentQueries, LatentQueries))",
-        "registers `latent` twice",
-    ),
-    "abstract component": (
-        "class Half(LearnedQueries):\n    name = 'half'\nplugin = Plugin('bad', 1, (Half,))",
-        "leaves start abstract",
-    ),
-    "device that is none": (
-        "class Odd(TorchRenderer):\n    name = 'odd'\n    devices = ('tpu',)\n"
-        "plugin = Plugin('bad', 1, (Odd,))",
-        "lists Odd, whose `devices` is ('tpu',); give some of ('cpu', 'cuda', 'mps') as a tuple",
-    ),
-    "no component": ("plugin = Plugin('bad', 1, (int,))", "is no qgs component"),
-    "no layout": (
-        "plugin = Plugin('bad', 1, (), layouts=(int,))",
-        "lists <class 'int'>, which is no WeightLayout",
-    ),
+    "syntax": ("def f(:", "SyntaxError"),
+    "exits at import": ("raise SystemExit(3)", "SystemExit: 3"),
+    "is no Plugin": ("plugin = {}", "qgs.Plugin"),
+    "no object at its entry point": ("other = 1", "'plugin'"),
+    "older contracts": ("plugin = Plugin('bad', 0, ())", "version 0"),
+    "other name": ("plugin = Plugin('qgs', CONTRACT_VERSION, ())", "`qgs`"),
+    "no component": ("plugin = Plugin('bad', CONTRACT_VERSION, (int,))", "int"),
 }
 
 
-@pytest.mark.parametrize("name", BROKEN_PLUGINS)
-def test_broken_plugin_is_reported_by_distribution(name, write, install):
-    source, reason = BROKEN_PLUGINS[name]
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_plugin_is_reported_by_distribution(name, write, install):
+    source, word = BROKEN[name]
     install("qgs-bad", "bad", IMPORTS + source, version="0.7")
     problem = refused(write("recipe: 1\nplugins: [bad]\nmodel: {queries: {type: bad/any}}\n"))
     assert (problem.file, problem.line, problem.option) == ("recipe.yaml", 2, "plugins.0")
     assert "qgs-bad 0.7" in problem.reason
-    assert reason in problem.reason
+    assert word in problem.reason
     assert "qgs-bad 0.7" in problem.fix
     resolve(write("recipe: 1\n", "other.yaml"))
-
-
-def test_a_plugin_may_offer_layouts_alone(write, install):
-    source = """
-    from qgs.components import TOKENGS
-    from qgs.contracts import Plugin
-    plugin = Plugin("layouts", 1, (), layouts=(TOKENGS,))
-    """
-    install("qgs-layouts", "layouts", source)
-    assert resolve(write("recipe: 1\nplugins: [layouts]\n")).plugin_versions["layouts"] == "1.2"
 
 
 @pytest.mark.parametrize(
     ("source", "fix"),
     [
-        ("import a_package_that_nobody_has.inside", "install `a_package_that_nobody_has`, which"),
-        ("import _test_qgs_odd.gone", "update qgs-odd 1.2, or do without the plugin"),
-        ("import qgs.gone", "update qgs-odd 1.2, or do without the plugin"),
-        ("", "install qgs-odd 1.2 again, its files are gone"),
-        (f"{IMPORTS}plugin = Plugin('odd', 99, ())", "update qgs, or do without the plugin"),
+        ("import a_package_that_nobody_has.inside", "install `a_package_that_nobody_has`"),
+        ("import _test_qgs_odd.gone", "update or correct qgs-odd 1.2"),
+        ("import qgs.gone", "update or correct qgs-odd 1.2"),
+        ("", "install qgs-odd 1.2 again"),
     ],
 )
 def test_fix_of_a_plugin_that_cannot_be_imported(source, fix, write, install):
     install("qgs-odd", "odd", source)
     if not source:
         Path(sys.path[0], "_test_qgs_odd.py").unlink()
-    problem = refused(write("recipe: 1\nplugins: [odd]\n"))
-    assert problem.fix.startswith(fix)
+    assert refused(write("recipe: 1\nplugins: [odd]\n")).fix.startswith(fix)
+
+
+def test_a_plugin_may_offer_layouts_alone(write, install):
+    listed = "plugin = Plugin('layouts', CONTRACT_VERSION, (), layouts=(TOKENGS,))"
+    install("qgs-layouts", "layouts", IMPORTS + listed)
+    assert resolve(write("recipe: 1\nplugins: [layouts]\n")).plugin_versions["layouts"] == "1.2"
 
 
 def test_two_distributions_with_one_plugin_name(write, install):
-    source = "from qgs.contracts import Plugin\nplugin = Plugin('twin', 1, ())"
-    install("first-twin", "twin", source)
-    install("second-twin", "twin", source)
+    for name in ("first-twin", "second-twin"):
+        install(name, "twin", f"{IMPORTS}plugin = Plugin('twin', CONTRACT_VERSION, ())")
     problem = refused(write("recipe: 1\nplugins: [twin]\n"))
     assert "first-twin 1.2, second-twin 1.2" in problem.reason
-    assert "uninstall" in problem.fix
 
 
-def test_a_distribution_that_takes_the_frameworks_name_is_reported(write, install):
-    install("impostor", "qgs", "from qgs.contracts import Plugin\nplugin = Plugin('qgs', 1, ())")
+def test_broken_plugins_and_impostors_hide_no_other_plugin(write, install):
+    install("impostor", "qgs", f"{IMPORTS}plugin = Plugin('qgs', CONTRACT_VERSION, ())")
+    install("qgs-raises", "raises", "raise RuntimeError('no luck')")
     registry, broken = load_sound_plugins()
-    (message,) = [message for message in broken if "impostor 1.2" in message]
-    assert "`qgs`, the framework's own name" in message
+    assert sum("impostor 1.2" in message or "qgs-raises 1.2" in message for message in broken) == 2
     assert "qgs/latent" in registry.components("queries")
     resolve(write("recipe: 1\n"))
-
-
-def test_one_fault_of_a_plugin_does_not_hide_the_others_of_an_installation(install):
-    install("qgs-raises", "raises", "raise RuntimeError('no luck')")
-    install(
-        "qgs-moody",
-        "moody",
-        """
-        from pydantic import field_validator
-        from qgs.contracts import Centers, ComponentConfig, Plugin
-        class Moody(Centers):
-            name = "moody"
-            class Config(ComponentConfig):
-                mood: int = 1
-                @field_validator("mood")
-                @classmethod
-                def _refuse(cls, mood):
-                    raise ValueError("no mood will do")
-                model_config = {"validate_default": True}
-            def forward(self, offsets, state):
-                return offsets
-        plugin = Plugin("moody", 1, (Moody,))
-        """,
-    )
     result = CliRunner().invoke(app, ["list"], env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
-    assert "moody/moody" in result.output
-    assert "qgs-raises 1.2 cannot be imported" in result.output
+    assert "qgs-raises 1.2" in result.output
     assert "qgs/latent" in result.output
     assert CliRunner().invoke(app, ["schema"]).exit_code == 0
 
@@ -236,3 +95,94 @@ def test_a_plugin_that_comes_to_a_folder_or_leaves_it_is_noticed(tmp_path, monke
     assert "late" in available_plugins()
     info.rename(tmp_path / "gone")
     assert "late" not in available_plugins()
+
+
+FAULTY = """
+from pydantic import field_validator
+from qgs.contracts import CONTRACT_VERSION, ComponentConfig, Loss, Plugin, Refinement, SceneSource
+
+class Faulty(Refinement):
+    name = "faulty"
+    class Config(ComponentConfig):
+        at: str = "nowhere"
+        @field_validator("at")
+        @classmethod
+        def _check(cls, at):
+            return {}["x"] if at == "Config" else at
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        {}["x"] if config.at == "__init__" else None
+    @classmethod
+    def fields_read(cls, config):
+        return {}["x"] if config.at == "fields_read" else {}
+    @classmethod
+    def fields_written(cls, config):
+        return {}["x"] if config.at == "fields_written" else {}
+    @classmethod
+    def problems(cls, config, context):
+        return {}["x"] if config.at == "problems" else ()
+    def forward(self, state):
+        return state
+
+class Closed(SceneSource):
+    name = "closed"
+    def __init__(self, config):
+        raise FileNotFoundError("photos/ is not there")
+    def scenes(self, split):
+        raise NotImplementedError
+
+class AbstractLoss(Loss):
+    name = "abstract"
+
+plugin = Plugin("faulty", CONTRACT_VERSION, (Faulty, Closed, AbstractLoss))
+"""
+
+
+@pytest.mark.parametrize("at", ["Config", "fields_read", "fields_written", "problems", "__init__"])
+def test_a_component_that_fails_names_its_distribution_and_shows_its_traceback(at, write, install):
+    install("qgs-faulty", "faulty", FAULTY, version="0.3")
+    model = f"model:\n  decoder: {{refinement: {{type: faulty/faulty, at: {at}}}}}\n"
+    recipe = write(f"recipe: 1\nplugins: [faulty]\n{model}")
+    with pytest.raises(RecipeError) as caught:
+        compose(recipe)
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.option) == (4, "model.decoder.refinement")
+    for word in ("qgs-faulty 0.3", f"`{at}`", "KeyError: 'x'"):
+        assert word in problem.reason
+    assert "_test_qgs_faulty.py" in "".join(traceback.format_exception(caught.value))
+
+
+def test_a_failing_loss_names_its_distribution_and_missing_data_is_a_users_mistake(write, install):
+    install("qgs-faulty", "faulty", FAULTY, version="0.3")
+    text = "losses: {x: {type: faulty/abstract}}\ndata: {type: faulty/closed}\n"
+    recipe = resolve(write(f"recipe: 1\nplugins: [faulty]\n{text}"))
+    assert "qgs-faulty 0.3" in refused(None, by=lambda _: recipe.build_losses()).reason
+    with pytest.raises(FileNotFoundError, match="photos/"):
+        recipe.build_data()
+
+
+def test_the_tracebacks_of_several_plugins_are_all_shown(write, install):
+    install("qgs-first", "first", "{}['x']\n")
+    install("qgs-second", "second", "[][1]\n")
+    with pytest.raises(RecipeError) as caught:
+        resolve(write("recipe: 1\nplugins: [first, second]\n"))
+    shown = "".join(traceback.format_exception(caught.value))
+    assert "_test_qgs_first.py" in shown
+    assert "_test_qgs_second.py" in shown
+
+
+def test_a_plugin_in_memory_has_no_distribution():
+    class Silent(LearnedQueries):
+        name = "silent"
+        count = 3
+
+        def start(self, batch_size):
+            raise NotImplementedError
+
+        @classmethod
+        def fields_written(cls, config):
+            raise KeyError("oops")
+
+    recipe = {"recipe": 1, "plugins": ["mine"], "model": {"queries": {"type": "mine/silent"}}}
+    problem = refused(recipe, plugins=[Plugin("mine", CONTRACT_VERSION, (Silent,))])
+    assert problem.reason.startswith("the plugin `mine` fails: `fields_written` of `mine/silent`")

@@ -9,12 +9,10 @@ import pytest
 import yaml
 
 import qgs
-from qgs.components import LatentQueries, MlpFeedForward, OneCycleAdamW
+from qgs.components import MlpFeedForward
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import annotated
-from qgs.composer.registry import component_fault
-from qgs.contracts import ComponentConfig, ModelComponent
-from qgs.contracts.component import Component
+from qgs.contracts import ComponentConfig
 from qgs.contracts.schedule import SCHEDULES, at_step, follow, number_kinds
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -170,27 +168,6 @@ def test_components_of_layers_follow_too_and_whole_numbers_are_rounded() -> None
     half = options.replace("[1, 4]", "[1, 4.5]")
     with pytest.raises(RecipeError, match="must be a valid integer"):
         resolve(RECIPES / "tiny" / "tokengs.yaml", ["plugins=[rooms, mine]", half], [PLUGIN])
-
-
-@pytest.mark.parametrize(
-    ("base", "scheduled", "seen"),
-    [
-        (MlpFeedForward, {"ratio"}, "not a frozenset"),
-        (MlpFeedForward, frozenset({"ratoi"}), "not a frozenset of options that are numbers"),
-        (LatentQueries, frozenset({"type"}), "not a frozenset of options that are numbers"),
-    ],
-)
-def test_a_class_lists_numbers_of_its_own(
-    base: type[ModelComponent], scheduled: Any, seen: str
-) -> None:
-    mine = type("Mine", (base,), {"name": "mine", "scheduled": scheduled})
-    assert seen in component_fault(mine)
-
-
-def test_what_training_does_not_call_cannot_follow() -> None:
-    listed = {"name": "mine", "scheduled": frozenset({"warmup"})}
-    mine: type[Component] = type("Mine", (OneCycleAdamW,), listed)
-    assert "those of the slot `optimizer` stay" in component_fault(mine)
 
 
 def test_kinds_of_numbers() -> None:

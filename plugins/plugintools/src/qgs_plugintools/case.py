@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from qgs.components import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
 from qgs.composer.build import load_pretrained
 from qgs.composer.errors import did_you_mean
-from qgs.composer.registry import component_fault
 from qgs.composer.yaml_text import dump
 from qgs.contracts import (
     Component,
@@ -26,6 +25,7 @@ from qgs.contracts import (
     component_of,
 )
 from qgs_plugintools.modules import seeded
+from qgs_plugintools.soundness import component_fault
 
 SMALL = ModelDims(width=32, heads=2, depth=2)
 

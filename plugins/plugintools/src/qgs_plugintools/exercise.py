@@ -2,11 +2,10 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import ValidationError
 
-from qgs.composer.flow import variants
 from qgs.composer.yaml_text import inline
 from qgs.contracts import ComponentConfig
 from qgs_plugintools.case import Case
@@ -46,6 +45,19 @@ def idle_options(cases: Iterable[Case]) -> dict[str, list[str]]:
             elif value not in idle[option]:
                 idle[option].append(value)
     return {option: tried for option, tried in idle.items() if option not in exercised}
+
+
+def variants(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:
+    """`config` with another choice of one option that is a bool or a Literal.
+
+    Yields the option, its new value in YAML, and the new config.
+    """
+    for option, field in type(config).model_fields.items():
+        is_choice = get_origin(field.annotation) is Literal
+        choices = get_args(field.annotation) if is_choice else (True, False)
+        for choice in choices if is_choice or field.annotation is bool else ():
+            if choice != getattr(config, option):
+                yield option, inline(choice), config.model_copy(update={option: choice})
 
 
 def numbers(config: ComponentConfig) -> Iterator[tuple[str, str, ComponentConfig]]:

@@ -7,11 +7,11 @@ from qgs.composer.registry import (
     InstalledPlugin,
     PluginError,
     default_config,
-    file_of,
     load_plugin,
 )
 from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
 from qgs_plugintools.case import Case
+from qgs_plugintools.places import file_of
 from qgs_plugintools.registry import TIERS, Tier, checked_tiers, checks_for
 from qgs_plugintools.running import CaseRun, CheckResult, refuse_unexpectable, with_place
 

@@ -9,10 +9,10 @@ from typing import Any, Literal, TypeAlias
 import torch
 
 from qgs.composer.errors import did_you_mean
-from qgs.composer.registry import file_of, package_of, place_in
 from qgs.contracts import Expected, ExpectedError
 from qgs.contracts.component import MissingExtraError
 from qgs_plugintools.case import CannotCheck, Case, ContractError
+from qgs_plugintools.places import file_of, package_of, place_in
 from qgs_plugintools.registry import (
     BASICS,
     CHECKS,

@@ -12,11 +12,10 @@ from pydantic import TypeAdapter
 
 from qgs.cli.train import with_absolute_path
 from qgs.composer import Recipe, RecipeError, resolve
-from qgs.composer.errors import Problems
+from qgs.composer.errors import Origin, Problems
 from qgs.composer.files import merge
-from qgs.composer.nodes import Count, MapNode, Origin, from_plain
 from qgs.composer.recipe import annotated, flat
-from qgs.composer.yaml_text import dump, load_mapping
+from qgs.composer.yaml_text import MapNode, dump, from_plain, load_mapping
 from qgs.contracts import OptionError
 from qgs.data.evaluation import EvaluationIndex, EvaluationPlan, IndexEntry
 from qgs.engine.folder import RunFolder
@@ -178,7 +177,7 @@ def composed(study: Study) -> dict[str, Recipe]:
 
 def judged_by(recipe: Recipe, node: MapNode) -> Recipe:
     """`recipe` as an evaluation changes it; raises RecipeError."""
-    tree = from_plain(recipe.tree, Origin("the variant"), Count())
+    tree = from_plain(recipe.tree, Origin("the variant"))
     assert isinstance(tree, MapNode)
     return resolve(merge(tree, node))
 

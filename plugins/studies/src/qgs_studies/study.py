@@ -9,10 +9,9 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from qgs.composer.decode import decode_config
-from qgs.composer.errors import Problems, did_you_mean, nearest
-from qgs.composer.files import MAX_BYTES, found_recipe, merge, recipe_folder
-from qgs.composer.nodes import ListNode, MapNode, Origin, kind_of
-from qgs.composer.yaml_text import load_mapping
+from qgs.composer.errors import Origin, Problems, did_you_mean, nearest
+from qgs.composer.files import found_recipe, merge, recipe_folder
+from qgs.composer.yaml_text import ListNode, MapNode, kind_of, load_mapping
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.engine.evaluation import SECTIONS
 from qgs_studies.hypotheses import NAME, Contrast, parsed
@@ -138,10 +137,7 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
     """The tree of `file` laid over the study that it extends, names of files made absolute."""
     origin = Origin(str(file))
     try:
-        written = file.read_bytes()
-        if len(written) > MAX_BYTES:
-            raise ValueError(f"it is longer than {MAX_BYTES // 1024} KiB")
-        text = written.decode()
+        text = file.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         fix = _meant(str(file), "studies/*/*.yaml", "studies/tiny/structural.yaml")

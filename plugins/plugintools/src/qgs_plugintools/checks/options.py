@@ -7,12 +7,11 @@ from pydantic import BaseModel
 
 from qgs.composer.decode import decode_config, models_in
 from qgs.composer.errors import Problems, RecipeError
-from qgs.composer.flow import variants
 from qgs.composer.yaml_text import dump, load_mapping
 from qgs.contracts import ComponentConfig
 from qgs_plugintools.case import Case, expect
 from qgs_plugintools.checks.objective import rehearsed
-from qgs_plugintools.exercise import numbers
+from qgs_plugintools.exercise import numbers, variants
 from qgs_plugintools.inputs import inputs_of
 from qgs_plugintools.modules import seeded
 from qgs_plugintools.registry import ALL_SLOTS, MODULES, check

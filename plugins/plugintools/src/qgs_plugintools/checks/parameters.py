@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from qgs.composer.build import ShapesAlone
+from qgs.composer.build import OnMeta
 from qgs.types import map_tensors
 from qgs_plugintools.case import Case, expect
 from qgs_plugintools.inputs import inputs_of
@@ -23,7 +23,7 @@ from qgs_plugintools.trees import cast, difference, floating, not_finite, scalar
 @check(PARAMETRIC)
 def check_builds_on_meta(case: Case) -> None:
     """Built under the meta device, a component allocates no parameter and no buffer."""
-    with torch.device("meta"), ShapesAlone():
+    with torch.device("meta"), OnMeta():
         module = case.construct()
     names = dict(module.named_parameters()) | dict(module.named_buffers())
     real = [name for name, tensor in names.items() if tensor.device.type != "meta"]
