@@ -13,7 +13,6 @@ from upath import UPath
 
 import qgs
 from qgs.composer import resolve
-from qgs.composer.registry import load_sound_plugins
 from qgs.engine.initial import initialise
 from qgs.io.checkpoint import CheckpointFile, export_checkpoint, save
 from qgs.io.models import checkpoint_path
@@ -89,13 +88,6 @@ def test_models_are_listed_and_checked(shipped: Path) -> None:
     assert checked.exit_code == 1
     assert "ok     model box/small" in checked.output
     assert "FAILED model box/gone: no checkpoint at" in checked.output
-
-
-@pytest.mark.parametrize("models", ["['a']", "{'a/b': 'f'}", "{'a': 1}"])
-def test_models_of_another_form_are_refused(install, models: str) -> None:
-    source = "from qgs.contracts import Plugin\n"
-    install("qgs-bad", "bad", f"{source}plugin = Plugin('bad', 1, (), models={models})")
-    assert any("models" in message for message in load_sound_plugins()[1])
 
 
 @pytest.fixture
