@@ -38,7 +38,7 @@ DISTRIBUTIONS = {
         "study": "query-gaussians-studies",
         "bench": "query-gaussians-bench",
     }
-    | dict.fromkeys(("view", "figures"), "query-gaussians-viewer")
+    | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
     "qgs.refiners": dict.fromkeys(("gaussians", "reconstruction"), "query-gaussians-refine"),
 }
@@ -59,10 +59,10 @@ has allocated any; with 4 KiB pages a forward pass takes some 5 % longer. Set it
 _ELSEWHERE = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
     "Plugin": "qgs.contracts.plugin",
-    "QueryGaussianModel": "qgs.model",
-    "compose": "qgs.composer",
+    "QueryGaussianModel": "qgs.analysis",
+    "compose": "qgs.analysis",
     "Reconstruction": "qgs.analysis.reconstruction",
-    "load": "qgs.io.checkpoint",
+    "load": "qgs.analysis",
     "load_ply": "qgs.io.ply",
     "read_photos": "qgs.analysis.scenes",
     "refine": "qgs.extensions",

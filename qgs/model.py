@@ -1,11 +1,8 @@
 """The model: views to image memory, queries through the decoder layers, states to Gaussians."""
 
-import os
-from collections.abc import Collection, Mapping, Sequence
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, cast
 
-import torch
 from torch import Tensor, nn
 
 from qgs.contracts import (
@@ -18,7 +15,7 @@ from qgs.contracts import (
     Renderer,
     Supervision,
 )
-from qgs.data.domain import Domain, warn_of_unlike
+from qgs.data.domain import Domain
 from qgs.types import (
     Cameras,
     Gaussians,
@@ -32,18 +29,18 @@ from qgs.types import (
     map_tensors,
 )
 
-if TYPE_CHECKING:
-    from qgs import Reconstruction
-
 
 class QueryGaussianModel(nn.Module):
-    """Photos in, the Gaussians of its queries out, as many as these say.
+    """From photos to the Gaussians of its queries, in one forward pass.
 
     refinements: one per decoder layer, at `refinement_of`; layers may share a module.
     recipe: the resolved recipe this model was composed from, None for one built by hand.
-    trained_on: what its checkpoint tells of the views that it was trained on, None if nothing.
-    loaded_from: its checkpoint as `qgs.load` takes it, a path in full; "" if it was not loaded.
+    trained_on: statistics of the training views, as its checkpoint records them, or None.
+    loaded_from: its checkpoint as `qgs.load` takes it, an absolute path; "" if it was not loaded.
     """
+
+    reconstruct: Callable[..., Any]
+    """From photos in any world to a `Reconstruction`; `qgs.analysis` adds this method."""
 
     def __init__(
         self,
@@ -72,14 +69,6 @@ class QueryGaussianModel(nn.Module):
         self.recipe = recipe
         self.trained_on: Domain | None = None
         self.loaded_from = ""
-        self._warned = False
-
-    def __repr__(self) -> str:
-        """A line for each slot; `repr` of `encoder` and the like shows the modules inside."""
-        return import_module("qgs.analysis.shown").model_text(self)
-
-    def _repr_html_(self) -> str:
-        return import_module("qgs.analysis.shown").model_html(self)
 
     @property
     def depth(self) -> int:
@@ -95,33 +84,23 @@ class QueryGaussianModel(nn.Module):
         """Reconstruct every scene of `views`, whose cameras are in the model's world.
 
         layers: see `predict`. state: the initial state; None for that of the queries.
-        In evaluation, a warning tells once what of `views` is not as it was in training.
         Raises ValueError for photos without cameras where the encoder or the queries read them.
         """
         if isinstance(views, Photos):
             views = self._without_cameras(views)
-        elif not (self.training or self._warned or torch.compiler.is_compiling()):
-            settings = (self.recipe or {}).get("views")
-            self._warned = warn_of_unlike(views, settings, self.trained_on)
         memory = self.encoder(views)
         initial = self.queries(memory, views) if state is None else state
         return self.predict(memory, initial, layers)
 
     def _without_cameras(self, photos: Photos) -> Views:
-        """The photos as what encoder and queries are given; ValueError if these read cameras."""
+        """`photos` for encoders and queries that read no cameras; ValueError if one does."""
         readers = [type(x).__name__ for x in (self.encoder, self.queries) if x.reads_cameras]
         if readers:
             raise ValueError(
                 f"{' and '.join(readers)} of this model read cameras, and these photos have none; "
                 "give Views with cameras, or take an encoder that does without (reads_cameras)"
             )
-        return cast(Views, photos)
-
-    def reconstruct(
-        self, photos: "str | os.PathLike[str] | Views", **options: Any
-    ) -> "Reconstruction":
-        """One scene of photos in any world; options: see `qgs.analysis.scenes.reconstruct`."""
-        return import_module("qgs.analysis.scenes").reconstruct(self, photos, **options)
+        return cast(Views, photos)  # it has the same images and masks
 
     def predict(
         self, memory: ImageMemory, state: QueryState, layers: Collection[int] | None = None
@@ -164,8 +143,15 @@ class QueryGaussianModel(nn.Module):
         opacities = flat.opacities
         if state.mask is not None:
             opacities = (attributes.opacities * state.mask[..., None]).flatten(1, 2)
-        look = flat.colors, flat.sh, flat.features
-        return Gaussians(means.flatten(1, 2), flat.scales, flat.quats, opacities, *look)
+        return Gaussians(
+            means=means.flatten(1, 2),
+            scales=flat.scales,
+            quats=flat.quats,
+            opacities=opacities,
+            colors=flat.colors,
+            sh=flat.sh,
+            features=flat.features,
+        )
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None

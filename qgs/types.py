@@ -14,7 +14,6 @@ Containers are frozen. A component returns a new one and never writes into the o
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from importlib import import_module
 from typing import Any, Self, TypeVar, cast
 
 import torch
@@ -463,7 +462,3 @@ class Prediction(TensorContainer):
     gaussians: Gaussians
     state: QueryState
     layers: Mapping[int, LayerPrediction]
-
-    def _repr_png_(self) -> bytes | None:
-        """Its picture in a notebook; what draws it is of a higher layer, and imported then."""
-        return import_module("qgs.analysis.shown").prediction_png(self)

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from qgs_viewer.queries import notable_queries, support_picture
 
 import qgs
-from qgs.analysis.reconstruction import orbit_path
+from qgs.analysis.saving import orbit_path
 from qgs.composer import resolve
 from qgs.data.evaluation import evaluation_samples
 from qgs.drawing.figures import INK
 from qgs.drawing.images import Picture, enlarged, rgb_picture, write_png
-from qgs.drawing.queries import notable_queries, support_picture
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Prediction, Views

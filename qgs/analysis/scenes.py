@@ -1,27 +1,30 @@
-"""A user's photos, or views made in Python, as one scene; and its reconstruction in one call."""
+"""Photos of a user as one scene, and its reconstruction in one call."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
 
-from qgs.analysis.reconstruction import Reconstruction, choose_sample, remarks_on
-from qgs.analysis.reconstruction import reconstruct as reconstruct_sample
+from qgs.analysis.reconstruction import Reconstruction, choose_sample, reconstruct_sample
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_sound_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
-from qgs.data.domain import odd_images
+from qgs.data.domain import Domain, odd_images, verdict
+from qgs.data.images import framing
 from qgs.data.recognition import open_for
 from qgs.data.sampling import training_frames, views_in
 from qgs.data.scenes import warn_once
+from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Gaussians, Views
 from qgs.wording import listed
 
-Frames = Sequence[int | str]
-Size = tuple[int, int]
+Frames: TypeAlias = str | Sequence[int | str]
+Size: TypeAlias = tuple[int, int]
+Tuning: TypeAlias = Callable[[Views], tuple[Gaussians, Mapping[str, Any]]]
 
 
 def read_photos(
@@ -33,16 +36,16 @@ def read_photos(
 ) -> Views:
     """Photos and cameras of a folder, or its URL, as Views (1, V) in the photos' own world.
 
-    size: (H, W) that they are cropped and resized to; of the first photo by default. frames:
-    numbers or file names; all by default. scene: name, where the folder holds several. Formats are
-    those of `qgs reconstruct`. Raises FileNotFoundError, ValueError, and TooLargeError for more
-    photos than fit into memory.
+    size: (H, W) to crop and resize to; of the first photo by default. frames: numbers or file
+    names; all by default. scene: name, where the folder holds several. Formats are those of
+    `qgs reconstruct`. Raises FileNotFoundError, ValueError, and TooLargeError for more photos than
+    fit into memory.
     """
     sources, path = installed_sources(), fspath(folder)
     found = named_scene(open_for(path, size, None, sources)[0], path, scene)
     if size is None and (stored := found.stored_size(0)):
         found = named_scene(open_for(path, stored, None, sources)[0], path, scene)
-    wanted = frame_list(range(len(found)) if frames is None else frames, "frames", found)
+    wanted = range(len(found)) if frames is None else frame_list(frames, "frames", found)
     here = torch.eye(4, dtype=torch.float64), torch.ones((), dtype=torch.float64)
     return views_in(here, found, tuple(wanted))
 
@@ -57,15 +60,19 @@ def reconstruct(
     size: Size | None = None,
     scene: str | None = None,
     overrides: Sequence[str] = (),
+    tune: Tuning | None = None,
 ) -> Reconstruction:
     """Reconstruct one scene as `qgs reconstruct` does, in the frame and scale of the recipe.
 
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, of which all
         are inputs unless `frames` says otherwise. OpenCV cameras, images in [0, 1].
-    inputs: how many; the recipe's number by default. frames: which photos, by number or file name;
-        spread by default. compare: photos to compare with; of a folder, some between the inputs.
-    size: (H, W) of the photos of a folder; the recipe's by default. scene: name, where a folder
-        holds several. overrides: of the recipe's `views`, such as "views.scale=auto".
+    inputs: how many; the recipe's number by default.
+    frames: which photos, by number or file name; spread by default.
+    compare: photos to compare with; of a folder, some between the inputs by default.
+    size: (H, W) of the photos of a folder; the recipe's by default.
+    scene: name, where a folder holds several.
+    overrides: of the recipe's `views`, such as "views.scale=auto".
+    tune: from the inputs to Gaussians and a record of their tuning, in place of the forward pass.
 
     Raises ValueError for a model without a recipe, several scenes, and images out of range, and as
     the data do.
@@ -76,7 +83,7 @@ def reconstruct(
             "are not known; build it with qgs.compose, or bring cameras into its world yourself"
         )
     if foreign := [text for text in overrides if not text.startswith("views.")]:
-        raise ValueError(f"`overrides` change `views` alone here, got {listed(foreign)}")
+        raise ValueError(f"only options of `views` can be set here, got {listed(foreign)}")
     recipe = resolve(model.recipe, overrides)
     if isinstance(photos, Views):
         if size is not None or scene is not None:
@@ -90,14 +97,28 @@ def reconstruct(
     sample, world = choose_sample(found, recipe.views, inputs, wanted, against)
     training = model.training
     try:
-        result = reconstruct_sample(model.eval(), sample, world, seen)
+        tuned, record = tune(sample.inputs) if tune else (None, None)
+        result = reconstruct_sample(model.eval(), sample, world, seen, tuned, record)
     finally:
         model.train(training)
-    return replace(result, remarks=remarks_on(result, found, model, recipe.views))
+    return replace(result, remarks=_remarks(result, found, recipe))
+
+
+def _remarks(result: Reconstruction, scene: Scene, recipe: Recipe) -> list[str]:
+    """What a user must know of photos and result."""
+    sample, found, model = result.sample, Domain(), result.model
+    found.see(sample.inputs.cameras, sample.targets.cameras)
+    remarks = (
+        verdict(model.trained_on or Domain(), found),
+        framing(scene, sample.input_frames[0]),
+        too_many_capped(model.head, capped_share(model.head, result.gaussians), recipe.views),
+        result.worse_than_nearest,
+    )
+    return [*filter(None, remarks)]
 
 
 class GivenScene(Scene):
-    """Views (1, V) as a scene. ValueError for several scenes, odd images and a target time."""
+    """Views (1, V) as a scene. ValueError for several scenes, wrong images and a target time."""
 
     name = "views"
 
@@ -110,8 +131,9 @@ class GivenScene(Scene):
         if fault := odd_images(views.images):
             raise ValueError(fault)
         if views.target_time is not None:
-            told = "a reconstruction is of the time of the photos that it is compared with"
-            raise ValueError(f"{told}: name them by `compare` in place of a target_time")
+            raise ValueError(
+                "a target_time is the time of compared photos: name those by `compare`"
+            )
         self.views = views = views.to("cpu")
         self.times = None if views.times is None else views.times[0].double()
 
@@ -131,7 +153,7 @@ class GivenScene(Scene):
 
 
 def installed_sources() -> dict[str, type[Component]]:
-    """All installed sources of data, by PLUGIN/NAME; a warning names plugins left out."""
+    """All installed sources of data, by PLUGIN/NAME; warns of plugins that cannot be loaded."""
     registry, broken = load_sound_plugins()
     for problem in broken:
         warn_once(f"left out: {problem}")
@@ -139,15 +161,12 @@ def installed_sources() -> dict[str, type[Component]]:
 
 
 def chosen_scene(
-    recipe: Recipe,
-    path: str,
-    size: Size | None,
-    name: str | None,
+    recipe: Recipe, path: str, size: Size | None, name: str | None
 ) -> tuple[Scene, Sequence[int]]:
     """The scene called `name` at `path`, or the only one, and the frames a model was trained on.
 
-    size: (H, W) of its images, the recipe's by default. Raises as `named_scene`, and ValueError for
-    a recipe without data, which has no image size, when none is given.
+    size: (H, W) of its images, the recipe's by default. Raises as `named_scene`, and ValueError
+    where neither gives a size.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
@@ -178,7 +197,7 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
     return source.scenes(split)[place]
 
 
-def frame_list(frames: str | Frames, option: str, scene: Scene) -> list[int]:
+def frame_list(frames: Frames, option: str, scene: Scene) -> list[int]:
     """Frame numbers of "0,8,x.jpg" or [0, 8, "x.jpg"].
 
     Folders of a photo may be left out. Raises ValueError for what is neither a number nor the name

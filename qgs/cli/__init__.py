@@ -7,12 +7,10 @@ import typer
 
 from qgs.cli import (
     convert,
-    demo,
     evaluate,
     inspect,
     recipes,
     reconstruct,
-    report,
     train,
     weights,
 )
@@ -37,10 +35,8 @@ COMMANDS = {
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
     "convert": convert.convert,
-    "report": report.report,
     "import": weights.import_,
     "export": weights.export,
-    "demo": demo.demo,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

@@ -15,6 +15,8 @@ GROUP = "qgs.commands"
 HELP = {
     "data": "Check and pack data sets.",
     "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
+    "demo": "Trained models on rooms that none has seen, or on your photos; writes report.html.",
+    "report": "Judge trained models side by side and picture their scenes; writes report.html.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",
     "study": (
         "Train every variant with every seed, judge them alike, and answer: better, and how sure?"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +10,7 @@ import typer
 
 from qgs.cli.options import SET_HELP, Checkpoint, Device, Size, Tune, parse_size, tuning_settings
 from qgs.extensions import function
-from qgs.wording import listed, numbered
+from qgs.wording import numbered
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,9 +18,8 @@ if TYPE_CHECKING:
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
-    from qgs.data.sampling import Sample
     from qgs.model import QueryGaussianModel
-    from qgs.types import Gaussians
+    from qgs.types import Gaussians, Views
 
 
 def reconstruct(
@@ -58,10 +56,7 @@ def reconstruct(
         int | None,
         typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", help=SET_HELP),
-    ] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help=SET_HELP)] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
@@ -74,80 +69,70 @@ def reconstruct(
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
 
     Of a folder that the model was trained on, held-out photos are compared with where there are.
-    What --refine makes is written to OUT/refined, beside what the model predicted.
+    The result of --refine is written to OUT/refined, beside the prediction of the model.
     """
-    if out.is_file():
-        raise FileExistsError(f"{out} is a file; choose a folder for --out")
-    if out.is_dir() and any(out.iterdir()) and not overwrite:
+    if out.is_file() or (out.is_dir() and any(out.iterdir()) and not overwrite):
         raise FileExistsError(
-            f"{out} is not empty; choose another --out, or add --overwrite to replace the files "
-            "of the same names"
+            f"{out} is a file or holds some; choose another --out, or add --overwrite to replace "
+            "the files of the same names in a folder"
         )
-    if foreign := [text for text in overrides or () if not text.startswith("views.")]:
-        raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
-    refuse_unused(
-        refine,
-        {"--refine-size": fine, "--refine-inputs": refine_inputs or None, "--gaussians": gaussians},
-    )
+    if refine is None and (refine_size or refine_inputs or gaussians):
+        raise ValueError("--refine-size, --refine-inputs and --gaussians need --refine SECONDS")
+    if refine is not None and not 0 < refine < float("inf"):
+        raise ValueError(f"--refine must be a number of seconds above 0, got {refine:g}")
     refiner = function("qgs.refiners", "reconstruction") if refine else None
 
     from rich.console import Console
 
-    from qgs.analysis.reconstruction import choose_sample, remarks_on, write_reconstruction
-    from qgs.analysis.reconstruction import reconstruct as run
-    from qgs.analysis.scenes import chosen_scene, frame_list
+    from qgs.analysis.scenes import chosen_scene
+    from qgs.analysis.scenes import reconstruct as run
     from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
     from qgs.io.checkpoint import load
 
     console = Console()
     model = load(checkpoint, choose_device(device))
-    chosen = tuning_settings(tune)
-    recipe = resolve(model.recipe or {}, [*(overrides or ()), *chosen])
-    scene, seen = chosen_scene(recipe, photos, pixels, scene_name)
-    named = {"--frames": frames, "--holdout": holdout}.items()
-    wanted = [None if text is None else frame_list(text, name, scene) for name, text in named]
-    sample, world = choose_sample(scene, recipe.views, inputs, *wanted)
-    tune_it = bool(chosen and recipe.evaluation.tuning_steps)
-    tuned, record = tuned_scene(model, recipe, sample, console) if tune_it else (None, None)
-    result = run(model, sample, world, seen, tuned, record)
-    result = replace(result, remarks=remarks_on(result, scene, model, recipe.views))
+    recipe = resolve(model.recipe or {}, tuning_settings(tune))
+    tunes = tune is not None and recipe.evaluation.tuning_steps
+    result = run(
+        model,
+        photos,
+        inputs=inputs,
+        frames=frames,
+        compare=holdout,
+        size=pixels,
+        scene=scene_name,
+        overrides=overrides or (),
+        tune=partial(tuned, model, recipe, console) if tunes else None,
+    )
     show(result, "feed-forward" if refine else "", console)
-    paths = write_reconstruction(model, result, out)
+    paths = result.save(out)
     if refiner:
-        if fine is not None:
-            scene, seen = chosen_scene(recipe, photos, fine, scene_name)
-        better = refiner(
-            result, scene, refine, count=gaussians, inputs_only=refine_inputs, seen=seen,
-            console=console,
-        )  # fmt: skip
+        scene, seen = chosen_scene(recipe, photos, fine or pixels, scene_name)
+        more = {"count": gaussians, "inputs_only": refine_inputs, "seen": seen}
+        better = refiner(result, scene, refine, **more, console=console)
         show(better, "refined", console)
-        paths += write_reconstruction(model, better, out / "refined")
+        paths += better.save(out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
 
 
-def tuned_scene(
-    model: QueryGaussianModel, recipe: Recipe, sample: Sample, console: Console
+def tuned(
+    model: QueryGaussianModel, recipe: Recipe, console: Console, inputs: Views
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """Gaussians of queries or latents tuned on the inputs of `sample`, and a record of that."""
+    """Gaussians of queries or latents tuned on `inputs`, and a record of that."""
     from qgs.engine.tuning import tune, tuning_loss
 
-    what, steps = recipe.evaluation.tuning, recipe.evaluation.tuning_steps
-    rate, inputs = recipe.evaluation.rate, sample.inputs.to(next(model.parameters()).device)
+    settings = recipe.evaluation
+    what, steps, rate = settings.tuning, settings.tuning_steps, settings.rate
+    inputs = inputs.to(next(model.parameters()).device)
     tuning = tune(model, inputs, tuning_loss(recipe), steps, rate, what)
     before, after = tuning.losses[0], tuning.losses[-1]
     losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
     console.print(f"{steps} steps of tuning the {what}: {losses}", highlight=False)
-    record = {
-        "what": what,
-        "steps": steps,
-        "rate": rate,
-        "loss_before": before,
-        "loss_after": after,
-    }
-    return tuning.prediction.gaussians, record
+    record = {"what": what, "steps": steps, "rate": rate}
+    return tuning.prediction.gaussians, {**record, "loss_before": before, "loss_after": after}
 
 
 def show(result: Reconstruction, what: str, console: Console) -> None:
@@ -156,19 +141,10 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
     console.print("\n".join(result.remarks), soft_wrap=True, highlight=False, markup=False)
 
 
-def refuse_unused(seconds: float | None, options: Mapping[str, object]) -> None:
-    """Raise ValueError for options of a refinement that is not asked for, or takes no time."""
-    given = [name for name, value in options.items() if value is not None]
-    if seconds is None and given:
-        raise ValueError(f"{listed(given)} needs --refine SECONDS: add it, such as --refine 30")
-    if seconds is not None and not 0 < seconds < float("inf"):
-        raise ValueError(f"--refine must be a number of seconds above 0, got {seconds:g}")
-
-
 def score_table(result: Reconstruction, what: str = "") -> Table:
     """PSNR of every rendered view and of the baselines, inputs first, and the means by kind.
 
-    what: said before the number of Gaussians.
+    what: put before the number of Gaussians.
     """
     from rich.table import Table
 

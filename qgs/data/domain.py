@@ -14,7 +14,7 @@ from itertools import islice
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from qgs.contracts import SceneSource, ViewsConfig
 from qgs.data.scenes import warn_once
@@ -142,14 +142,14 @@ def odd_images(images: Tensor) -> str:
 
 def warn_of_unlike(
     views: Views, settings: Mapping[str, Any] | None, trained: Domain | None
-) -> bool:
-    """Warn where `views` cannot be what a model was trained on; whether it did. Some 0.1 ms.
+) -> None:
+    """Warn where `views` cannot be what a model was trained on.
 
     settings: `views` of its recipe. Looks at values, but not while a CUDA graph is captured.
     """
     c2w = views.cameras.c2w
     if c2w.is_meta or (c2w.is_cuda and torch.cuda.is_current_stream_capturing()):
-        return False
+        return
     told = [odd_images(views.images)] if views.images.numel() else []
     if settings is not None and c2w.numel():
         first = settings["frame"] == "first_cam"
@@ -170,7 +170,25 @@ def warn_of_unlike(
             f"{'; '.join(told)}. Expect a poor result. `model.reconstruct(views)` brings cameras "
             "in any frame and unit to those of the model"
         )
-    return bool(told)
+
+
+class FirstViews:
+    """Forward pre-hook that checks the first views of a model in evaluation, and no later ones.
+
+    Looking at values waits for the device, which costs every further pass more than it tells.
+    settings, trained: see `warn_of_unlike`.
+    """
+
+    def __init__(self, settings: Mapping[str, Any] | None, trained: Domain | None) -> None:
+        self.settings, self.trained, self.pending = settings, trained, True
+
+    def __call__(self, model: nn.Module, args: tuple[Any, ...]) -> None:
+        """Warn if the first argument is Views that are unlike those of the training."""
+        if model.training or not self.pending or torch.compiler.is_compiling():
+            return
+        self.pending = False
+        if args and isinstance(args[0], Views):
+            warn_of_unlike(args[0], self.settings, self.trained)
 
 
 def trained_domain(source: SceneSource, views: ViewsConfig, seed: int) -> Domain:

@@ -1,8 +1,7 @@
-"""Labelled figures: comparison grids with a depth scale, training curves; colours of all."""
+"""The look of all figures: colours, type, grids of pictures with a depth scale."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
@@ -14,7 +13,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from qgs.drawing.images import DEPTH_MAP, NOTHING, Picture
-from qgs.metrics.images import Psnr
 
 Color = tuple[int, int, int]
 
@@ -72,16 +70,6 @@ def figure_style() -> AbstractContextManager[None]:
     return rc_context(style)
 
 
-@dataclass(frozen=True)
-class Curves:
-    """What training reported: seconds since its start, loss, PSNR of supervised views, steps."""
-
-    seconds: Sequence[float]
-    loss: Sequence[float]
-    psnr: Sequence[float]
-    steps: Sequence[float]
-
-
 def figure_picture(figure: Figure, dpi: int = 120) -> Picture:
     """The figure as a picture."""
     buffer = BytesIO()
@@ -115,27 +103,6 @@ def grid_figure(
                 bar.outline.set_visible(False)  # type: ignore[operator]
         for axis, title in zip(axes[0], columns, strict=True):
             axis.set_title(title)
-    return figure
-
-
-def curves_figure(curves: Mapping[str, Curves]) -> Figure:
-    """Loss and PSNR by time, by steps where one took over two hours; running means are strong."""
-    long = max(max(run.seconds) for run in curves.values()) > 7200  # with pauses, other work
-    with figure_style():
-        figure = Figure(figsize=(8.4, 2.9), layout="constrained")
-        loss_axis, psnr_axis = figure.subplots(1, 2)
-        for index, (name, run) in enumerate(curves.items()):
-            color, place = hex_color(categorical(index)), run.steps if long else run.seconds
-            for axis, values in ((loss_axis, run.loss), (psnr_axis, run.psnr)):
-                axis.plot(place, values, color=color, alpha=0.18, linewidth=0.7)
-                axis.plot(place, running_mean(values), color=color, label=name)
-        loss_axis.set(title="Training loss", xlabel="steps" if long else "seconds", yscale="log")
-        title = f"{Psnr.column.heading} of the training views, {Psnr.column.unit}"
-        psnr_axis.set(title=title, xlabel=loss_axis.get_xlabel())
-        psnr_axis.legend(loc="lower right")
-        loss_axis.yaxis.set_major_formatter("{x:g}")
-        loss_axis.yaxis.set_minor_formatter("{x:g}")
-        loss_axis.tick_params(which="minor", color=hex_color(MUTED), labelsize=7)
     return figure
 
 

@@ -15,7 +15,7 @@ from qgs.types import Cameras
 
 Picture = np.ndarray  # uint8 (H, W, 3)
 NOTHING = (232, 233, 235)  # where there is nothing to show: no depth, no attention
-DEPTH_MAP, ERROR_MAP = "viridis_r", "inferno"
+DEPTH_MAP = "viridis_r"
 EXACT = 128  # pixels on the longer side up to which photos in pages are not compressed with loss
 
 
@@ -27,22 +27,13 @@ def rgb_picture(image: Tensor) -> Picture:
 
 def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
     """Depth (1, H, W) from near (light) to far (dark); pixels without depth (0) are grey."""
-    picture = _shaded(depth, near, far, DEPTH_MAP)
+    picture = shaded(depth, near, far, DEPTH_MAP)
     picture[depth.detach()[0].cpu().numpy() <= 0] = NOTHING
     return picture
 
 
-def color_error(images: Tensor, truth: Tensor) -> Tensor:
-    """Mean over channels of what clipped images are off, (..., 3, H, W) -> (..., 1, H, W)."""
-    return (images.clamp(0, 1) - truth.to(images)).abs().mean(-3, keepdim=True)
-
-
-def error_picture(error: Tensor, most: float) -> Picture:
-    """Error (1, H, W) from none (black) to `most` and above (light yellow)."""
-    return _shaded(error, 0.0, most, ERROR_MAP)
-
-
-def _shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
+def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
+    """Values (1, H, W) from `low` to `high` in the colours of a Matplotlib map."""
     from matplotlib import colormaps
 
     shade = (values.detach().float().cpu().numpy()[0] - low) / max(high - low, 1e-12)
@@ -126,10 +117,3 @@ def finer(cameras: Cameras, side: int) -> Cameras:
     height, width = cameras.size
     factor = max(1, round(side / max(height, width)))
     return Cameras(cameras.c2w, cameras.intrinsics * factor, (height * factor, width * factor))
-
-
-def washed(picture: Picture, strength: float = 0.6) -> Picture:
-    """Greys, lightened towards white by `strength`: a ground to draw on."""
-    grey = picture.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
-    light = 255 - (255 - grey) * (1 - strength)
-    return np.repeat(light[..., None], 3, -1).round().astype(np.uint8)

@@ -15,7 +15,7 @@ import qgs
 from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts.schedule import END, follow, steps_followed
-from qgs.data.domain import KEY, Domain
+from qgs.data.domain import KEY, Domain, FirstViews
 from qgs.io.files import refuse_existing
 from qgs.io.models import checkpoint_path
 from qgs.io.tensors import (
@@ -135,6 +135,8 @@ class CheckpointFile(TensorFile):
         model.trained_on = self.domain
         local = Path(self.name).expanduser().exists()
         model.loaded_from = str(self.path.resolve()) if local else self.name
+        settings = self.recipe.tree.get("views")
+        model.register_forward_pre_hook(FirstViews(settings, self.domain))
         return (model if device is None else model.to(device)).eval()
 
 

@@ -1,6 +1,6 @@
 import torch
 
-from qgs.analysis.reconstruction import orbit
+from qgs.analysis.saving import orbit
 from qgs.geometry.poses import look_at
 
 

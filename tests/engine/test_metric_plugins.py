@@ -9,12 +9,12 @@ from typing import ClassVar, TypeAlias
 
 import pytest
 import torch
+from qgs_viewer.contest import Entry, report_of, table_of
+from qgs_viewer.report import Contender
 from rich.console import Console
 from torch import Tensor
 from training_runs import Tiny
 
-from qgs.analysis.report import Contender
-from qgs.cli.contest import Entry, report_of, table_of
 from qgs.composer import PluginError, Recipe, RecipeError, resolve
 from qgs.contracts import (
     CONTRACT_VERSION,

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from qgs_viewer.curves import curves_of
 from training_runs import (
     Tiny,
     change_batches,
@@ -19,7 +20,6 @@ from training_runs import (
 )
 
 import qgs
-from qgs.cli.contest import curves_of
 from qgs.composer import Recipe
 from qgs.contracts import MissingExtraError
 from qgs.data.sampling import Batch

@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from pydantic import ValidationError
 from qgs_rooms.source import RoomsSource
+from qgs_viewer.curves import curves_of
 
-from qgs.cli.contest import curves_of
 from qgs.data.sampling import mirrored_views
 from qgs.geometry.rays import pixel_directions
 from qgs.io.models import checkpoint_path

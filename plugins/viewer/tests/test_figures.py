@@ -10,6 +10,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from PIL import Image
+from qgs_viewer.curves import Curves
 from qgs_viewer.figures import (
     anchors,
     attention,
@@ -25,12 +26,12 @@ from qgs_viewer.figures.layers import chosen_layers
 from qgs_viewer.figures.overview import level_axes, overview, seen_points
 from qgs_viewer.figures.paper import DPI, WIDTH, new_figure, write_figure
 from qgs_viewer.figures.plan import ground, plan_of
+from qgs_viewer.queries import attention_pictures
 from small import KINDS, QUERIES, SIDE, VIEWS, Walk, exhibit_of, exhibition_of, sample_of
 
 import qgs
 from qgs.contracts import MetricInput
 from qgs.data.sampling import make_sample
-from qgs.drawing.figures import Curves
 from qgs.drawing.images import (
     color_error,
     depth_picture,
@@ -39,7 +40,6 @@ from qgs.drawing.images import (
     error_picture,
     rgb_picture,
 )
-from qgs.drawing.queries import attention_pictures
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics import Dispersion
 

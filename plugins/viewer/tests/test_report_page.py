@@ -21,6 +21,8 @@ from qgs_viewer.choice import Choice
 from qgs_viewer.figures import dispersion
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
 from qgs_viewer.page import shared_start
+from qgs_viewer.queries import notable_queries
+from qgs_viewer.report import GROUP, Contender, Report, Shown, report_html
 from qgs_viewer.section import (
     dispersion_section,
     refinement_section,
@@ -30,10 +32,8 @@ from qgs_viewer.section import (
 )
 from small import VIEWS, Walk, model_of
 
-from qgs.analysis.report import GROUP, Contender, Report, Shown, report_html
 from qgs.contracts import Column
 from qgs.data.sampling import Sample, make_sample
-from qgs.drawing.queries import notable_queries
 
 KINDS = ("tokengs", "locus")
 SHOWN = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"

@@ -10,7 +10,7 @@ from qgs_viewer.sources import FixedSource, ModelSource, Wanted, _difference, op
 from small import QUERIES, VIEWS, Walk, model_of
 
 import qgs
-from qgs.analysis.reconstruction import choose_sample, reconstruct, write_reconstruction
+from qgs.analysis.reconstruction import choose_sample, reconstruct_sample
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
 from qgs.io.ply import load_ply
@@ -24,8 +24,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     qgs.save(model_of("locus"), folder / "model.safetensors")
     model = qgs.load(folder / "model.safetensors")
     sample, world = choose_sample(Walk(), VIEWS, 2, (1, 4), (2, 3))
-    result = reconstruct(model, sample, world)
-    write_reconstruction(model, result, folder / "scene")
+    reconstruct_sample(model, sample, world).save(folder / "scene")
     return folder
 
 
@@ -45,7 +44,7 @@ def finished_by_distance(folder: Path, views: ViewsConfig) -> QueryGaussianModel
     )
     model = qgs.load(folder / "model.safetensors")
     sample, world = choose_sample(Walk(), views, 2, (1, 4), (0, 2, 3, 5))
-    write_reconstruction(model, reconstruct(model, sample, world), folder / "scene")
+    reconstruct_sample(model, sample, world).save(folder / "scene")
     return model
 
 

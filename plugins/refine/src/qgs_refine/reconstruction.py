@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 
 from rich.console import Console
 
-from qgs.analysis.reconstruction import Reconstruction, reconstruct
+from qgs.analysis.reconstruction import Reconstruction, reconstruct_sample
 from qgs.contracts import Scene
 from qgs.data.sampling import Sample, training_frames, views_in
 from qgs.types import Views
@@ -50,7 +50,7 @@ def refine_reconstruction(
         "stopped_by": result.stopped_by,
         "curve": [asdict(point) for point in result.curve],
     }
-    found = reconstruct(
+    found = reconstruct_sample(
         start.model, sample, start.world, seen, result.gaussians, start.tuning, record
     )
     return replace(found, remarks=[*filter(None, [found.worse_than_nearest])])

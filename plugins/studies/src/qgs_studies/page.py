@@ -3,11 +3,11 @@
 import json
 from typing import Any
 
-from qgs.analysis.report import page_environment
 from qgs.analysis.shown import parameter_counts
 from qgs.composer import Recipe
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import data_uri
+from qgs.drawing.pages import page_environment
 from qgs_studies.figures import curves_figure, values_figure
 from qgs_studies.output import hypothesis_rows, table_rows
 from qgs_studies.plan import differences

@@ -1,15 +1,27 @@
-"""What one query reads, drawn onto the input photos."""
+"""Pictures of errors, and of what one query reads in the input photos."""
 
 import numpy as np
+from torch import Tensor
 
-from qgs.drawing.images import Picture, enlarged, rgb_picture, side_by_side
-from qgs.drawing.queries import attention_pictures, patch_maps
+from qgs.drawing.images import Picture, enlarged, rgb_picture, shaded, side_by_side
 from qgs_viewer.look import Look
+from qgs_viewer.queries import attention_pictures, patch_maps
 
 SIDE = 192
 """Pixels on the longer side of each photo."""
 COLUMNS = 2
+ERROR_MAP = "inferno"
 PARTS = ("result", "content", "geometry")
+
+
+def color_error(images: Tensor, truth: Tensor) -> Tensor:
+    """Mean over channels of what clipped images are off, (..., 3, H, W) -> (..., 1, H, W)."""
+    return (images.clamp(0, 1) - truth.to(images)).abs().mean(-3, keepdim=True)
+
+
+def error_picture(error: Tensor, most: float) -> Picture:
+    """Error (1, H, W) from none (black) to `most` and above (light yellow)."""
+    return shaded(error, 0.0, most, ERROR_MAP)
 
 
 def attention_parts(look: Look, query: int, layer: int) -> dict[str, Picture]:

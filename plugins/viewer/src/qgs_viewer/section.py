@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 import torch
 from matplotlib.figure import Figure
 
-from qgs.analysis.report import ReportSection, Shown, Tile
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import rgb_picture, side_by_side
@@ -16,6 +15,7 @@ from qgs_viewer.figures import dispersion, graph, refinement
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
 from qgs_viewer.look import Look
 from qgs_viewer.page import scenes_html, shared_start
+from qgs_viewer.report import ReportSection, Shown, Tile
 from qgs_viewer.server import FIELD_OF_VIEW, first_eye, up_of
 
 _SIZE = 240, 320  # of each scene's picture, H, W

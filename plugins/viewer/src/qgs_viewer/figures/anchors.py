@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qgs.drawing.images import enlarged, finer, rgb_picture
-from qgs.drawing.queries import DrawnQuery, query_picture, support_picture
 from qgs.types import SpatialSupport, map_tensors
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition
 from qgs_viewer.figures.layers import chosen_layers, layer_name
@@ -20,6 +19,7 @@ from qgs_viewer.figures.paper import (
     picture_panel,
     row_label,
 )
+from qgs_viewer.queries import DrawnQuery, query_picture, support_picture
 
 QUERIES = 6
 LAYERS = 4

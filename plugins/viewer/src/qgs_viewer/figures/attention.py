@@ -11,13 +11,6 @@ from torch import Tensor
 from qgs.contracts import AttentionWeights
 from qgs.drawing.figures import categorical, hex_color
 from qgs.drawing.images import enlarged, rgb_picture
-from qgs.drawing.queries import (
-    OUTLINE_POINTS,
-    DrawnQuery,
-    attention_pictures,
-    patch_maps,
-    project_support,
-)
 from qgs.types import Cameras
 from qgs_viewer.figures.anchors import support_of
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition, NothingToShowError
@@ -30,6 +23,13 @@ from qgs_viewer.figures.paper import (
     paper_style,
     picture_panel,
     row_label,
+)
+from qgs_viewer.queries import (
+    OUTLINE_POINTS,
+    DrawnQuery,
+    attention_pictures,
+    patch_maps,
+    project_support,
 )
 
 LAYERS = 3

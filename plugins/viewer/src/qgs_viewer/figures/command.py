@@ -45,8 +45,8 @@ def figures(
     scene, novel views with depth and error, anchors and supports, cross- and self-attention,
     dispersion by scene, refinement by layer, training curves.
     """
-    from qgs.cli.demo import new_folder
     from qgs.engine.distributed import choose_device
+    from qgs_viewer.demo import new_folder
     from qgs_viewer.figures.gallery import refuse_unknown, write_all
     from qgs_viewer.figures.opening import open_exhibition
 

@@ -1,6 +1,6 @@
 """Figure: training curves of runs."""
 
-from qgs.drawing.figures import curves_figure
+from qgs_viewer.curves import curves_figure
 from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
 from qgs_viewer.figures.paper import WIDTH, Made, paper_style
 

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from qgs.data.sampling import Sample
-from qgs.drawing.figures import Curves
-from qgs.drawing.queries import DrawnQuery, colored_queries, notable_queries
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians
+from qgs_viewer.curves import Curves
 from qgs_viewer.look import Look, look_inside
+from qgs_viewer.queries import DrawnQuery, colored_queries, notable_queries
 
 
 class NothingToShowError(ValueError):

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qgs.drawing.images import rgb_picture
-from qgs.drawing.queries import DrawnQuery, query_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition
@@ -24,6 +23,7 @@ from qgs_viewer.figures.paper import (
     tag,
 )
 from qgs_viewer.placement import corners, on_photo
+from qgs_viewer.queries import DrawnQuery, query_picture
 from qgs_viewer.stage import FRUSTUM, frustum_lines
 
 SHAPE = (3, 4)

@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from qgs.drawing.figures import MUTED, hex_color
-from qgs.drawing.queries import DrawnQuery, rendered_weights
 from qgs_viewer.figures.attention import PARTS
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition, NothingToShowError
 from qgs_viewer.figures.layers import chosen_layers
 from qgs_viewer.figures.paper import WIDTH, Made, new_figure, paper_style, row_label
 from qgs_viewer.figures.plan import SHAPE, Plan, draw_ground, plan_of
+from qgs_viewer.queries import DrawnQuery, rendered_weights
 
 QUERIES = 5
 LAYERS = 2

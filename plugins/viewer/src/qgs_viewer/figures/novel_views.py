@@ -12,11 +12,8 @@ from torch import Tensor
 from qgs.data.sampling import Sample
 from qgs.drawing.images import (
     DEPTH_MAP,
-    ERROR_MAP,
-    color_error,
     depth_picture,
     depth_range,
-    error_picture,
     rgb_picture,
 )
 from qgs.metrics.images import Psnr, psnr
@@ -33,6 +30,7 @@ from qgs_viewer.figures.paper import (
     row_label,
     tag,
 )
+from qgs_viewer.pictures import ERROR_MAP, color_error, error_picture
 
 SCENES = 3
 INPUTS = 2

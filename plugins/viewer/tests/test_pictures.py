@@ -3,18 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-
-from qgs.drawing.figures import CATEGORICAL, Curves, curves_figure, figure_picture, running_mean
-from qgs.drawing.images import (
-    NOTHING,
-    depth_picture,
-    depth_range,
-    enlarged,
-    finer,
-    rgb_picture,
-    washed,
-)
-from qgs.drawing.queries import (
+from qgs_viewer.curves import Curves, curves_figure
+from qgs_viewer.queries import (
     attention_pictures,
     notable_queries,
     patch_maps,
@@ -22,7 +12,11 @@ from qgs.drawing.queries import (
     query_picture,
     rendered_weights,
     support_picture,
+    washed,
 )
+
+from qgs.drawing.figures import CATEGORICAL, figure_picture, running_mean
+from qgs.drawing.images import NOTHING, depth_picture, depth_range, enlarged, finer, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import SpatialSupport
 

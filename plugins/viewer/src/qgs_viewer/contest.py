@@ -1,4 +1,4 @@
-"""Training and judging several recipes under one budget, and the report of it."""
+"""Models side by side: trained under one budget or loaded, judged alike, and reported."""
 
 import os
 import platform
@@ -14,20 +14,28 @@ import yaml
 from rich import box
 from rich.table import Table
 
-from qgs.analysis.report import Contender, Report
+from qgs.analysis.scenes import installed_sources
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
 from qgs.data.evaluation import evaluation_samples, true_depth
-from qgs.drawing.figures import Curves
+from qgs.data.recognition import open_for
+from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import Evaluation, evaluate
 from qgs.engine.training import train
-from qgs.io.files import read_records
-from qgs.io.ply import save_ply
+from qgs.io.checkpoint import CheckpointFile
+from qgs.io.models import about, checkpoint_path
 from qgs.metrics.baselines import BASELINES
 from qgs.model import QueryGaussianModel
 from qgs.wording import counted, listed, short_names
+from qgs_viewer.curves import Curves, curves_of
+from qgs_viewer.report import Contender, Report
 
 PICTURED_SCENES = 6
+WINDOWS = 6
+"""Scenes, and windows of a scene, that are judged of a user's photos."""
+HOLDOUT = 8
+"""Every n-th of a user's photos is held out; of fewer photos the middle one."""
+AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
 NEXT = {
     "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
     "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "reconstructs and refines them",
@@ -37,14 +45,14 @@ NEXT = {
 """Commands that a reader of a report may want, and what they do."""
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
-"""Parts of recipes that must be equal, so that only the models differ."""
+"""Sections of recipes that must be equal, so that only the models differ."""
 OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning")
-"""What may differ all the same: how a method trains, and what nobody tunes here."""
+"""Options in them that may differ: how a method trains, and tuning, which nobody does here."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One recipe after training and evaluation."""
+    """One model with its recipe and evaluation."""
 
     recipe: Recipe
     contender: Contender
@@ -59,26 +67,25 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
     names = short_names(files)
     recipes = {name: resolve(f, overrides) for name, f in zip(names, files, strict=True)}
-    first = next(iter(recipes))
-    for name, recipe in recipes.items():
-        refuse_unequal(name, recipe, first, recipes[first], (*JUDGED, *TRAINED))
+    refuse_unequal(recipes, (*JUDGED, *TRAINED))
     return recipes
 
 
-def refuse_unequal(
-    name: str, recipe: Recipe, other: str, others: Recipe, parts: Sequence[str]
-) -> None:
-    """Raise ValueError where two recipes differ in one of `parts`, but for `OF_THE_METHOD`."""
+def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> None:
+    """Raise ValueError where two recipes differ in `sections`, except in `OF_THE_METHOD`."""
 
-    def compared(part: str, of: Recipe) -> dict[str, Any]:
-        options = of.tree[part] or {}
-        return {name: x for name, x in options.items() if f"{part}.{name}" not in OF_THE_METHOD}
+    def compared(section: str, of: Recipe) -> dict[str, Any]:
+        options = of.tree[section] or {}
+        return {name: x for name, x in options.items() if f"{section}.{name}" not in OF_THE_METHOD}
 
-    if unequal := [part for part in parts if compared(part, recipe) != compared(part, others)]:
-        raise ValueError(
-            f"{name} and {other} differ in {', '.join(unequal)}, so their figures could not be "
-            "compared; make these parts equal, or take one at a time"
-        )
+    first = next(iter(recipes))
+    for name, recipe in recipes.items():
+        unequal = [s for s in sections if compared(s, recipe) != compared(s, recipes[first])]
+        if unequal:
+            raise ValueError(
+                f"{name} and {first} differ in {', '.join(unequal)}, so their figures could not be "
+                "compared; make these parts equal, or take one at a time"
+            )
 
 
 def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry:
@@ -90,7 +97,65 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
     curves = curves_of(result.folder.checkpoint)
-    return entry_of(name, recipe, evaluation, result.model, curves=curves)
+    return entry_of(name, recipe, evaluation, result.model, describe(recipe), curves)
+
+
+def checkpoints(names: Sequence[str]) -> dict[str, Path]:
+    """The files of the models `names` (see `checkpoint_path`), by short name."""
+    return dict(zip(short_names(names), map(checkpoint_path, names), strict=True))
+
+
+def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[Entry]:
+    """The models in `files`, of `checkpoints`, on unseen scenes, or on held-out photos.
+
+    Raises as `CheckpointFile` and the data do, and ValueError where the recipes do not judge alike.
+    """
+    recipes, entries = recipes_alike(files, photos), []
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            model = file.model(choose_device(device))
+        evaluation = evaluate(model, recipes[name], trained_on=model.trained_on)
+        text = about(path) or describe(recipes[name])
+        entries.append(entry_of(name, recipes[name], evaluation, model, text, curves_of(path)))
+    return entries
+
+
+def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Recipe]:
+    """The recipes of `files`, of `checkpoints`; with the data at `photos` in place of their own.
+
+    Raises as `CheckpointFile` and the data do, and ValueError where they do not judge alike.
+    """
+    recipes = dict[str, Recipe]()
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            recipes[name] = file.recipe
+    if photos is not None:
+        recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
+    refuse_unequal(recipes, JUDGED)
+    return recipes
+
+
+def _on_photos(recipe: Recipe, photos: str) -> Recipe:
+    """`recipe` with the data at `photos`, some of them held out, in place of its own.
+
+    Data that it was not trained on has a unit of its own, so a constant `views.scale` becomes auto.
+    """
+    sources = installed_sources()
+    source, own = open_for(photos, None, recipe.data_config, sources)
+    views = {} if own or recipe.views.scale != "constant" else {"scale": "auto"}
+    kind = next(name for name, component in sources.items() if component is type(source))
+    options = source.config.model_dump(mode="json")
+    if options.get("holdout") == 0:
+        fewest = min((len(scene) for scene in source.scenes("test")), default=HOLDOUT)
+        options["holdout"] = min(HOLDOUT, fewest)
+    tree = {
+        **recipe.tree,
+        "data": {"type": kind, **options},
+        "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{kind.split("/")[0]} - {"qgs"}])],
+        "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
+        "views": {**recipe.tree["views"], **views},
+    }
+    return resolve(tree)
 
 
 def entry_of(
@@ -98,10 +163,10 @@ def entry_of(
     recipe: Recipe,
     evaluation: Evaluation,
     model: QueryGaussianModel,
-    about: str = "",
+    text: str,
     curves: Curves | None = None,
 ) -> Entry:
-    """A judged model, which moves to the CPU. about, curves: see `Contender`."""
+    """A judged model, which moves to the CPU. text: its `about`; curves: see `Contender`."""
     contender = Contender(
         name=name,
         model=model.cpu(),
@@ -109,14 +174,14 @@ def entry_of(
         gaussians=evaluation.gaussians,
         parameters=sum(p.numel() for p in model.parameters()),
         recipe=yaml.safe_dump(dict(recipe.tree), sort_keys=False, allow_unicode=True),
-        about=about or _about(recipe),
+        about=text,
         curves=curves,
     )
     return Entry(recipe, contender, evaluation)
 
 
-def _about(recipe: Recipe) -> str:
-    """What the queries are and how they read the photos, in the words of these components."""
+def describe(recipe: Recipe) -> str:
+    """The first sentence on its queries, and on the component with which they read the photos."""
     first = ("model", "decoder", "layers", "0")
     readers = (*first, "cross_attention"), (*first, "layer"), ("model", "encoder")
     reader = next(place for place in readers if place in recipe.parts)
@@ -125,12 +190,25 @@ def _about(recipe: Recipe) -> str:
     return " ".join([*(f"{part.type}: {summary_of(part.component)}" for part in chosen), *more])
 
 
-def curves_of(file: Path) -> Curves | None:
-    """NAME.history.jsonl beside NAME.safetensors, or its run's history, but for skipped steps."""
-    own, names = file.with_suffix(".history.jsonl"), ("seconds", "loss", "psnr", "step")
-    records = read_records(own if own.is_file() else file.with_name("history.jsonl"))
-    steps = [r for r in records if not r.get("skipped") and r.keys() >= set(names)]
-    return Curves(*([step[name] for step in steps] for name in names)) if steps else None
+def remarks(entries: Sequence[Entry]) -> list[str]:
+    """The remarks of all evaluations, each once with the models that it is about."""
+    models: dict[str, list[str]] = {}
+    for entry in entries:
+        for remark in entry.evaluation.remarks:
+            models.setdefault(remark, []).append(entry.contender.name)
+    texts = [f"{', '.join(names)}: {remark}." for remark, names in models.items()]
+    return [*texts, AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else texts
+
+
+def progress(files: Mapping[str, Path]) -> str:
+    """How far the training of each model in `files` has come, of the steps of its recipe."""
+    texts = []
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            step, training = file.step, file.recipe.training
+        of = "" if training.seconds else f" of {training.steps:,}"
+        texts.append(f"{name}: " + ("not known" if step is None else f"step {step:,}{of}"))
+    return "; ".join(texts)
 
 
 def baselines(entry: Entry) -> dict[str, dict[str, float | None]]:
@@ -145,8 +223,7 @@ def table_of(entries: Sequence[Entry], title: str = "Unseen scenes") -> Table:
     table = Table(title=title, caption="best in green", box=box.SIMPLE_HEAD)
     table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
-    headings = [column.title for column in columns.values()]
-    for heading in (*headings, "Gaussians", "parameters"):
+    for heading in (*(column.title for column in columns.values()), "Gaussians", "parameters"):
         table.add_column(heading, justify="right")
     best = {name: column.best(c.scores[name] for c in rows) for name, column in columns.items()}
     for c in rows:
@@ -203,11 +280,3 @@ def report_of(
             "Software": ", ".join(f"{name} {version}" for name, version in software.items()),
         },
     )
-
-
-@torch.no_grad()
-def write_examples(report: Report, target: Path) -> None:
-    """The first pictured scene as TARGET/NAME/example.ply, by every contender."""
-    for contender in report.contenders:
-        gaussians = contender.model(report.samples[0].inputs).gaussians
-        save_ply(gaussians, target / contender.name / "example.ply")

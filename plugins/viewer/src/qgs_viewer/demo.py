@@ -1,8 +1,8 @@
-"""`qgs demo`: trained models on rooms they never saw, or on photos; or a training of two."""
+"""`qgs demo` and `qgs report`: trained models side by side, or a training of two; report.html."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device
+from qgs.cli.options import Device, Photos, Runs
 
 if TYPE_CHECKING:
-    from qgs.analysis.report import Report
-    from qgs.cli.contest import Entry
+    from qgs_viewer.contest import Entry
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64")
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
+app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
+report_app = typer.Typer(help="The report page of trained models.")
 
+
+@app.command()
 def demo(
     given: Annotated[
         list[str] | None,
@@ -61,46 +64,60 @@ def demo(
         raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
-    target, console = new_folder(out), Console()
+    target = new_folder(out)
     if train:
-        _contest(given or RECIPES, 120 if seconds is None else seconds, seed or 0, target, device)
+        compare_trainings(given or RECIPES, seconds or 120, seed or 0, target, device)
     else:
-        show_trained(models, given[0] if given else None, target, console, device)
+        show_trained(models, given[0] if given else None, target, device)
+
+
+@report_app.command()
+def report(
+    runs: Runs,
+    photos: Photos = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder for the page; default: report, report-2, ...")
+    ] = None,
+    device: Device = "auto",
+) -> None:
+    """Judge trained models side by side and picture their scenes; writes report.html."""
+    show_trained(runs, photos, new_folder(out, "report"), device)
 
 
 def show_trained(
-    models: Sequence[str] | None, photos: str | None, target: Path, console: Console, device: str
+    models: Sequence[str] | None, photos: str | None, target: Path, device: str
 ) -> None:
-    """Judge `models`, those that come with qgs by default, and write their report into `target`."""
-    from qgs.cli import contest, trained
+    """Judge `models`, by default those that come with qgs, and write their report."""
+    from qgs_viewer import contest
 
+    console = Console()
     try:
-        files = trained.checkpoints(models or MODELS)
+        files = contest.checkpoints(models or MODELS)
     except FileNotFoundError as error:
         if not models:
             error.add_note("without trained models: qgs demo --train, which takes some minutes")
         raise
     scenes = "Unseen scenes" if photos is None else "Your photos"
     console.print(f"Reconstructing: {scenes.lower()}", style="dim")
-    entries = trained.judge(files, photos, device)
+    entries = contest.judge(files, photos, device)
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
     elif models:
         lede = "Trained models, judged on the test split of their recipe."
-    told = trained.remarks(entries) if photos is not None else []
-    facts = {"Training": trained.progress(files)}
-    report = contest.report_of(entries, lede, facts, scenes, told)
-    for sentence in told:
-        console.print(sentence, soft_wrap=True, highlight=False, markup=False)
-    console.print(contest.table_of(entries, scenes))
-    console.print(f"Training: {facts['Training']}", soft_wrap=True, highlight=False, style="dim")
-    _write(report, entries, target, console)
+    notes = contest.remarks(entries) if photos is not None else []
+    for note in notes:
+        console.print(note, soft_wrap=True, highlight=False, markup=False)
+    facts = {"Training": contest.progress(files)}
+    _write(entries, lede, facts, target, console, scenes, notes)
 
 
-def _contest(recipes: Sequence[str], seconds: float, seed: int, target: Path, device: str) -> None:
-    from qgs.cli import contest
+def compare_trainings(
+    recipes: Sequence[str], seconds: float, seed: int, target: Path, device: str
+) -> None:
+    """Train `recipes` one after the other under one budget, and write their report."""
     from qgs.engine.guard import TrainingError
+    from qgs_viewer import contest
 
     console = Console()
     resolved = contest.resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
@@ -112,29 +129,44 @@ def _contest(recipes: Sequence[str], seconds: float, seed: int, target: Path, de
         except TrainingError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
-    console.print(contest.table_of(entries))
     facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}
     lede = "Trained by one command on the same scenes, judged on scenes that none of them saw."
-    report = contest.report_of(entries, lede, facts)
-    _write(report, entries, target, console)
+    _write(entries, lede, facts, target, console)
 
 
-def _write(report: Report, entries: Sequence[Entry], target: Path, console: Console) -> None:
-    """The report and an example of every model, and where they are."""
-    from qgs.analysis.report import report_html
-    from qgs.cli import contest
+def _write(
+    entries: Sequence[Entry],
+    lede: str,
+    facts: Mapping[str, str],
+    target: Path,
+    console: Console,
+    scenes: str = "Unseen scenes",
+    notes: Sequence[str] = (),
+) -> None:
+    """Show the table; write the report and, by every model, the first scene as a PLY."""
+    import torch
+
     from qgs.io.files import write_text
+    from qgs.io.ply import save_ply
+    from qgs_viewer import contest
+    from qgs_viewer.report import report_html
 
+    console.print(contest.table_of(entries, scenes))
+    for name, fact in facts.items():
+        console.print(f"{name}: {fact}", soft_wrap=True, highlight=False, style="dim")
     console.print("Writing the report", style="dim")
+    report = contest.report_of(entries, lede, facts, scenes, notes)
     page = target / "report.html"
     write_text(page, report_html(report))
-    contest.write_examples(report, target)
     console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)
-    for entry in entries:
-        run = target / entry.contender.name
+    for contender in report.contenders:
+        run = target / contender.name
+        with torch.no_grad():
+            gaussians = contender.model(report.samples[0].inputs).gaussians
+        save_ply(gaussians, run / "example.ply")
         files = run / "checkpoint.safetensors", run / "example.ply"
         there = ", ".join(str(file) for file in files if file.is_file())
-        console.print(f"{entry.contender.name}: {there}", soft_wrap=True)
+        console.print(f"{contender.name}: {there}", soft_wrap=True)
     console.print("Next:")
     for command, what in report.commands.items():
         console.print(f"  {command}  {what}", soft_wrap=True, highlight=False)

@@ -1,34 +1,37 @@
 """report.html: what was trained and how it compares, in one self-contained page."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any
 
 import torch
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
-from qgs.analysis.reconstruction import orbit_path
+from qgs.analysis.saving import orbit_path
 from qgs.analysis.trace import trace
 from qgs.contracts import Column, LearnedQueries
 from qgs.data.sampling import Sample
 from qgs.data.scenes import warn_once
-from qgs.drawing.figures import Curves, curves_figure, figure_picture, hex_color
+from qgs.drawing.figures import figure_picture, hex_color
 from qgs.drawing.images import (
     Picture,
     checked,
-    color_error,
     data_uri,
     depth_picture,
     depth_range,
     enlarged,
-    error_picture,
     finer,
     rgb_picture,
     side_by_side,
 )
-from qgs.drawing.queries import (
+from qgs.drawing.pages import page_environment
+from qgs.metrics.images import Psnr, psnr
+from qgs.model import QueryGaussianModel
+from qgs.types import Prediction
+from qgs_viewer.curves import Curves, curves_figure
+from qgs_viewer.pictures import color_error, error_picture
+from qgs_viewer.queries import (
     DrawnQuery,
     attention_pictures,
     notable_queries,
@@ -36,9 +39,6 @@ from qgs.drawing.queries import (
     query_picture,
     support_picture,
 )
-from qgs.metrics.images import Psnr, psnr
-from qgs.model import QueryGaussianModel
-from qgs.types import Prediction
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def report_html(report: Report) -> str:
         pictured_scene([(c, predictions[number]) for c, predictions in shown], sample, depth)
         for number, (sample, depth) in enumerate(zip(samples, report.depths, strict=True))
     ]
-    environment = page_environment(uri=data_uri, hex=hex_color)
+    environment = page_environment("qgs_viewer", uri=data_uri, hex=hex_color)
     template = environment.get_template("report.html")
     sections = [section for section in sections if section.figures]
     return template.render(report=report, scenes=scenes, sections=sections)
@@ -160,19 +160,6 @@ def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[Report
                 f"the report does without the section `{entry.name}` of {release}, `{entry.value}`"
                 f" fails: {type(error).__name__}: {error}; update {release}, or uninstall it"
             )
-
-
-def page_environment(*packages: str, **filters: Callable[..., str]) -> Environment:
-    """Jinja for pages whose templates are in `packages`, or else in qgs.analysis."""
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader(p, "template") for p in (*packages, "qgs.analysis")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(filters)
-    return environment
 
 
 def pictured_scene(

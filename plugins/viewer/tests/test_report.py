@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 from commands import MODEL
+from qgs_viewer.curves import Curves
+from qgs_viewer.pictures import error_picture
+from qgs_viewer.report import GROUP, Contender, Report, report_html
 
-from qgs.analysis.report import GROUP, Contender, Report, report_html
 from qgs.composer import resolve
 from qgs.contracts import Column
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.data.scenes import warn_once
-from qgs.drawing.figures import Curves
-from qgs.drawing.images import EXACT, data_uri, error_picture
+from qgs.drawing.images import EXACT, data_uri
 
 PLAIN = {
     "recipe": 1,
@@ -33,7 +34,7 @@ PLAIN = {
 def _only_sections_of_the_test(monkeypatch):
     """Whether the viewer is installed makes no difference."""
     monkeypatch.setattr(
-        "qgs.analysis.report.entry_points",
+        "qgs_viewer.report.entry_points",
         lambda group: [e for e in entry_points(group=group) if e.module.startswith("_test_")],
     )
 
@@ -176,7 +177,7 @@ def test_pictures_are_in_the_page_and_have_words():
 
 OFFERED = """
 import numpy as np
-from qgs.analysis.report import ReportSection, Tile
+from qgs_viewer.report import ReportSection, Tile
 
 GREY = np.full((4, 6, 3), 128, np.uint8)
 
@@ -199,7 +200,7 @@ def test_a_distribution_adds_a_section_with_a_page(install):
 
 
 SEVERAL = """
-from qgs.analysis.report import ReportSection, Tile
+from qgs_viewer.report import ReportSection, Tile
 import numpy as np
 
 def plugin(shown, samples):

@@ -9,11 +9,18 @@ from commands import MODEL, run_qgs
 from photo_formats import row_of_frames
 from PIL import Image
 from plyfile import PlyData
+from qgs_viewer.contest import (
+    WINDOWS,
+    checkpoints,
+    describe,
+    judge,
+    remarks,
+    resolve_fairly,
+)
+from qgs_viewer.curves import curves_of
+from qgs_viewer.demo import new_folder
 
 import qgs
-from qgs.cli.contest import _about, curves_of, resolve_fairly
-from qgs.cli.demo import new_folder
-from qgs.cli.trained import WINDOWS, checkpoints, judge, remarks
 from qgs.composer import resolve
 from qgs.data.domain import KEY, trained_domain
 from qgs.engine.guard import CollapseError
@@ -68,7 +75,7 @@ def test_all_systems_can_be_compared():
     compared = resolve_fairly([Path(f"tiny/{n}.yaml") for n in names], seconds=1, seed=0)
     assert [*compared] == [*names]
     assert compared["c3g"].training.judge_inputs
-    assert _about(compared["c3g"]).endswith("Trained on its input views too.")
+    assert describe(compared["c3g"]).endswith("Trained on its input views too.")
 
 
 def test_budget_and_seed_are_those_asked_for(recipes):
@@ -240,7 +247,7 @@ def test_words_without_meaning_are_refused(words, told, tmp_path, monkeypatch):
 
 
 def test_without_the_models_that_come_with_qgs_training_is_pointed_to(tmp_path, monkeypatch):
-    monkeypatch.setattr("qgs.cli.demo.MODELS", ("rooms/gone-64",))
+    monkeypatch.setattr("qgs_viewer.demo.MODELS", ("rooms/gone-64",))
     error = run_qgs("demo", "--out", tmp_path / "demo").exception
     assert "qgs demo --train" in error.__notes__[0]
 
@@ -258,7 +265,7 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("depth", "reader"), [(0, "qgs/multiview_vit: "), (1, "qgs/content: ")])
 def test_a_model_is_told_by_its_queries_and_by_what_reads_the_photos(depth, reader):
     model = {"decoder": {"depth": depth}, "supervision": {"layers": [depth]}}
-    told = _about(resolve({"recipe": 1, "model": model}))
+    told = describe(resolve({"recipe": 1, "model": model}))
     assert told.startswith("qgs/latent: ")
     assert reader in told
 
@@ -267,7 +274,7 @@ def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch
     def collapse(*_):
         raise CollapseError("training collapsed at step 7")
 
-    monkeypatch.setattr("qgs.cli.contest.compete", collapse)
+    monkeypatch.setattr("qgs_viewer.contest.compete", collapse)
     out = tmp_path / "demo"
     result = run_qgs("demo", "--train", recipes[0], "--out", out)
     assert result.exit_code == 1

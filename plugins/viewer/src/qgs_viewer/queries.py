@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from qgs.drawing.figures import INK, Color, categorical
-from qgs.drawing.images import NOTHING, Picture, enlarged, rgb_picture, washed
+from qgs.drawing.images import NOTHING, Picture, enlarged, rgb_picture
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics.dispersion import token_dispersion
@@ -61,6 +61,13 @@ def project_support(support: SpatialSupport, cameras: Cameras) -> Ellipses:
     in_front = torch.where(depths[:, None] > 0, centers_N3, centers_N3.new_tensor([0, 0, 1]))
     points = to_pixels(in_front, cameras.intrinsics[0, 0])
     return Ellipses(centers, axes, points, depths, whole)
+
+
+def washed(picture: Picture, strength: float = 0.6) -> Picture:
+    """Greys, lightened towards white by `strength`: a ground to draw on."""
+    grey = picture.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    light = 255 - (255 - grey) * (1 - strength)
+    return np.repeat(light[..., None], 3, -1).round().astype(np.uint8)
 
 
 def _oversampled(picture: Picture) -> Image.Image:

@@ -1,8 +1,24 @@
-"""A small picture of a model: from views over queries and decoder layers to Gaussians."""
+"""Pictures of models and predictions in notebooks, for all once this module is imported.
+
+A model shows the way from views over queries and decoder layers to Gaussians, a prediction its
+scene and depth.
+"""
 
 from collections.abc import Mapping
 from html import escape
 
+import torch
+
+from qgs.analysis.shown import heading, parameter_counts, slot_rows
+from qgs.contracts import LearnedQueries
+from qgs.drawing.images import depth_picture, depth_range, png_bytes, rgb_picture, side_by_side
+from qgs.model import QueryGaussianModel
+from qgs.renderers import AutoRenderer
+from qgs.types import Cameras, Prediction
+
+SIDE = 192  # pixels of the picture of a prediction
+OUTSIDE = 0.04  # share of the Gaussians that it may leave out at its sides
+WIDEST = 1.2  # tangent of half the widest view
 LETTER, LINE, PAD, GAP = 6.7, 16, 8, 34
 """Pixels: a letter's width, a line's height, space around text, the length of arrows."""
 
@@ -52,3 +68,39 @@ def pipeline_svg(
         f'width="{left - GAP + 2:.0f}" fill="currentColor" stroke="currentColor" '
         f'style="max-width:100%;font:11px ui-monospace,monospace">{"".join(parts)}</svg>'
     )
+
+
+def model_html(model: QueryGaussianModel) -> str:
+    """A picture of the way from views to Gaussians, and the same as a table."""
+    rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in slot_rows(model)]
+    kinds = {slot: kind for slot, kind, _ in slot_rows(model)}
+    learned = isinstance(model.queries, LearnedQueries)
+    picture = pipeline_svg(kinds, parameter_counts(model), model.depth, learned)
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    head = "<tr><th>slot</th><th>component</th><th>parameters</th></tr>"
+    return f"<p>{escape(heading(model))}</p>{picture}<table>{head}{body}</table>"
+
+
+@torch.no_grad()
+def prediction_png(prediction: Prediction) -> bytes | None:
+    """The first scene and its depth from the origin of its world; None if nothing lies before it.
+
+    There stands the first input camera, or the mean of all, whichever the recipe says.
+    """
+    gaussians, means = prediction.gaussians[:1], prediction.gaussians.means[0].float()
+    if means.is_meta or not means.isfinite().all():
+        return None
+    before = means[(means[:, 2] > 0) & (gaussians.opacities[0] > 0.05)]
+    if len(before) == 0:
+        return None
+    slopes = (before[:, :2] / before[:, 2:]).abs().amax(-1)
+    focal = SIDE / 2 / float(slopes.quantile(1 - OUTSIDE).clamp(0.1, WIDEST))
+    lens = means.new_tensor([[[focal, focal, SIDE / 2, SIDE / 2]]])
+    camera = Cameras(torch.eye(4).to(means)[None, None], lens, (SIDE, SIDE))
+    seen = AutoRenderer(AutoRenderer.Config())(gaussians, camera)
+    depth = depth_picture(seen.depth[0, 0], *depth_range(seen.depth))
+    return png_bytes(side_by_side([rgb_picture(seen.rgb[0, 0]), depth]))
+
+
+QueryGaussianModel._repr_html_ = model_html  # type: ignore[attr-defined]
+Prediction._repr_png_ = prediction_png  # type: ignore[attr-defined]

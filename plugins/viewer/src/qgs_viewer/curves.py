@@ -1,0 +1,50 @@
+"""Curves of a training: loss and PSNR, by seconds or by steps."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from qgs.drawing.figures import MUTED, categorical, figure_style, hex_color, running_mean
+from qgs.io.files import read_records
+from qgs.metrics.images import Psnr
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What training reported: seconds since its start, loss, PSNR of supervised views, steps."""
+
+    seconds: Sequence[float]
+    loss: Sequence[float]
+    psnr: Sequence[float]
+    steps: Sequence[float]
+
+
+def curves_figure(curves: Mapping[str, Curves]) -> Figure:
+    """Loss and PSNR by time, by steps where one took over two hours; running means are strong."""
+    long = max(max(run.seconds) for run in curves.values()) > 7200  # with pauses, other work
+    with figure_style():
+        figure = Figure(figsize=(8.4, 2.9), layout="constrained")
+        loss_axis, psnr_axis = figure.subplots(1, 2)
+        for index, (name, run) in enumerate(curves.items()):
+            color, place = hex_color(categorical(index)), run.steps if long else run.seconds
+            for axis, values in ((loss_axis, run.loss), (psnr_axis, run.psnr)):
+                axis.plot(place, values, color=color, alpha=0.18, linewidth=0.7)
+                axis.plot(place, running_mean(values), color=color, label=name)
+        loss_axis.set(title="Training loss", xlabel="steps" if long else "seconds", yscale="log")
+        title = f"{Psnr.column.heading} of the training views, {Psnr.column.unit}"
+        psnr_axis.set(title=title, xlabel=loss_axis.get_xlabel())
+        psnr_axis.legend(loc="lower right")
+        loss_axis.yaxis.set_major_formatter("{x:g}")
+        loss_axis.yaxis.set_minor_formatter("{x:g}")
+        loss_axis.tick_params(which="minor", color=hex_color(MUTED), labelsize=7)
+    return figure
+
+
+def curves_of(file: Path) -> Curves | None:
+    """Of NAME.history.jsonl beside NAME.safetensors, or of its run; without skipped steps."""
+    own, names = file.with_suffix(".history.jsonl"), ("seconds", "loss", "psnr", "step")
+    records = read_records(own if own.is_file() else file.with_name("history.jsonl"))
+    steps = [r for r in records if not r.get("skipped") and r.keys() >= set(names)]
+    return Curves(*([step[name] for step in steps] for name in names)) if steps else None
