@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from qgs_viewer.notebook import model_html, prediction_png
+from qgs_viewer.notebook import model_html, prediction_png, show_pictures
 from small import model_of, sample_of
 
 import qgs
@@ -16,6 +16,8 @@ from qgs.composer import resolve
 from qgs.types import Gaussians
 
 SPACE = "{http://www.w3.org/2000/svg}"
+
+show_pictures()
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -1,8 +1,4 @@
-"""Pictures of models and predictions in notebooks, for all once this module is imported.
-
-A model shows the way from views over queries and decoder layers to Gaussians, a prediction its
-scene and depth.
-"""
+"""Pictures in notebooks: of a model its way from views to Gaussians, of a prediction its scene."""
 
 from collections.abc import Mapping
 from html import escape
@@ -102,5 +98,7 @@ def prediction_png(prediction: Prediction) -> bytes | None:
     return png_bytes(side_by_side([rgb_picture(seen.rgb[0, 0]), depth]))
 
 
-QueryGaussianModel._repr_html_ = model_html  # type: ignore[attr-defined]
-Prediction._repr_png_ = prediction_png  # type: ignore[attr-defined]
+def show_pictures() -> None:
+    """Have notebooks show models and predictions as pictures from now on."""
+    QueryGaussianModel._repr_html_ = model_html  # type: ignore[attr-defined]
+    Prediction._repr_png_ = prediction_png  # type: ignore[attr-defined]
