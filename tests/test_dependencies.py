@@ -27,6 +27,7 @@ PLUGINS = (
     "c3g",
     "gslrm",
     "globalsplat",
+    "tokengs2026",
     "rooms",
     "datatools",
     "viewer",

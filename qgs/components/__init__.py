@@ -9,11 +9,8 @@ from qgs.components.decoder import (
     MlpFeedForward,
     NoRefinement,
 )
-from qgs.components.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
-from qgs.components.latents import LatentBottleneck
-from qgs.components.multiscale import MultiscaleViT
 from qgs.components.objective import OnePass
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
@@ -24,13 +21,8 @@ from qgs.kernels.attention_bias import AttentionBias, Kernel
 
 COMPONENTS: tuple[type[Component], ...] = (
     MultiViewViT,
-    MultiscaleViT,
-    LatentBottleneck,
     LatentQueries,
-    DynamicQueries,
     CrossSelfMlp,
-    BlockCausalSelfAttention,
-    DynamicObjective,
     ContentCrossAttention,
     ContentSelfAttention,
     MlpFeedForward,
@@ -48,24 +40,19 @@ __all__ = [
     "NORM_EPS",
     "TOKENGS",
     "AttentionBias",
-    "BlockCausalSelfAttention",
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",
     "CrossSelfMlp",
-    "DynamicObjective",
-    "DynamicQueries",
     "FreeCenters",
     "GaussianHead",
     "Kernel",
-    "LatentBottleneck",
     "LatentQueries",
     "LayerScale",
     "LayerSupervision",
     "Mlp",
     "MlpFeedForward",
     "MultiViewViT",
-    "MultiscaleViT",
     "NoRefinement",
     "OffsetCenters",
     "OneCycleAdamW",

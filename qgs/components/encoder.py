@@ -1,6 +1,6 @@
 """ViTs over the patches of all views together; `qgs/multiview_vit` (TokenGS release)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import torch
 from einops import rearrange, repeat
@@ -8,8 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
-from qgs.components.times import TimeEmbedding, without_times
-from qgs.contracts import ModelDims, PatchEncoder, Problem, RecipeContext
+from qgs.contracts import ModelDims, PatchEncoder
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
 
@@ -64,8 +63,6 @@ class PatchViT(PatchEncoder):
         """Hidden width of the MLPs (rounded down) over the model's width."""
         layer_scale: float = Field(default=0.01, gt=0)
         """Initial value of every LayerScale factor of the encoder."""
-        time_channels: int = Field(default=0, ge=0, multiple_of=2)
-        """Numbers that the time of a photo is embedded as; 0 for photos without times."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
         """Added to the variance by every LayerNorm."""
 
@@ -76,17 +73,10 @@ class PatchViT(PatchEncoder):
         patch, eps = config.patch_size, config.norm_eps
         self.rgb_embedding = PatchEmbedding(3, dims.width, patch, eps)
         self.ray_embedding = PatchEmbedding(6, dims.width, patch, eps)
-        if config.time_channels:
-            self.time_embedding = TimeEmbedding(config.time_channels, dims.width, patch)
         self.blocks = nn.ModuleList(
             EncoderBlock(dims.width, dims.heads, config.mlp_ratio, config.layer_scale, eps)
             for _ in range(config.depth)
         )
-
-    @classmethod
-    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        yield from without_times(config.time_channels, context)
-        yield from super().problems(config, context)
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Weights of smaller patches serve larger ones, if their side is a multiple.
@@ -95,25 +85,14 @@ class PatchViT(PatchEncoder):
         """
         own = self.state_dict()
         return {
-            name: _larger(kernel, own[name].shape[-1]) if name in _PATCH_KERNELS else kernel
+            name: _larger(kernel, own[name].shape[-1]) if name.endswith(_KERNEL) else kernel
             for name, kernel in learned.items()
         }
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
-        """Views (B, V) and their Plücker maps (B, V, 6, H, W) -> (B, M, D).
-
-        Raises ValueError for views without times where these are to be embedded.
-        """
+        """Views (B, V) and their Plücker maps (B, V, 6, H, W) -> (B, M, D)."""
         x_XPD = self.rgb_embedding(imagenet_normalised(views.images).flatten(0, 1))
         x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
-        if self.config.time_channels:
-            if views.times is None:
-                raise ValueError(
-                    "this encoder reads the times of photos and these have none: give each frame "
-                    "of their transforms file a 'time' and pack chunks again, give the views times "
-                    "(B, V), or set model.encoder.time_channels to 0"
-                )
-            x_XPD = x_XPD + self.time_embedding(views.times).flatten(0, 1)[:, None]
         return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=len(views.images))
 
 
@@ -149,7 +128,8 @@ def keys_and_values(
     return k_norm(split_heads(k_BMD, heads)).to(v_BhMd.dtype), v_BhMd
 
 
-_PATCH_KERNELS = tuple(f"{name}_embedding.proj.weight" for name in ("rgb", "ray", "time"))
+_KERNEL = "_embedding.proj.weight"
+"""How names of patch embeddings' kernels end."""
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:

@@ -35,7 +35,6 @@ BUILTIN = Plugin(
     ),
     layouts=(qgs.components.TOKENGS,),
     examples=(
-        qgs.components.LatentBottleneck.Config(depth=2, blocks=(1, 2), latents=6, latent_depth=2),
         qgs.components.LayerSupervision.Config(layers=(1, 2)),
         qgs.data.ChunksSource.Config(path="chunks"),  # type: ignore[call-arg]
         qgs.data.Dl3dvSource.Config(path="dl3dv"),  # type: ignore[call-arg]

@@ -101,7 +101,7 @@ class EvaluationConfig(ComponentConfig):
     """Name of these settings in tables; null takes the name of the index file."""
     tuning: Tuned = "queries"
     """What tuning fits to a scene's input views: its queries, or the features of its image memory,
-    with an encoder that makes keys and values of them anew (qgs/latent_bottleneck)."""
+    with an encoder that makes keys and values of them anew."""
     tuning_steps: int = Field(default=0, ge=0)
     """Steps of tuning on the input views of each scene before it is judged, with the recipe's
     photometric loss (TokenGS: 50); 0 for none."""

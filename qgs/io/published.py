@@ -116,7 +116,9 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
 def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
     """The layout, of any installed plugin, that a state dict is of; and all that there are."""
     layouts = _layouts(load_sound_plugins()[0].plugins.values())
-    return next((layout for layout in layouts if set(layout.marks) <= set(shapes)), None), layouts
+    found = [layout for layout in layouts if set(layout.marks) <= set(shapes)]
+    # A codebase's later release has all names of the earlier one.
+    return max(found, key=lambda layout: len(layout.marks), default=None), layouts
 
 
 def without_prefix(file: WeightFile) -> WeightFile:

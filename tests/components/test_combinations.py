@@ -16,7 +16,7 @@ from qgs.contracts import Component, ComponentConfig, FieldSpec
 
 SLOTS = ("queries", "cross_attention", "self_attention", "refinement", "centers", "supervision")
 LAYER = SLOTS[1:4]
-REGISTRY = load_registry(["locus"])
+REGISTRY = load_registry(["locus", "tokengs2026"])
 DEPTH = 2
 SIZES = (Sizes(), Sizes(batch=1, views=3, image=(24, 16)))
 """Of the views that every combination runs with."""
@@ -89,7 +89,7 @@ def _recipe(chosen: dict[str, Choice]) -> dict[str, Any]:
 
     return {
         "recipe": 1,
-        "plugins": ["locus"],
+        "plugins": ["locus", "tokengs2026"],
         "model": {
             "width": 32,
             "heads": 2,
@@ -164,8 +164,8 @@ def test_a_combination_of_options_runs_or_is_refused(parts: tuple[Choice, ...]) 
 
 ENCODERS = {
     "qgs/multiview_vit": {"depth": 1},
-    "qgs/multiscale_vit": {"depth": 2, "blocks": [1, 2]},
-    "qgs/latent_bottleneck": {"depth": 1, "blocks": [1], "latents": 4, "latent_depth": 1},
+    "tokengs2026/multiscale_vit": {"depth": 2, "blocks": [1, 2]},
+    "tokengs2026/latent_bottleneck": {"depth": 1, "blocks": [1], "latents": 4, "latent_depth": 1},
 }
 
 
@@ -181,8 +181,8 @@ def test_an_encoder_runs_with_all_that_need_no_rays(
     recipe = _recipe(chosen)
     recipe["model"]["encoder"] = {"type": encoder, **ENCODERS[encoder]}
     needed = chosen["cross_attention"][1].fields_read(chosen["cross_attention"][2])
-    if encoder == "qgs/latent_bottleneck" and "memory.patch_rays" in needed:
-        with pytest.raises(RecipeError, match=r"needs memory.patch_rays .*qgs/latent_bottleneck"):
+    if encoder == "tokengs2026/latent_bottleneck" and "memory.patch_rays" in needed:
+        with pytest.raises(RecipeError, match=r"needs memory.patch_rays .*latent_bottleneck"):
             resolve(recipe)
     else:
         run_training_step(resolve(recipe), Case(chosen["queries"][2]))

@@ -47,20 +47,8 @@ CONTENT = [f"{CROSS}={{type: qgs/content}}", f"{OWN}={{type: qgs/content}}"]
 FREE, OFFSET = "model.centers={type: qgs/free}", "model.centers={type: locus/anchor_offset}"
 FIXED = f"{CROSS}.bandwidth=fixed"
 NORM = "model.head.norm=true"
-READ = "depth: 1, blocks: [1], layer_scale: 0.5"
-MULTISCALE = f"model.encoder={{type: qgs/multiscale_vit, {READ}}}"
-LATENTS = f"model.encoder={{type: qgs/latent_bottleneck, latents: 5, latent_depth: 1, {READ}}}"
-
-DYNAMIC = (
-    *CONTENT,
-    "model.queries={type: qgs/dynamic, count: 8, dynamic: 3, std: 1.0, time_channels: 0}",
-    f"{OWN}={{type: qgs/block_causal}}", f"{REFINE}={{type: qgs/none}}", FREE,
-)  # fmt: skip
-
 LIMITS: list[tuple[str, tuple[str, ...], float, float, tuple[str, ...]]] = [
     ("multiview_vit", ("model.encoder.norm_eps",), 1e-5, 0.1, ()),
-    ("multiscale_vit", ("model.encoder.norm_eps",), 1e-5, 0.1, (MULTISCALE,)),
-    ("latent_bottleneck", ("model.encoder.norm_eps",), 1e-5, 0.1, (LATENTS, *CONTENT)),
     ("anchored", tuple(RADIUS_MIN), 1e-3, 3.0, ()),
     ("ray_biased", (f"{CROSS}.sigma0",), 0.1, 0.5, ()),
     ("ray_biased", (f"{CROSS}.sigma0",), 0.1, 0.5, (FIXED,)),
@@ -73,7 +61,6 @@ LIMITS: list[tuple[str, tuple[str, ...], float, float, tuple[str, ...]]] = [
     ("anchor_aware", (f"{OWN}.norm_eps",), 1e-5, 0.1, ()),
     ("content", (f"{CROSS}.norm_eps",), 1e-5, 0.1, tuple(CONTENT)),
     ("content", (f"{OWN}.norm_eps",), 1e-5, 0.1, tuple(CONTENT)),
-    ("block_causal", (f"{OWN}.norm_eps",), 1e-5, 0.1, DYNAMIC),
     ("mlp", (f"{FEED}.norm_eps",), 1e-5, 0.1, ()),
     ("refine", (f"{REFINE}.input_limit",), 100.0, 0.01, ()),
     ("refine", (f"{REFINE}.output_limit",), 1000.0, 0.01, ()),
@@ -106,7 +93,7 @@ LOSS_LIMITS: list[tuple[str, str, float, float, dict[str, Any]]] = [
 
 BEGINNINGS = {
     "std", "init_std", "position_std", "layer_scale", "init_radius", "gamma_init", "weight",
-    "mse_weight", "l1_weight", "ssim_weight", "ratio", "mlp_ratio", "latent_std", "z_init",
+    "mse_weight", "l1_weight", "ssim_weight", "ratio", "mlp_ratio", "z_init",
 }  # fmt: skip
 """Numbers that say how training starts, what it weighs or how wide a layer is."""
 

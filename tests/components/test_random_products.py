@@ -17,7 +17,7 @@ from qgs.composer.yaml_text import inline
 from qgs.contracts import Component
 from qgs.engine.objective import TrainingPass
 
-PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat"]
+PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "tokengs2026"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")
 DRAWN = ("encoder", "queries", *LAYER, "head", "centers", "objective", "losses")
 DRAWS, LEAST = 300, 60
@@ -31,15 +31,15 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 """In place of the defaults of options of these names."""
 
-BLOCKS = {"qgs/multiview_vit": 0, "qgs/multiscale_vit": 2, "gslrm/transformer": 1}
+BLOCKS = {"qgs/multiview_vit": 0, "tokengs2026/multiscale_vit": 2, "gslrm/transformer": 1}
 NOT_DRAWN = {"qgs/lpips"}
 """What needs weights from elsewhere; `c3g/vggt_features`, which does too, has no example."""
 
 PUBLISHED: tuple[dict[str, str], ...] = (
     {},
-    {"encoder": "qgs/multiscale_vit"},
-    {"encoder": "qgs/latent_bottleneck", "queries": "qgs/dynamic",
-     "self_attention": "qgs/block_causal", "objective": "qgs/dynamic"},
+    {"encoder": "tokengs2026/multiscale_vit"},
+    {"encoder": "tokengs2026/latent_bottleneck", "queries": "tokengs2026/dynamic",
+     "self_attention": "tokengs2026/block_causal", "objective": "tokengs2026/dynamic"},
     {"queries": "locus/anchored", "cross_attention": "locus/ray_biased",
      "self_attention": "locus/anchor_aware", "refinement": "locus/refine",
      "centers": "locus/radius_scaled", "losses": "locus/anchor_visibility"},
@@ -79,7 +79,7 @@ def _component(random: random.Random, slot: str, kind: str) -> dict[str, Any]:
     component, given = random.choice(CHOICES[slot][kind])
     fields = component.Config.model_fields
     small = SMALL | ({"depth": BLOCKS[kind]} if kind in BLOCKS else {})
-    if kind == "qgs/multiscale_vit":
+    if kind == "tokengs2026/multiscale_vit":
         small |= {"blocks": random.choice([[1, 2], [2]])}
     options = {**{n: value for n, value in small.items() if n in fields}, **given}
     if "memory_width" in options or (slot == "layer" and "memory_width" in fields):

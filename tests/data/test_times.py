@@ -169,10 +169,11 @@ def test_chunks_keep_times(tmp_path: Path) -> None:
 
 
 DYNAMIC = (
-    "model.encoder.time_channels=2",
-    "model.queries={type: qgs/dynamic, count: 64, dynamic: 16, std: 0.3, time_channels: 2}",
-    "model.decoder.self_attention={type: qgs/block_causal}",
-    "objective={type: qgs/dynamic, weight: 0.3}",
+    "plugins=[rooms, tokengs2026]",
+    "model.encoder={type: tokengs2026/multiscale_vit, depth: 2, blocks: [2], time_channels: 2}",
+    "model.queries={type: tokengs2026/dynamic, count: 64, dynamic: 16, std: 0.3, time_channels: 2}",
+    "model.decoder.self_attention={type: tokengs2026/block_causal}",
+    "objective={type: tokengs2026/dynamic, weight: 0.3}",
     "views.scale=constant",
     "training.steps=2",
     "training.seconds=null",
@@ -188,7 +189,7 @@ def test_a_dynamic_model_trains_on_photos_with_times(tmp_path: Path) -> None:
     recipe = resolve("tiny/tokengs.yaml", [*DYNAMIC, data])
     result = run(recipe, tmp_path / "run")
     assert result.steps == 2
-    with pytest.raises(RecipeError, match="the data of this recipe tell no times"):
+    with pytest.raises(RecipeError, match="the data of this recipe have no times"):
         resolve("tiny/tokengs.yaml", [*DYNAMIC])
 
 

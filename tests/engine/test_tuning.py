@@ -97,13 +97,14 @@ def test_a_forward_pass_starts_from_the_given_state(tiny: Tiny) -> None:
 
 
 LATENTS = (
-    "model.encoder={type: qgs/latent_bottleneck, depth: 1, blocks: [1], latents: 12, "
-    "latent_depth: 1, patch_size: 8, layer_scale: 0.3}"
+    "plugins=[tokengs2026]",
+    "model.encoder={type: tokengs2026/latent_bottleneck, depth: 1, blocks: [1], latents: 12, "
+    "latent_depth: 1, patch_size: 8, layer_scale: 0.3}",
 )
 
 
 def test_latents_are_tuned_and_nothing_else(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", LATENTS, "evaluation.tuning=latents")
+    recipe = tiny("tokengs", *LATENTS, "evaluation.tuning=latents")
     assert recipe.evaluation.rate == 1e-2
     model, inputs = model_and_inputs(recipe)
     before = {key: tensor.clone() for key, tensor in model.state_dict().items()}

@@ -64,12 +64,12 @@ LATENT = [
     ({"num_latents": 5}, {"encoder.latents": 5}),
     ({"latent_cross_attn_depth": 5}, {"encoder.latent_depth": 5}),
     ({"use_multiscale_encoder": False}, {"encoder.blocks": [4]}),
-    ({"use_latent_bottleneck": False}, {"encoder.type": "qgs/multiscale_vit"}),
+    ({"use_latent_bottleneck": False}, {"encoder.type": "tokengs2026/multiscale_vit"}),
 ]
 DYNAMIC = [
     (
         {"num_dynamic_gs_tokens": 3},
-        {"queries.count": 15, "queries.dynamic": 3, "queries.type": "qgs/dynamic"},
+        {"queries.count": 15, "queries.dynamic": 3, "queries.type": "tokengs2026/dynamic"},
     ),
     ({"num_dynamic_gs_tokens": 0}, {"decoder.self_attention.type": "qgs/content"}),
     ({"time_embedding_dim": 6}, {"encoder.time_channels": 6, "queries.time_channels": 6}),

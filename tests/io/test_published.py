@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from golden_weights import published
+from qgs_tokengs2026.weights import TOKENGS_2026_6
 from safetensors.torch import load_file, save, save_file
 from torch import Tensor
 
@@ -101,7 +102,7 @@ def test_a_latent_checkpoint_gives_the_recipe_of_its_preset(
     theirs = published_shapes(recipe)
     assert theirs["enc_dec_backbone.latents"][0] == sizes.get("encoder.latents", 4096)
     layout, tree = fitting_recipe(theirs, "file")
-    assert layout is TOKENGS
+    assert layout is TOKENGS_2026_6
     read = resolve(tree)
     models = ({"model": one.tree["model"]} for one in (recipe, read))
     assert differing_predictions(*models) == {}
@@ -115,19 +116,6 @@ def test_a_readout_of_more_blocks_than_there_are_fits_no_recipe() -> None:
     shapes |= {f"enc_dec_backbone.multiscale_norms.{n}.weight": (32,) for n in range(2, 5)}
     with pytest.raises(PublishedError, match="5 norms"):
         fitting_recipe(shapes, "file")
-
-
-def test_latents_of_the_last_block_are_read_once_its_norm_is_renamed() -> None:
-    """The release with `use_multiscale_encoder: False`, which parity is checked with."""
-    recipe = resolve(RECIPES / "tokengs/latent_2views_ssim.yaml", [*SMALL, "model.encoder.depth=1",
-                     "model.encoder.blocks=[1]", "model.supervision.layers=[2]"])  # fmt: skip
-    renamed = published_shapes(recipe)
-    one, other = "enc_dec_backbone.multiscale_norms.0", "enc_dec_backbone.encoder_norm"
-    shapes = {name.replace(one, other): shape for name, shape in renamed.items()}
-    with pytest.raises(PublishedError, match=other):
-        fitting_recipe(shapes, "file")
-    encoder = resolve(fitting_recipe(renamed, "file")[1]).tree["model"]["encoder"]
-    assert (encoder["type"], encoder["blocks"]) == ("qgs/latent_bottleneck", [1])
 
 
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("ablations/*.yaml")), ids=lambda p: p.stem)

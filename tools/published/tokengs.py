@@ -36,7 +36,8 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     }
     model["supervision"] = {"layers": [released.count("dec_depth")]}
     frame = released.meaning("camera_normalization_method", {name: name for name in FRAMES})
-    return {"recipe": 1, "model": model, "views": {"frame": frame}}
+    plugins = ["tokengs2026"]
+    return {"recipe": 1, "plugins": plugins, "model": model, "views": {"frame": frame}}
 
 
 def backbone(options: ReleasedOptions) -> dict[str, Any]:
@@ -63,10 +64,10 @@ def motion_options(options: ReleasedOptions, model: dict[str, Any]) -> dict[str,
         return {}
     count = options.count("num_dynamic_gs_tokens")
     channels = options.count("time_embedding_dim") if options.flag("time_embedding") else 0
-    queries = {**model["queries"], "type": "qgs/dynamic", "dynamic": count}
+    queries = {**model["queries"], "type": "tokengs2026/dynamic", "dynamic": count}
     queries |= {"count": queries["count"] + count, "time_channels": channels}
     queries |= {"patch_size": model["encoder"]["patch_size"]}
-    own = {"self_attention": {"type": "qgs/block_causal"}} if count else {}
+    own = {"self_attention": {"type": "tokengs2026/block_causal"}} if count else {}
     return {
         "encoder": {**model["encoder"], "time_channels": channels},
         "queries": queries,
@@ -76,17 +77,17 @@ def motion_options(options: ReleasedOptions, model: dict[str, Any]) -> dict[str,
 
 def encoder_options(options: ReleasedOptions) -> dict[str, Any]:
     """Which encoder it is, and the options that only the encoders of TokenGS 2026.6 have."""
-    flags = [name in options and options.flag(name) for name in OF_2026_6]
-    if not any(flags):
+    multiscale, latent = (name in options and options.flag(name) for name in OF_2026_6)
+    timed = "time_embedding" in options and options.flag("time_embedding")
+    if not (multiscale or latent or timed):
         return {"type": "qgs/multiview_vit"}
-    multiscale, latent = flags
     depth = options.count("enc_depth")
     # The release numbers blocks from 0; without the readout it reads the last one.
     read = sorted(set(options.counts("multiscale_encoder_layers"))) if multiscale else [depth - 1]
-    found: dict[str, Any] = {"type": "qgs/multiscale_vit", "blocks": [n + 1 for n in read]}
+    found: dict[str, Any] = {"type": "tokengs2026/multiscale_vit", "blocks": [n + 1 for n in read]}
     if latent:
         found |= {
-            "type": "qgs/latent_bottleneck",
+            "type": "tokengs2026/latent_bottleneck",
             "latents": options.count("num_latents"),
             "latent_depth": options.count("latent_cross_attn_depth"),
         }

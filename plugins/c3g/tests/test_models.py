@@ -85,7 +85,11 @@ def recipe(decoder: Any = OWN_LAYER, **model: Any) -> dict[str, Any]:
         "supervision": {"layers": [2]},
         "renderer": {"type": "qgs/torch"},
     }
-    return {"recipe": 1, "plugins": ["c3g", "locus", "ellipsoid"], "model": {**small, **model}}
+    return {
+        "recipe": 1,
+        "plugins": ["c3g", "locus", "ellipsoid", "tokengs2026"],
+        "model": {**small, **model},
+    }
 
 
 def ran(written: dict[str, Any]) -> Recipe:
@@ -135,12 +139,12 @@ def test_what_stands_in_another_layer_is_refused(slot: str, part: dict[str, str]
 
 
 def test_tokens_of_another_width_are_refused_and_of_the_models_run() -> None:
-    wide = {"type": "qgs/multiscale_vit", "depth": 2, "blocks": [1, 2]}
+    wide = {"type": "tokengs2026/multiscale_vit", "depth": 2, "blocks": [1, 2]}
     problem = refused(recipe(encoder=wide))
     assert problem.reason.startswith("`c3g/joint` reads memory.features as D float32")
     assert "writes it as 2*D float32" in problem.reason
     ran(recipe(encoder={**wide, "blocks": [2]}))
-    latents = {"type": "qgs/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
+    latents = {"type": "tokengs2026/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
     ran(recipe(encoder={**latents, "latent_depth": 1}))
 
 

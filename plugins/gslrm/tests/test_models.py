@@ -18,7 +18,12 @@ RECIPES = Path(__file__).parents[3] / "recipes"
 ENCODERS = {
     "gslrm": {"type": "gslrm/transformer", "patch_size": 8, "depth": 1},
     "vit": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-    "multiscale": {"type": "qgs/multiscale_vit", "patch_size": 8, "depth": 1, "blocks": [1]},
+    "multiscale": {
+        "type": "tokengs2026/multiscale_vit",
+        "patch_size": 8,
+        "depth": 1,
+        "blocks": [1],
+    },
 }
 NO_LAYERS = {"depth": 0}
 ANCHORS = {"type": "locus/anchored", "count": 6}
@@ -37,7 +42,7 @@ def recipe(**model: Any) -> dict[str, Any]:
         "renderer": {"type": "qgs/torch"},
     }
     losses = {"photometric": {"type": "qgs/photometric"}}
-    plugins = ["gslrm", "locus"]
+    plugins = ["gslrm", "locus", "tokengs2026"]
     return {"recipe": 1, "plugins": plugins, "model": {**parts, **model}, "losses": losses}
 
 
@@ -70,7 +75,7 @@ def test_a_combination_runs(name: str) -> None:
     run_training_step(resolve(recipe(**RUNNING[name])), Case(AlongRays.Config()))
 
 
-LATENTS = {"type": "qgs/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
+LATENTS = {"type": "tokengs2026/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
 KEYS = "needs memory.keys (D/h float32) and memory.values (D/h float32)"
 REFUSED = {
     "a decoder without keys": ({"decoder": {"depth": 1}}, f"`qgs/content` {KEYS}"),
@@ -80,7 +85,7 @@ REFUSED = {
     ),
     "features of another width": (
         {"encoder": {**ENCODERS["multiscale"], "depth": 2, "blocks": [1, 2]}},
-        "`gslrm/pixels` reads memory.features as D float32, `qgs/multiscale_vit`",
+        "`gslrm/pixels` reads memory.features as D float32, `tokengs2026/multiscale_vit`",
     ),
     "LocusGS's centres": (
         {"centers": {"type": "locus/radius_scaled"}},

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import torch
 from contract_mutants.mutant import mutant
+from qgs_tokengs2026.latents import LatentBottleneck
 from torch import Tensor, nn
 
 from qgs.components import (
     ContentSelfAttention,
     GaussianHead,
-    LatentBottleneck,
     LatentQueries,
     LayerSupervision,
     MultiViewViT,

@@ -126,7 +126,7 @@ def _permuted(tree: Any, order: list[int]) -> Any:
     if isinstance(tree, ImageMemory) and tree.grid is None:
         return tree
     if not isinstance(tree, ImageMemory):
-        return map_tensors(lambda x: x[:, order] if x.shape[1] else x, tree)
+        return map_tensors(lambda x: x[:, order] if x.shape[1] > 1 else x, tree)
     if tree.grid is None:  # tokens of no view
         return tree
     tokens = torch.arange(tree.features.shape[1]).unflatten(0, (len(order), -1))[order].flatten()

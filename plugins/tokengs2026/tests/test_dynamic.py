@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from qgs_tokengs2026.dynamic import MOVES, BlockCausalSelfAttention, DynamicQueries
+from qgs_tokengs2026.multiscale import MultiscaleViT
+from qgs_tokengs2026.times import TimeEmbedding, time_features
 from torch import Tensor
 
 from qgs import Cameras, Views
-from qgs.components import BlockCausalSelfAttention, DynamicQueries, LatentQueries, MultiViewViT
-from qgs.components.dynamic import MOVES
-from qgs.components.times import TimeEmbedding, time_features
+from qgs.components import LatentQueries
 from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
 from qgs.contracts.schedule import follow
@@ -21,18 +22,29 @@ from qgs.engine.objective import TrainingPass
 from qgs.model import QueryGaussianModel
 from qgs.types import ImageMemory, LayerPrediction, Photos
 
-TOKENGS = Path(__file__).parents[2] / "recipes/tokengs"
+TOKENGS = Path(__file__).parents[3] / "recipes/tokengs"
 
 DIMS = ModelDims(width=16, heads=2, depth=1)
 MEMORY = ImageMemory(torch.zeros(2, 3, 16))
 RECIPE: dict[str, Any] = {
     "recipe": 1,
+    "plugins": ["tokengs2026"],
     "model": {
         "width": 16,
         "heads": 2,
-        "encoder": {"depth": 1, "time_channels": 4, "layer_scale": 0.5},
-        "queries": {"type": "qgs/dynamic", "count": 7, "dynamic": 3, "std": 1.0},
-        "decoder": {"depth": 2, "layer_scale": 0.5, "self_attention": {"type": "qgs/block_causal"}},
+        "encoder": {
+            "type": "tokengs2026/multiscale_vit",
+            "depth": 1,
+            "blocks": [1],
+            "time_channels": 4,
+            "layer_scale": 0.5,
+        },
+        "queries": {"type": "tokengs2026/dynamic", "count": 7, "dynamic": 3, "std": 1.0},
+        "decoder": {
+            "depth": 2,
+            "layer_scale": 0.5,
+            "self_attention": {"type": "tokengs2026/block_causal"},
+        },
         "head": {"gaussians_per_query": 2, "init_std": 0.5},
         "supervision": {"layers": [2]},
     },
@@ -96,7 +108,7 @@ def test_that_nothing_reads_which_queries_move_is_no_warning(dynamic: int) -> No
 def test_a_recipe_without_dynamic_queries_is_told_which_option_makes_them() -> None:
     with pytest.raises(RecipeError) as caught:
         resolve(TOKENGS / "dynamic.yaml", ["model.queries.dynamic=0"])
-    fix = "set `model.queries.dynamic: 256` on `qgs/dynamic`"
+    fix = "set `model.queries.dynamic: 256` on `tokengs2026/dynamic`"
     assert [problem.fix for problem in caught.value.problems] == [fix, fix]
 
 
@@ -137,7 +149,7 @@ def test_views_without_times_are_refused() -> None:
     reconstruct, times = model(), torch.zeros(2, 2)
     with pytest.raises(ValueError, match=r"reads the times of photos .*time_channels to 0"):
         reconstruct(views(target=torch.zeros(2, 1)))
-    with pytest.raises(ValueError, match=r"the time that is asked for: .* target_time \(B, 1\)"):
+    with pytest.raises(ValueError, match=r"requested time: .* target_time \(B, 1\)"):
         reconstruct(views(times))
 
 
@@ -154,9 +166,11 @@ def test_what_reads_times_is_refused_beside_data_that_tell_none() -> None:
     assert resolve(RECIPE)
     assert resolve({**RECIPE, "data": {"type": "qgs/chunks", "path": "x"}})
     with pytest.raises(RecipeError) as caught:
-        resolve({**RECIPE, "plugins": ["rooms"], "data": {"type": "rooms/procedural"}})
+        resolve(
+            {**RECIPE, "plugins": ["rooms", "tokengs2026"], "data": {"type": "rooms/procedural"}}
+        )
     told = {problem.option: problem.reason for problem in caught.value.problems}
-    reason = "the data of this recipe tell no times: `time_channels: {}` reads them"
+    reason = "the data of this recipe have no times: `time_channels: {}` reads them"
     assert told == {
         "model.encoder.time_channels": reason.format(4),
         "model.queries.time_channels": reason.format(2),
@@ -179,8 +193,8 @@ def test_what_time_adds_to_the_parameters() -> None:
         p.numel() for p in LatentQueries(LatentQueries.Config(count=1280), DIMS).parameters()
     )
     assert count == still + 16 * 2 * 8 * 8 + 16
-    timed = MultiViewViT(MultiViewViT.Config(depth=0, time_channels=2), DIMS)
-    untimed = MultiViewViT(MultiViewViT.Config(depth=0), DIMS)
+    timed = MultiscaleViT(MultiscaleViT.Config(depth=1, blocks=(1,), time_channels=2), DIMS)
+    untimed = MultiscaleViT(MultiscaleViT.Config(depth=1, blocks=(1,)), DIMS)
     assert timed.state_dict().keys() - untimed.state_dict().keys() == {
         "time_embedding.proj.weight",
         "time_embedding.proj.bias",
@@ -189,7 +203,7 @@ def test_what_time_adds_to_the_parameters() -> None:
 
 @pytest.mark.parametrize("weight", [0.3, 0.0])
 def test_the_objective_judges_dynamic_gaussians_again(weight: float) -> None:
-    recipe = resolve({**RECIPE, "objective": {"type": "qgs/dynamic", "weight": weight}})
+    recipe = resolve({**RECIPE, "objective": {"type": "tokengs2026/dynamic", "weight": weight}})
     reconstruct = model()
     inputs = views(torch.zeros(2, 2), torch.zeros(2, 1))
     targets = replace(inputs.select([0]), target_time=None)
@@ -204,7 +218,7 @@ def test_the_objective_judges_dynamic_gaussians_again(weight: float) -> None:
 
 
 def test_no_loss_may_have_the_term_of_the_objective() -> None:
-    recipe = resolve({**RECIPE, "objective": {"type": "qgs/dynamic"}})
+    recipe = resolve({**RECIPE, "objective": {"type": "tokengs2026/dynamic"}})
     judging = TrainingPass.of(recipe, model())
     loss = next(iter(judging.losses.values()))
     loss.forward = lambda *given: {"dynamic": given[0].gaussians.means.sum()}
@@ -215,7 +229,9 @@ def test_no_loss_may_have_the_term_of_the_objective() -> None:
 
 def test_larger_patches_embed_times_as_smaller_ones() -> None:
     small, large = (
-        MultiViewViT(MultiViewViT.Config(depth=0, patch_size=side, time_channels=2), DIMS)
+        MultiscaleViT(
+            MultiscaleViT.Config(depth=1, blocks=(1,), patch_size=side, time_channels=2), DIMS
+        )
         for side in (4, 8)
     )
     torch.nn.init.normal_(small.time_embedding.proj.weight)
@@ -234,6 +250,6 @@ def test_the_published_weight_of_dynamic_gaussians() -> None:
 
 
 def test_static_queries_have_nothing_for_the_objective() -> None:
-    tree = {"recipe": 1, "objective": {"type": "qgs/dynamic"}}
-    with pytest.raises(RecipeError, match=r"`qgs/dynamic` needs dynamic.moves"):
+    tree = {"recipe": 1, "plugins": ["tokengs2026"], "objective": {"type": "tokengs2026/dynamic"}}
+    with pytest.raises(RecipeError, match=r"`tokengs2026/dynamic` needs dynamic.moves"):
         resolve(tree)

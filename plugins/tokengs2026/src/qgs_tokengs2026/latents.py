@@ -1,4 +1,4 @@
-"""`qgs/latent_bottleneck`: learned latents that stand for the photos (TokenGS 2026.6).
+"""`tokengs2026/latent_bottleneck`: learned latents that stand for the photos (TokenGS 2026.6).
 
 Axes: L latents, C = S D the width of the image tokens' features.
 """
@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from qgs.components.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.components.encoder import keys_and_values
-from qgs.components.multiscale import MultiscaleReadout
 from qgs.contracts import ModelDims, memory_fields
 from qgs.geometry.rays import plucker_rays
 from qgs.types import ImageMemory, Views
+from qgs_tokengs2026.multiscale import MultiscaleReadout
 
 
 class LatentBlock(nn.Module):

@@ -1,4 +1,4 @@
-"""Times: numbers that a network reads of them (TokenGS 2026.6). Axes: T numbers of a time."""
+"""Embedding of times (TokenGS 2026.6). Axes: T channels."""
 
 import math
 from collections.abc import Iterator
@@ -20,11 +20,11 @@ def time_features(times: Tensor, channels: int) -> Tensor:
 
 
 def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
-    """The option `time_channels` beside data that never tell times."""
+    """A problem of the option `time_channels` if the data of the recipe have no times."""
     if channels and context.inputs is not None and not context.times:
         yield Problem(
             "time_channels",
-            f"the data of this recipe tell no times: `time_channels: {channels}` reads them",
+            f"the data of this recipe have no times: `time_channels: {channels}` reads them",
             "set time_channels to 0, or take qgs/photos (each frame of a transforms file with its "
             "'time') or qgs/chunks packed from them",
         )
@@ -33,7 +33,7 @@ def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
 class TimeEmbedding(nn.Module):
     """Times (B, V) -> (B, V, D), zeros at first.
 
-    As published a patch embedding, of P x P pixels that all hold the numbers of one time.
+    A convolution of P x P pixels that are all equal, because the release embeds a map of times.
     """
 
     def __init__(self, channels: int, width: int, patch_size: int) -> None:

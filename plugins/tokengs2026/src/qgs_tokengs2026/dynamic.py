@@ -1,4 +1,4 @@
-"""Queries of scenes that move: static ones, and others of the moment asked for (TokenGS 2026.6)."""
+"""Queries of moving scenes: static, and dynamic for the requested time (TokenGS 2026.6)."""
 
 from collections.abc import Iterable
 
@@ -7,7 +7,6 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.decoder import ContentSelfAttention
-from qgs.components.times import TimeEmbedding, without_times
 from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,
@@ -29,14 +28,15 @@ from qgs.types import (
     Views,
     map_tensors,
 )
+from qgs_tokengs2026.times import TimeEmbedding, without_times
 
 MOVES = "dynamic.moves"
-"""Whether a query is of the moment that is asked for: True for the dynamic ones."""
+"""Field (B, N), bool: True for dynamic queries, which stand for the requested time."""
 _FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
 
 
 class DynamicQueries(Queries):
-    """N learned vectors, of which the last ones also know the time that is asked for."""
+    """N learned vectors; to the last of them, the dynamic ones, the requested time is added."""
 
     name = "dynamic"
     reads_cameras = False
@@ -45,13 +45,13 @@ class DynamicQueries(Queries):
         count: int = Field(default=1280, ge=1)
         """N, the number of queries, static and dynamic (TokenGS: 1024 and 256)."""
         dynamic: int = Field(default=256, ge=0)
-        """Dynamic ones among them, the last; 0 gives all of them the time."""
+        """Number of dynamic queries, the last of the N; with 0 all queries get the time."""
         std: float = Field(default=0.02, ge=0)
         """Standard deviation of the normal distribution that the features start from."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
-        """Numbers that a time is embedded as; 0 for queries that know no time."""
+        """Channels that the requested time is embedded with; 0 for none."""
         patch_size: int = Field(default=8, ge=1)
-        """Side of the patches that embed the time, as published those of the encoder."""
+        """Side of the patches that embed the time; the release takes the encoder's."""
 
     config: Config
 
@@ -91,7 +91,7 @@ class DynamicQueries(Queries):
         if config.time_channels:
             if views.target_time is None:
                 raise ValueError(
-                    "qgs/dynamic queries need the time that is asked for: compare with photos of "
+                    "tokengs2026/dynamic queries need the requested time: compare with photos of "
                     "one time, give the input views a target_time (B, 1), or set "
                     "model.queries.time_channels to 0"
                 )
@@ -113,21 +113,21 @@ class BlockCausalSelfAttention(ContentSelfAttention):
 
 
 class DynamicObjective(Objective):
-    """One pass, judged as a whole and again by the Gaussians of its dynamic queries alone."""
+    """One pass; its losses, plus those of the Gaussians of dynamic queries rendered alone."""
 
     name = "dynamic"
     reads = _FIELDS
     scheduled = frozenset({"weight"})
-    judges_inputs = False  # photos of other moments than the one that is reconstructed
+    judges_inputs = False  # input photos show other moments than the reconstructed one
 
     class Config(ComponentConfig):
         weight: float = Field(default=0.3, ge=0)
-        """Factor of the second judgement (TokenGS: 0.3 for 5,000 steps, to 0 over 10,000)."""
+        """Weight of the second losses (TokenGS: 0.3 for 5,000 steps, then to 0 over 10,000)."""
 
     config: Config
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """The term `dynamic`, besides those of the whole."""
+        """All losses of the whole prediction, and the term `dynamic`."""
         prediction = passes.predict(inputs)
         whole = passes.judge(prediction, targets, inputs)
         added = torch.zeros_like(whole.total)
@@ -140,7 +140,7 @@ class DynamicObjective(Objective):
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:
-    """The dynamic queries of a layer, the same in all scenes, and their Gaussians."""
+    """Dynamic queries of a layer and their Gaussians; which these are is equal in all scenes."""
     moves_N = layer.state[MOVES][0]
     each = layer.gaussians.count // len(moves_N)
     of_gaussians = moves_N.repeat_interleave(each)
@@ -151,7 +151,7 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
 
 
 def _readable(state: QueryState) -> Tensor:
-    """(B, N, N): which queries (rows) may read which."""
+    """(B, N, N): True where the query of the row may read that of the column."""
     moves_BN = state[MOVES]
     readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
     return readable_BNN if state.mask is None else readable_BNN & state.mask[:, None]
