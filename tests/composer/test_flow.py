@@ -63,14 +63,19 @@ COMPONENTS = (Start, Keep, Late, Joint, Placed, Blind, FeatureLoss)
 PLUGIN = Plugin("mine", CONTRACT_VERSION, COMPONENTS)
 JOINT, PLACED = {"type": "mine/joint"}, {"type": "mine/placed"}
 START, KEEP, LATE = ({"type": f"mine/{name}"} for name in ("start", "keep", "late"))
-LATENTS = {"type": "qgs/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
+LATENTS = {"type": "tokengs2026/latent_bottleneck", "depth": 1, "blocks": [1], "latents": 5}
 NO_LAYERS = {"decoder": {"depth": 0}, "supervision": {"layers": [0]}}
 
 
 def problems_of(recipe: dict[str, Any] | None = None, **model: Any) -> list[tuple[str, str]]:
     """Option, and reason and fix, of all problems of a small recipe."""
     small = {"width": 16, "heads": 2, "decoder": {"depth": 2}, "supervision": {"layers": [2]}}
-    given = {"recipe": 1, "plugins": ["mine"], "model": small | model, **(recipe or {})}
+    given = {
+        "recipe": 1,
+        "plugins": ["mine", "tokengs2026"],
+        "model": small | model,
+        **(recipe or {}),
+    }
     try:
         first = resolve(given, plugins=[PLUGIN]).tree
     except RecipeError as error:
