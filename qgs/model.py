@@ -126,13 +126,13 @@ class QueryGaussianModel(nn.Module):
             raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
         decoded: dict[int, LayerPrediction] = {}
         if not self.depth:
-            decoded[0] = LayerPrediction(self.decode(state), state)
+            decoded[0] = LayerPrediction(gaussians=self.decode(state), state=state)
         for number, layer in enumerate(self.decoder, start=1):
             refine = self.refinements[self.refinement_of[number - 1]]
             state, memory = layer(state, memory)
             state = refine(state)
             if number in layers or number == self.depth:
-                decoded[number] = LayerPrediction(self.decode(state), state)
+                decoded[number] = LayerPrediction(gaussians=self.decode(state), state=state)
         return Prediction(decoded[self.depth].gaussians, state, decoded)
 
     def decode(self, state: QueryState) -> Gaussians:

@@ -30,11 +30,15 @@ class TensorContainer:
         cls.__repr__ = TensorContainer.__repr__
 
     def __repr__(self) -> str:
-        """Shapes, and what else is unusual; no numbers."""
-        parts = [f"{name}: {_told(item)}" for name, item in _items(self)]
+        """Shapes, and types and devices that are not float32 on the CPU; no numbers."""
+        parts = [f"{name}: {_described(item)}" for name, item in _items(self)]
         several = any(isinstance(item, TensorContainer) for _, item in _items(self))
         lines = "\n  ".join(["", *(part.replace("\n", "\n  ") for part in parts)]) + "\n"
         return f"{type(self).__name__}({lines if several else ', '.join(parts)})"
+
+    def replace(self, **changes: Any) -> Self:
+        """A new container with other values in some fields."""
+        return replace(cast(Any, self), **changes)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """The container with every tensor moved as by `Tensor.to`; a dtype moves geometry too."""
@@ -55,7 +59,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
     if all(new is old for (_, new), (_, old) in zip(mapped, items, strict=True)):
         return value
     if isinstance(value, TensorContainer):
-        return replace(cast(Any, value), **dict(mapped))
+        return value.replace(**dict(mapped))
     if isinstance(value, Mapping):
         return dict(mapped)
     return getattr(value, "_make", type(value))([item for _, item in mapped])  # _make: namedtuple
@@ -67,8 +71,8 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
     Raises ValueError where one has a tensor that another one lacks.
     """
     found = [dict(named_tensors(part)) for part in parts]
-    if odd := sorted({name for other in found for name in other.keys() ^ found[0].keys()}):
-        raise ValueError(f"some of what is put together have {', '.join(odd)}, others have not")
+    if some := sorted({name for other in found for name in other.keys() ^ found[0].keys()}):
+        raise ValueError(f"all or none must have {', '.join(some)}")
     joined = iter([torch.cat([x[name] for x in found], dim) for name in found[0]])
     return map_tensors(lambda _: next(joined), parts[0])
 
@@ -82,17 +86,17 @@ def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
             yield from named_tensors(item, f"{name}.{key}" if name else str(key))
 
 
-def _told(item: Any) -> str:
-    """A part of a container in words: of a tensor its shape, its type and device if unusual."""
+def _described(item: Any) -> str:
     if isinstance(item, Tensor):
         unusual = [str(item.dtype).removeprefix("torch.")] * (item.dtype != torch.float32)
         unusual += [str(item.device)] * (item.device.type != "cpu")
         return " ".join([str(tuple(item.shape)), *unusual])
-    if isinstance(item, Mapping):
-        told = [
-            type(v).__name__ if isinstance(v, TensorContainer) else _told(v) for v in item.values()
-        ]
-        return f"{{{', '.join(f'{key}: {text}' for key, text in zip(item, told, strict=True))}}}"
+    if isinstance(item, Mapping):  # of containers the name alone: their own lines would be many
+        names = (
+            type(x).__name__ if isinstance(x, TensorContainer) else _described(x)
+            for x in item.values()
+        )
+        return f"{{{', '.join(f'{key}: {name}' for key, name in zip(item, names, strict=True))}}}"
     return repr(item)
 
 
@@ -218,20 +222,15 @@ class Views(TensorContainer):
 
     def select(self, index: Any) -> Self:
         """The views at `index` of every scene (a slice or a list of ints), of the same time."""
-        of_views = replace(self, target_time=None)
-        chosen = map_tensors(lambda x: x[:, index], of_views)
-        return replace(chosen, target_time=self.target_time)
+        chosen = map_tensors(lambda x: x[:, index], self.replace(target_time=None))
+        return chosen.replace(target_time=self.target_time)
 
     def joined(self, other: Self) -> Self:
         """These views, then `other` ones of the same scenes, of one size, with the same parts."""
-        of_views = replace(self, target_time=None)
-        own = dict(named_tensors(of_views))
-        theirs = dict(named_tensors(replace(other, target_time=None)))
-        if own.keys() != theirs.keys() or self.cameras.size != other.cameras.size:
-            raise ValueError(f"views cannot be joined with others of another kind: {self}, {other}")
-        added = iter(theirs.values())
-        both = map_tensors(lambda x: torch.cat([x, next(added)], 1), of_views)
-        return replace(both, target_time=self.target_time)
+        if self.cameras.size != other.cameras.size:
+            raise ValueError(f"views of different sizes cannot be joined: {self}, {other}")
+        both = concatenated([x.replace(target_time=None) for x in (self, other)], 1)
+        return both.replace(target_time=self.target_time)
 
 
 @dataclass(frozen=True)
@@ -319,12 +318,10 @@ class QueryState(TensorContainer):
     def __contains__(self, name: object) -> bool:
         return name in self.fields
 
-    def replace(
-        self, features: Tensor | None = None, fields: Mapping[str, Tensor] | None = None
-    ) -> "QueryState":
-        """A new state with other features and with `fields` added or replaced."""
-        features = self.features if features is None else features
-        return QueryState(features, {**self.fields, **(fields or {})}, self.mask)
+    def replace(self, **changes: Any) -> Self:
+        """A new state; `fields` are added to the present ones, or take the place of some."""
+        fields = {**self.fields, **changes.pop("fields", {})}
+        return super().replace(fields=fields, **changes)
 
 
 _OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "colors": "... 3"}

@@ -53,7 +53,8 @@ def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) 
     scale = q_BhQd.shape[-1] ** -0.5
     content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
     logits_BhQT = content_BhQT if bias_BhQT is None else content_BhQT + bias_BhQT
-    return AttentionWeights(content_BhQT, bias_BhQT, logits_BhQT.softmax(-1))
+    weights_BhQT = logits_BhQT.softmax(-1)
+    return AttentionWeights(content=content_BhQT, geometry=bias_BhQT, weights=weights_BhQT)
 
 
 class SelfAttentionCore(nn.Module):

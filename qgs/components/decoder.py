@@ -43,10 +43,10 @@ class CrossSelfMlp(DecoderLayer):
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
-        state = state.replace(x_BND)
+        state = state.replace(features=x_BND)
         x_BND = x_BND + self.self_scale(self.self_attention(state))
         x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
-        return state.replace(x_BND), memory
+        return state.replace(features=x_BND), memory
 
 
 class ContentCrossAttention(CrossAttention):

@@ -24,4 +24,4 @@ class LatentQueries(LearnedQueries):
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
 
     def start(self, batch_size: int) -> QueryState:
-        return QueryState(self.features.expand(batch_size, -1, -1))
+        return QueryState(features=self.features.expand(batch_size, -1, -1))

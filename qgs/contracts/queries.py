@@ -61,6 +61,11 @@ class LearnedQueries(Queries):
 
     reads_cameras = False
 
+    @property
+    def count(self) -> int:
+        """N, the number of queries: the option `count`."""
+        return getattr(self.config, "count")  # noqa: B009 (an option of subclasses)
+
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:
         """The initial state, expanded to `batch_size` scenes."""

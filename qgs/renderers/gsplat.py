@@ -75,9 +75,12 @@ class GsplatRenderer(Renderer):
                 render_mode="RGB+ED",
             )
         images = rgbd.movedim(-1, -3)
-        shown = None if features is None else images[..., 3:-1, :, :]
-        alpha = alpha.movedim(-1, -3)
-        return Rendering(images[..., :3, :, :], alpha, images[..., -1:, :, :], shown)
+        return Rendering(
+            rgb=images[..., :3, :, :],
+            alpha=alpha.movedim(-1, -3),
+            depth=images[..., -1:, :, :],
+            features=None if features is None else images[..., 3:-1, :, :],
+        )
 
 
 def _unsupported(config: ComponentConfig) -> list[Problem]:

@@ -114,7 +114,8 @@ def resolve(sums: Tensor, background: Tensor, features: Tensor | None = None) ->
     """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w, and those of features -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
     hit = torch.where(alpha > 0, alpha, 1.0)
-    return Rendering(rgb + (1 - alpha) * background[:, None, None], alpha, depth / hit, features)
+    rgb = rgb + (1 - alpha) * background[:, None, None]
+    return Rendering(rgb=rgb, alpha=alpha, depth=depth / hit, features=features)
 
 
 def _composite(

@@ -1,7 +1,7 @@
 """Inputs of the tests: cameras side by side, noise pictures, states of two streams."""
 
 import torch
-from qgs_globalsplat.slots import TEXTURE
+from qgs_globalsplat.streams import TEXTURE
 
 from qgs.contracts import ModelDims
 from qgs.types import Cameras, QueryState, Views

@@ -6,7 +6,7 @@ import pytest
 import torch
 from globalsplat_inputs import DIMS, cameras, views
 from qgs_globalsplat.encoder import PosedPatches, lens, place
-from qgs_globalsplat.slots import TEXTURE, SlotQueries
+from qgs_globalsplat.streams import TEXTURE, SlotQueries
 
 from qgs.contracts import RecipeContext
 from qgs.geometry.rays import plucker_rays

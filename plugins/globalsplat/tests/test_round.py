@@ -3,8 +3,7 @@
 import torch
 import torch.nn.functional as F
 from globalsplat_inputs import DIMS, lively, state
-from qgs_globalsplat.rounds import Round, Stream
-from qgs_globalsplat.slots import TEXTURE
+from qgs_globalsplat.streams import TEXTURE, Round, Stream
 from torch import Tensor, nn
 
 from qgs.contracts import LayerParts

@@ -6,8 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from qgs_gslrm.encoder import Transformer
-from qgs_gslrm.head import PixelHead
-from qgs_gslrm.pixels import PATCH, AlongRays, PixelQueries, patch_rays_at, patches
+from qgs_gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at, patches
 from torch import Tensor
 
 from qgs.contracts import ModelDims

@@ -58,8 +58,9 @@ class EllipsoidQueries(LearnedQueries):
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
         fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
-        return QueryState(self.features.expand(batch_size, -1, -1), fields)
+        features = self.features.expand(batch_size, -1, -1)
+        return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """The ellipsoids."""
-        return SpatialSupport(state[CENTER], anchor_axes(state, self.config))
+        return SpatialSupport(centers=state[CENTER], axes=anchor_axes(state, self.config))

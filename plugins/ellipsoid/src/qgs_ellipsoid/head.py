@@ -1,7 +1,5 @@
 """`ellipsoid/gaussian_head`, `ellipsoid/axis_scaled`: Gaussians relative to their anchor."""
 
-from dataclasses import replace
-
 from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, support_radius
 from torch import Tensor
@@ -40,7 +38,7 @@ class EllipsoidHead(GaussianHead):
         quats = unit_quats(local.quats)
         turn = unit_quats(state[ROTATION])[:, :, None].expand_as(quats)
         scales = local.scales * radii_along(support_radius(state[RAW_RADII], self.config), quats)
-        return replace(local, quats=quat_product(turn, quats), scales=scales)
+        return local.replace(quats=quat_product(turn, quats), scales=scales)
 
 
 @full_precision

@@ -5,8 +5,7 @@ from qgs_globalsplat.encoder import PosedPatches
 from qgs_globalsplat.head import MergingHead
 from qgs_globalsplat.losses import Frustum, Regularisers
 from qgs_globalsplat.objective import TwoPasses
-from qgs_globalsplat.rounds import Round
-from qgs_globalsplat.slots import SlotQueries
+from qgs_globalsplat.streams import Round, SlotQueries
 
 plugin = Plugin(
     name="globalsplat",

@@ -21,8 +21,6 @@ class Frustum(Loss):
     renderings = "none"
 
     class Config(Loss.Config):
-        """The weight is GlobalSplat's."""
-
         weight: float = Field(default=0.01, ge=0)
         """Factor of the term in the objective."""
         softness: float = Field(default=0.05, gt=0)
@@ -48,8 +46,6 @@ class Regularisers(Loss):
     renderings = "none"
 
     class Config(Loss.Config):
-        """The weights are GlobalSplat's."""
-
         opacity_weight: float = Field(default=0.01, ge=0)
         """Factor of the mean opacity."""
         scale_weight: float = Field(default=0.01, ge=0)

@@ -2,8 +2,7 @@
 
 from qgs.contracts import Plugin
 from qgs_gslrm.encoder import Transformer
-from qgs_gslrm.head import PixelHead
-from qgs_gslrm.pixels import AlongRays, PixelQueries
+from qgs_gslrm.pixels import AlongRays, PixelHead, PixelQueries
 
 plugin = Plugin(
     name="gslrm",

@@ -19,19 +19,18 @@ CHANNELS = 9
 class Block(nn.Module):
     """Pre-norm self-attention and MLP (exact GELU), no biases: (B, M, D) -> (B, M, D)."""
 
-    def __init__(self, width: int, heads: int, mlp_ratio: float, norm_eps: float) -> None:
+    def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
         self.heads = heads
         hidden = int(mlp_ratio * width)
-        self.norm1 = nn.LayerNorm(width, norm_eps, bias=False)
+        self.norm1 = nn.LayerNorm(width, NORM_EPS, bias=False)
         self.qkv = nn.Linear(width, 3 * width, bias=False)
         self.proj = nn.Linear(width, width, bias=False)
-        self.norm2 = nn.LayerNorm(width, norm_eps, bias=False)
+        self.norm2 = nn.LayerNorm(width, NORM_EPS, bias=False)
         self.fc1 = nn.Linear(width, hidden, bias=False)
         self.fc2 = nn.Linear(hidden, width, bias=False)
 
     def forward(self, x_BMD: Tensor) -> Tensor:
-        """The tokens after both."""
         parts = self.qkv(self.norm1(x_BMD)).chunk(3, -1)
         q_BhMd, k_BhMd, v_BhMd = (split_heads(part, self.heads) for part in parts)
         read_BhMd = F.scaled_dot_product_attention(q_BhMd, k_BhMd, v_BhMd)
@@ -49,8 +48,6 @@ class Transformer(PatchEncoder):
     writes = memory_fields("features", "patch_rays", "grid")
 
     class Config(PatchEncoder.Config):
-        """Defaults are the paper's."""
-
         depth: int = Field(default=24, ge=0, le=256)
         """Number of blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
@@ -58,18 +55,15 @@ class Transformer(PatchEncoder):
         init_std: float = Field(default=0.02, gt=0)
         """Standard deviation of the normal distribution that all weights of linear layers start
         from."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.embedding = nn.Linear(CHANNELS * config.patch_size**2, dims.width, bias=False)
-        self.norm = nn.LayerNorm(dims.width, config.norm_eps, bias=False)
+        self.norm = nn.LayerNorm(dims.width, NORM_EPS, bias=False)
         self.blocks = nn.ModuleList(
-            Block(dims.width, dims.heads, config.mlp_ratio, config.norm_eps)
-            for _ in range(config.depth)
+            Block(dims.width, dims.heads, config.mlp_ratio) for _ in range(config.depth)
         )
         for module in self.modules():
             if isinstance(module, nn.Linear):

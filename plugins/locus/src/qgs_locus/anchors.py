@@ -118,7 +118,8 @@ class AnchoredQueries(LearnedQueries):
         fields = {CENTER: self.center.expand(batch_size, -1, -1)}
         if self.config.radius:
             fields[RAW_RADIUS] = self.raw_radius.expand(batch_size, -1, -1)
-        return QueryState(self.features.expand(batch_size, -1, -1), fields)
+        features = self.features.expand(batch_size, -1, -1)
+        return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Balls of the support radius, points for anchors without one."""
@@ -126,4 +127,5 @@ class AnchoredQueries(LearnedQueries):
         r_BN1 = torch.zeros_like(center_BN3[..., :1])
         if self.config.radius:
             r_BN1 = support_radius(state[RAW_RADIUS], self.config)
-        return SpatialSupport(center_BN3, r_BN1[..., None] * torch.eye(3).to(center_BN3))
+        axes_BN33 = r_BN1[..., None] * torch.eye(3).to(center_BN3)
+        return SpatialSupport(centers=center_BN3, axes=axes_BN33)

@@ -33,10 +33,10 @@ from qgs_locus.ray_bias import RayBias, dense_bias, ray_tokens
 
 
 class RayBiasedCrossAttention(CrossAttention):
-    """softmax(q k / sqrt(d) + gamma b) v, with b = -1/2 (D / sigma)^2 (LocusGS), equation (4).
+    """By content, and by the distance D of a patch's ray to the anchor (LocusGS), equation (4).
 
-    D is the distance of a patch's ray to the anchor; sigma = sigma0 r ("radius"), or sigma0
-    ("fixed"). The bias is the same for all heads.
+    softmax(q k / sqrt(d) + gamma b) v, b = -1/2 (D / sigma)^2. sigma = sigma0 r ("radius"), or
+    sigma0 ("fixed"). The bias is the same for all heads.
     """
 
     name = "ray_biased"

@@ -59,7 +59,7 @@ class DividesBySpread(ContentSelfAttention):
     def forward(self, state):
         features = state.features
         spread = (features - features[:, :1]).norm(dim=(1, 2), keepdim=True)
-        return super().forward(state.replace(features / spread))
+        return super().forward(state.replace(features=features / spread))
 
 
 @mutant("points_behind_cameras_stay_finite", "in the centre of a camera")

@@ -61,7 +61,7 @@ class NumbersScenes(LatentQueries):
     def start(self, batch_size):
         state = super().start(batch_size)
         scene = torch.arange(batch_size).to(state.features)[:, None, None]
-        return state.replace(state.features + scene)
+        return state.replace(features=state.features + scene)
 
 
 @mutant("queries_resize", "cannot be loaded", options={"count": 6})

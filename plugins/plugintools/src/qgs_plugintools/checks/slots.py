@@ -64,7 +64,7 @@ def check_head_gives_gaussians(case: Case) -> None:
     for module, factor, where in modules:
         for mode in each_mode(module):
             with seeded(0), torch.no_grad():
-                out = module(state.replace(factor * state.features))
+                out = module(state.replace(features=factor * state.features))
             given = {name for name in ("sh", "features") if getattr(out, name) is not None}
             expect(
                 given == told, f"in {mode} it gives {given or None}, and provides {told or None}"
@@ -543,7 +543,9 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
         return
     if given.geometry is None:
         state = inputs["state"]
-        inputs["state"] = state.replace(state.features[:, :1].expand_as(state.features).clone())
+        inputs["state"] = state.replace(
+            features=state.features[:, :1].expand_as(state.features).clone()
+        )
         given = _explanation(module, inputs) or given
     inputs = mapped(inputs, lambda n, x: x.requires_grad_() if n == "memory.values" else x)
     update, values = module(*inputs.values()), inputs["memory"].values
