@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.extensions import refine
     from qgs.io.checkpoint import load, save
-    from qgs.io.ply import load_ply, save_ply
+    from qgs.io.gaussians import load_ply, save_ply
     from qgs.model import QueryGaussianModel
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
 
@@ -63,11 +63,11 @@ _ELSEWHERE = {
     "compose": "qgs.analysis",
     "Reconstruction": "qgs.analysis.reconstruction",
     "load": "qgs.analysis",
-    "load_ply": "qgs.io.ply",
+    "load_ply": "qgs.io.gaussians",
     "read_photos": "qgs.analysis.scenes",
     "refine": "qgs.extensions",
     "save": "qgs.io.checkpoint",
-    "save_ply": "qgs.io.ply",
+    "save_ply": "qgs.io.gaussians",
     "trace": "qgs.analysis.trace",
 }
 """Where public names come from that are not of `qgs.types`."""

@@ -30,7 +30,7 @@ from qgs.engine.fit import OutOfMemoryError
 from qgs.engine.guard import TrainingError
 from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointFile
-from qgs.io.ply import save_ply
+from qgs.io.gaussians import save_ply
 
 STEPS = 2
 LARGE = {

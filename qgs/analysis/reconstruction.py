@@ -152,11 +152,11 @@ class Reconstruction:
             seen = self.model.render(self.gaussians, own)
         return replace(seen, depth=seen.depth / float(scale))
 
-    def save(self, folder: str | PathLike[str]) -> list[Path]:
+    def save(self, out: str | PathLike[str]) -> list[Path]:
         """Write the files of `qgs reconstruct`; returns their paths. See `qgs.analysis.saving`."""
         from qgs.analysis.saving import write_reconstruction  # Matplotlib is slow to import
 
-        return write_reconstruction(self, Path(folder))
+        return write_reconstruction(self, Path(out))
 
     def __repr__(self) -> str:
         """Scene, views with PSNR, and the remarks."""

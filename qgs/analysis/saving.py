@@ -22,7 +22,7 @@ from qgs.drawing.images import (
 )
 from qgs.geometry.poses import look_at
 from qgs.io.files import replacing_entries, write_text
-from qgs.io.ply import save_ply
+from qgs.io.gaussians import save_gaussians, save_ply, scene_writers
 from qgs.metrics.images import Psnr
 from qgs.types import Cameras
 from qgs.wording import numbered
@@ -64,7 +64,12 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
 
     All is in the model's world; cameras.json has the similarity to that of the photos. Earlier
     files and folders of these names are replaced, all at the end.
+    With the suffix of a scene writer (.ply, .splat, ...) `out` is one file of the Gaussians, in the
+    world of the photos.
     """
+    if out.suffix.lower() in scene_writers():
+        save_gaussians(result.in_photos_world, out)
+        return [out]
     path = orbit_path(result.sample.inputs.cameras, result.rendering.depth)
     with torch.no_grad():
         frames = result.model.render(result.gaussians, path).rgb[0]

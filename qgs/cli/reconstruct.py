@@ -27,7 +27,7 @@ def reconstruct(
     photos: Annotated[
         str, typer.Argument(help="Folder of photos and cameras, chunks or archives, or its URL.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results, or .ply/.splat file.")],
     inputs: Annotated[
         int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
     ] = None,
@@ -71,10 +71,10 @@ def reconstruct(
     Of a folder that the model was trained on, held-out photos are compared with where there are.
     The result of --refine is written to OUT/refined, beside the prediction of the model.
     """
-    if out.is_file() or (out.is_dir() and any(out.iterdir()) and not overwrite):
+    if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise FileExistsError(
             f"{out} is a file or holds some; choose another --out, or add --overwrite to replace "
-            "the files of the same names in a folder"
+            "the files of the same names"
         )
     pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
     if refine is None and (refine_size or refine_inputs or gaussians):
@@ -113,7 +113,8 @@ def reconstruct(
         more = {"count": gaussians, "inputs_only": refine_inputs, "seen": seen}
         better = refiner(result, scene, refine, **more, console=console)
         show(better, "refined", console)
-        paths += better.save(out / "refined")
+        single = out.with_stem(f"{out.stem}_refined")
+        paths += better.save(single if paths == [out] else out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
 

@@ -14,7 +14,7 @@ from varying_head import VaryingHead
 import qgs
 from qgs.geometry.poses import look_at
 from qgs.geometry.transforms import matrix_to_quat, quat_to_matrix
-from qgs.io.ply import load_ply
+from qgs.io.gaussians import load_ply
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Views
 
@@ -133,6 +133,8 @@ def test_harmonics_are_turned_into_the_world_of_the_photos(model, tmp_path, monk
     torch.testing.assert_close(again.rgb, own, atol=5e-3, rtol=0)
     result.save(tmp_path / "saved")
     assert torch.equal(load_ply(tmp_path / "saved" / "gaussians.ply").sh, result.gaussians.sh)
+    assert result.save(tmp_path / "one.ply") == [tmp_path / "one.ply"]
+    assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "placed.ply").read_bytes()
 
 
 def test_rotations_become_quaternions():

@@ -13,7 +13,7 @@ import qgs
 from qgs.analysis.reconstruction import choose_sample, reconstruct_sample
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
-from qgs.io.ply import load_ply
+from qgs.io.gaussians import load_ply
 from qgs.model import QueryGaussianModel
 
 

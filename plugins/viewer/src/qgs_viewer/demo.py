@@ -147,7 +147,7 @@ def _write(
     import torch
 
     from qgs.io.files import write_text
-    from qgs.io.ply import save_ply
+    from qgs.io.gaussians import save_ply
     from qgs_viewer import contest
     from qgs_viewer.report import report_html
 

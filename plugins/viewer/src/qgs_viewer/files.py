@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.contracts import Scene
-from qgs.io.ply import load_ply
+from qgs.io.gaussians import load_ply
 from qgs.types import Cameras, Gaussians
 from qgs_viewer.look import NEUTRAL, Background
 

@@ -18,7 +18,7 @@ from qgs.data.images import framing
 from qgs.data.sampling import make_sample, own_world, views_in
 from qgs.geometry.poses import relative_to, scaled
 from qgs.io.checkpoint import CheckpointFile
-from qgs.io.ply import load_ply
+from qgs.io.gaussians import load_ply
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
 from qgs_viewer.files import CAMERAS, PLY, REFINED, Finished, read_finished
