@@ -26,8 +26,7 @@ import qgs
 from qgs.composer import Recipe, resolve
 from qgs.contracts import LearnedQueries
 from qgs.data.domain import Domain, verdict
-from qgs.engine.fit import OutOfMemoryError
-from qgs.engine.guard import TrainingError
+from qgs.engine.guard import OutOfMemoryError, TrainingError
 from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.gaussians import save_ply

@@ -34,9 +34,8 @@ from rich.console import Console
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.data.paths import opened_path
-from qgs.engine.checkpoint import read_state
 from qgs.engine.evaluation import evaluate
-from qgs.engine.folder import RunFolder
+from qgs.engine.folder import RunFolder, read_state
 from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.files import is_leftover

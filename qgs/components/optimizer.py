@@ -1,4 +1,4 @@
-"""AdamW with a one-cycle learning rate."""
+"""AdamW with a one-cycle learning rate, or with any schedule of a recipe."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,8 @@ class OneCycleAdamW(Optimizer):
     The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that
     comes first. The fall follows the fraction of the budget that is used, the larger of steps and
     seconds; with steps alone this is torch's `OneCycleLR` with pct_start = warmup / steps.
-    Raises ValueError when the warm-up fills all steps and no time budget shortens it.
+
+    A schedule for `learning_rate` replaces this cycle; warmup and divisors then have no effect.
     """
 
     name = "adamw"
@@ -29,8 +30,8 @@ class OneCycleAdamW(Optimizer):
     class Config(OptimizerConfig):
         """The learning rate, and AdamW's own options."""
 
-        learning_rate: float = Field(default=4e-4, gt=0)
-        """The peak, at the end of the warm-up."""
+        learning_rate: float = Field(default=4e-4, ge=0)
+        """The peak, at the end of the warm-up; or a schedule, which replaces the cycle."""
         warmup: int = Field(default=2000, ge=0)
         """Optimiser steps up to the peak."""
         warmup_shape: Literal["cosine", "linear"] = "cosine"
@@ -52,11 +53,14 @@ class OneCycleAdamW(Optimizer):
         self.last = self.first / config.final_divisor
         self.budget = self.training.seconds or math.inf
         self._descent_starts: float | None = None
-        steps = self.training.steps
-        if self.training.seconds is None and config.warmup >= steps:
+
+    def check(self) -> None:
+        """Raise ValueError when the warm-up fills all steps and no time budget shortens it."""
+        warmup, steps = self.options.warmup, self.training.steps
+        if not self.follows_schedule and self.training.seconds is None and warmup >= steps:
             raise ValueError(
-                f"optimizer.warmup is {config.warmup}, but training.steps is {steps}: the learning "
-                "rate would never come down; lower warmup or train for longer"
+                f"optimizer.warmup is {warmup}, but training.steps is {steps}: the learning rate "
+                "would never come down; lower warmup or train for longer"
             )
 
     def build(self, groups: Sequence[ParameterGroup]) -> AdamW:
@@ -66,7 +70,9 @@ class OneCycleAdamW(Optimizer):
         return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """The one-cycle rate; where the fall starts is where the warm-up was first over."""
+        """The schedule's rate, else the one-cycle rate."""
+        if self.follows_schedule:
+            return super().learning_rate(step, seconds)
         of_steps, of_seconds = step / max(self.training.steps - 1, 1), seconds / self.budget
         used = min(max(of_steps, of_seconds), 1.0)
         if self._descent_starts is None:
@@ -76,6 +82,7 @@ class OneCycleAdamW(Optimizer):
                 if self.options.warmup_shape == "linear":
                     return self.first + (self.peak - self.first) * warmed
                 return _cosine(self.first, self.peak, warmed)
+            # Kept, since a later end of the budget must not bring the warm-up back.
             self._descent_starts = used
         left = 1 - self._descent_starts
         part = (used - self._descent_starts) / left if left > 0 else 1.0
@@ -86,10 +93,7 @@ class OneCycleAdamW(Optimizer):
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        start = state["descent_starts"]
-        if start is not None and not 0 <= start <= 1:
-            raise ValueError(f"descent_starts is {start}, no fraction of the budget")
-        self._descent_starts = start
+        self._descent_starts = state["descent_starts"]
 
 
 def _cosine(start: float, end: float, part: float) -> float:

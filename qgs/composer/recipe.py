@@ -113,7 +113,9 @@ class Recipe:
 
     def build_optimizer(self) -> contracts.Optimizer:
         """The optimiser; raises ValueError where `training` is too short for it."""
-        return build(self.parts["optimizer",], self.training)
+        optimizer = build(self.parts["optimizer",], self.training)
+        optimizer.check()
+        return optimizer
 
     def rate_factors(self, module: nn.Module) -> dict[str, float]:
         """Factor of the learning rate for every parameter of a model or objective, by name."""

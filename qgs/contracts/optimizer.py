@@ -15,6 +15,9 @@ from qgs.contracts.settings import TrainingConfig
 class OptimizerConfig(ComponentConfig):
     """The options of every optimiser."""
 
+    learning_rate: float = Field(default=4e-4, ge=0)
+    """The learning rate: a number, or a schedule such as `{schedule: linear, values: [0, 4.0e-4],
+    at: [0, 500]}`."""
     parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={}, max_length=1000)
     """Parts of the model to factors of the learning rate: `{encoder: 0.1}`; 0 freezes a part. A
     part is a path of the recipe, as in `swap`, or a module or parameter of the model; `*`, `?` and
@@ -24,7 +27,7 @@ class OptimizerConfig(ComponentConfig):
 
 
 class ParameterGroup(TypedDict):
-    """Parameters that are treated alike; a group of torch's optimisers.
+    """Parameters with the same decay and factor; a group of torch's optimisers.
 
     decays: whether weight decay applies. factor: of the learning rate, from `parts`.
     """
@@ -38,33 +41,46 @@ class Optimizer(Component):
     """An optimiser of torch with its learning rate.
 
     Training makes one, calls `build` once, and sets the learning rate of every group of torch's
-    optimiser to `learning_rate(...)` times the group's factor before each step. What torch's
-    optimiser remembers of the parameters is saved and restored by training.
+    optimiser to `learning_rate(...)` times the group's factor before each step. Training saves and
+    restores the state of torch's optimiser.
+
+    The kinds of schedules that a recipe can write are in `qgs.contracts.schedule`.
     """
 
     slot: ClassVar[str] = "optimizer"
+    scheduled: ClassVar[frozenset[str]] = frozenset({"learning_rate"})
 
     class Config(OptimizerConfig):
-        """No options but `parts`."""
+        """No options but those of every optimiser."""
 
     def __init__(self, config: OptimizerConfig, training: TrainingConfig | None = None) -> None:
-        """training: says how long training lasts; ValueError is raised where that does not fit."""
+        """training: its budget of steps and seconds."""
         self.config = config
         self.training = training or TrainingConfig()
+
+    def check(self) -> None:
+        """Raise ValueError where the options do not fit the budget; called once it is built."""
+        return
 
     @abstractmethod
     def build(self, groups: Sequence[ParameterGroup]) -> torch.optim.Optimizer:
         """Torch's optimiser of `groups`; groups of its own keep the `factor` of what they hold."""
 
-    @abstractmethod
     def learning_rate(self, step: int, seconds: float) -> float:
         """Rate of the `step`-th optimiser step (0 is the first), `seconds` into training.
 
-        Called with ascending steps.
+        Called with ascending steps, `config` at this step's values. By default the option
+        `learning_rate`; another rule should leave it so where `follows_schedule`.
         """
+        return self.config.learning_rate
+
+    @property
+    def follows_schedule(self) -> bool:
+        """Whether the recipe writes a schedule for `learning_rate`."""
+        return "learning_rate" in self.schedules
 
     def state(self) -> Mapping[str, Any]:
-        """JSON values that continue `learning_rate` in another process, where it needs any."""
+        """JSON values that `learning_rate` needs to continue in another process."""
         return {}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -81,8 +81,9 @@ class TrainingConfig(ComponentConfig):
     the next scenes instead, counts it, and names it in the end."""
     evaluate_every: int = Field(default=0, ge=0)
     """Steps between evaluations with pictures; 0 for none."""
-    trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
-    """Where numbers and pictures go besides the folder of the run."""
+    trackers: tuple[str, ...] = ()
+    """Where numbers and pictures go besides the folder of the run: tensorboard, wandb, or what
+    plugins offer."""
 
 
 class EvaluationConfig(ComponentConfig):

@@ -66,7 +66,7 @@ class Domain:
         return {name: (v[places[name]], v[-1 - places[name]]) for name, v in ordered.items()}
 
     def state(self) -> dict[str, Any]:
-        """See `qgs.engine.checkpoint.Stateful`."""
+        """See `qgs.engine.folder.Stateful`."""
         return {"samples": self.samples, "values": self.values}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

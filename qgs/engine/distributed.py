@@ -1,86 +1,52 @@
-"""Devices and processes of a run, and asking it to stop."""
+"""Devices, processes and random states of a run; requests to stop."""
 
 from __future__ import annotations
 
 import os
+import random
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from importlib.util import find_spec
 from types import FrameType
+from typing import Any
 
+import numpy as np
 import torch
 from accelerate import Accelerator
-from accelerate.utils import DistributedDataParallelKwargs, InitProcessGroupKwargs
-from torch import Tensor, nn
-from torch.distributed.fsdp import FSDPModule, fully_shard
-from torch.distributed.tensor import DTensor, distribute_tensor
-
-from qgs.model import QueryGaussianModel
+from accelerate.utils import (
+    DistributedDataParallelKwargs,
+    DistributedType,
+    InitProcessGroupKwargs,
+    gather_object,
+)
+from torch import Tensor
 
 TIMEOUT = timedelta(hours=24)
-"""How long processes wait for each other while one evaluates or saves; torch's own 10 minutes with
-NCCL would end such runs. A process that died is noticed by the launcher, which ends the others."""
+"""How long processes wait while one evaluates or saves. NCCL's default of 10 minutes would end such
+runs; a process that died is noticed by the launcher, which ends the others."""
+
+_PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
 
 
 def make_accelerator(device: str, unread: bool = False) -> Accelerator:
-    """The processes that a launcher started, or this one alone; autocast is the trainer's own.
+    """The processes that a launcher started (DDP), or this one alone.
 
-    unread: whether some parameters never get a gradient, which processes must then look for.
+    unread: whether some parameters never get a gradient, which DDP must then search for.
+    Raises ValueError for a launcher's request of anything but DDP.
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
     parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
+    # Autocast is the trainer's own: losses and geometry must stay float32.
     options = {"cpu": device == "cpu", "mixed_precision": "no"}
-    return Accelerator(**options, kwargs_handlers=[group, parallel])
-
-
-def wants_shards(accelerator: Accelerator) -> bool:
-    """Whether `accelerate launch --use_fsdp` started several processes."""
-    asked = os.environ.get("ACCELERATE_USE_FSDP", "false").lower() in ("1", "true")
-    return asked and accelerator.num_processes > 1
-
-
-def shard(model: QueryGaussianModel) -> None:
-    """Lay the parameters of `model` in shards over all processes (FSDP2), in place.
-
-    Each decoder layer gathers its own when it runs. Scalars stay whole, see `average_gradients`.
-    """
-    scalars = {parameter for parameter in model.parameters() if parameter.ndim == 0}
-    for layer in model.decoder:
-        fully_shard(layer, ignored_params=scalars)
-    fully_shard(model, ignored_params=scalars)
-
-
-def sharded(module: nn.Module) -> list[FSDPModule]:
-    """The modules inside `module` whose parameters `shard` laid in shards."""
-    return [inner for inner in module.modules() if isinstance(inner, FSDPModule)]
-
-
-@contextmanager
-def unsynchronised(accelerator: Accelerator, module: nn.Module) -> Iterator[None]:
-    """Leave gradients unshared between processes for the `with` block; a later pass shares them."""
-    shards = sharded(module)
-    for inner in shards:
-        inner.set_requires_gradient_sync(False, recurse=False)
-    try:
-        with accelerator.no_sync(module):
-            yield
-    finally:
-        for inner in shards:
-            inner.set_requires_gradient_sync(True, recurse=False)
-
-
-def average_gradients(accelerator: Accelerator, module: nn.Module) -> None:
-    """Average the gradients of parameters that are whole beside others in shards."""
-    if not sharded(module):
-        return
-    for parameter in module.parameters():
-        if parameter.grad is not None and not isinstance(parameter, DTensor):
-            parameter.grad.copy_(mean(accelerator, parameter.grad))
+    accelerator = Accelerator(**options, kwargs_handlers=[group, parallel])
+    if accelerator.distributed_type not in _PARALLEL:
+        kind = accelerator.distributed_type.value
+        raise ValueError(f"training runs in one process or under DDP: launch it without {kind}")
+    return accelerator
 
 
 def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
@@ -90,30 +56,56 @@ def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
     return reduced
 
 
-def whole(tensor: Tensor) -> Tensor:
-    """`tensor` without gradient; where processes hold shards of it, gathered, in host memory.
-
-    All processes must call this.
-    """
-    tensor = tensor.detach()
-    return tensor.full_tensor().cpu() if isinstance(tensor, DTensor) else tensor
+def gathered(accelerator: Accelerator, own: Any) -> list[Any]:
+    """The `own` of every process, by rank."""
+    return gather_object([own]) if accelerator.num_processes > 1 else [own]
 
 
-def placed_like(tensor: Tensor, other: Tensor) -> Tensor:
-    """The whole `tensor` on the device of `other`, as shards where `other` lies in shards."""
-    tensor = tensor.to(other.device)
-    if not isinstance(other, DTensor) or tensor.shape != other.shape:
-        return tensor
-    return distribute_tensor(tensor, other.device_mesh, other.placements, src_data_rank=None)
+class RandomStates:
+    """The generators of Python, NumPy and torch, of every process by its rank."""
+
+    def __init__(self, accelerator: Accelerator) -> None:
+        self._accelerator = accelerator
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and JSON values; all processes must call it."""
+        version, words, gauss = random.getstate()
+        own: dict[str, Any] = {
+            "python": [version, list(words), gauss],
+            "numpy": _with_key(np.random.get_state(legacy=False), np.ndarray.tolist),
+            "torch": torch.get_rng_state(),
+        }
+        if self._accelerator.device.type == "cuda":
+            own["cuda"] = torch.cuda.get_rng_state(self._accelerator.device)
+        ranks = enumerate(gathered(self._accelerator, own))
+        return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Restore this process's generators; a rank that `state` lacks keeps its own."""
+        prefix, device = f"{self._accelerator.process_index}/", self._accelerator.device
+        own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+        if not own:
+            return
+        version, words, gauss = own["python"]
+        random.setstate((version, tuple(words), gauss))
+        np.random.set_state(_with_key(own["numpy"], lambda key: np.array(key, np.uint32)))
+        torch.set_rng_state(own["torch"])
+        if device.type == "cuda" and "cuda" in own:
+            torch.cuda.set_rng_state(own["cuda"], device)
+
+
+def _with_key(state: Any, function: Callable[[Any], Any]) -> dict[str, Any]:
+    """NumPy's state with `function` of the 624 words of its Mersenne Twister."""
+    return {**state, "state": {**state["state"], "key": function(state["state"]["key"])}}
 
 
 DEVICES = ("auto", "cpu", "cuda")
 
 
 def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
-    """ "cpu" or "cuda" for one of DEVICES; raises ValueError for others, or for "cuda" without one.
+    """ "cpu" or "cuda" for one of DEVICES; raises ValueError for others, and "cuda" without one.
 
-    "auto" takes CUDA where there is one and gsplat is installed; `say` is called if it is missing.
+    "auto" takes CUDA if there is one and gsplat is installed; `say` gets a note if it is missing.
     """
     if wanted not in DEVICES:
         raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
@@ -135,13 +127,9 @@ def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> s
     return "cuda" if available else "cpu"
 
 
-PAUSE = 1.0
-"""Seconds after which a second Ctrl-C is a person's: launchers and terminals repeat theirs."""
-
-
 @dataclass
 class StopRequest:
-    """Whether someone asked training to stop, and by which signal."""
+    """Whether training was asked to stop, and by which signal."""
 
     signal: signal.Signals | None = None
 
@@ -151,28 +139,22 @@ class StopRequest:
 
 @contextmanager
 def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
-    """Turn the first SIGINT or SIGTERM inside the block into a request, and say so unless `quiet`.
+    """Turn SIGINT and SIGTERM inside the block into a request; print so once unless `quiet`.
 
-    Launchers repeat their signals, so later ones are ignored; only a second SIGINT, PAUSE seconds
-    or more after the first, raises KeyboardInterrupt. Outside the main thread none ever comes.
+    Does nothing outside the main thread, where Python cannot handle signals.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    gives_up_at = float("inf")
 
     def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal gives_up_at
-        if number == signal.SIGINT:
-            if time.monotonic() >= gives_up_at:
-                raise KeyboardInterrupt
-            gives_up_at = min(gives_up_at, time.monotonic() + PAUSE)
-        if not request:
-            request.signal = signal.Signals(number)
-            message = f"{request.signal.name}: finishing the step, saving; Ctrl-C again to give up"
-            if not quiet:  # not by print, which must not be entered twice
-                os.write(2, f"\n{message}\n".encode())
+        if request:  # launchers and terminals each send the signal: repeats mean nothing new
+            return
+        request.signal = signal.Signals(number)
+        message = f"{request.signal.name}: finishing the step, then saving (Ctrl-\\ ends at once)"
+        if not quiet:  # print is not reentrant, and a handler may interrupt it
+            os.write(2, f"\n{message}\n".encode())
 
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -1,4 +1,4 @@
-"""Parameter groups and averaged weights."""
+"""Parameter groups, the optimiser's state, and averaged weights."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -6,11 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.distributed.tensor import DTensor
 
 from qgs.contracts import ModelComponent, Optimizer, ParameterGroup
-from qgs.engine.checkpoint import refuse_other_tensors
-from qgs.engine.distributed import placed_like, whole
 from qgs.io.checkpoint import unique_tensors
 
 
@@ -28,11 +25,10 @@ def make_optimizer(
 
 
 def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[ParameterGroup]:
-    """The parameters of `module` that train, together with others that are treated alike.
+    """The parameters of `module` that train, grouped by decay and factor of the learning rate.
 
     The innermost component around a parameter decides whether it decays (`ModelComponent.decays`);
     outside of components all but 1-d parameters do. A shared parameter goes by its first name.
-    Parameters in shards and whole ones are kept apart: no kernel updates both at once.
     """
     groups: dict[Any, ParameterGroup] = {}
     components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
@@ -45,10 +41,40 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
             innermost = max(owners, key=len)
             inner_name = name.removeprefix(innermost).removeprefix(".")
             decays = components[innermost].decays(inner_name, parameter)
-        key = (not decays, isinstance(parameter, DTensor), factor)
+        key = (not decays, factor)
         empty = ParameterGroup(params=[], decays=decays, factor=factor)
         groups.setdefault(key, empty)["params"].append(parameter)
     return [groups[key] for key in sorted(groups)]
+
+
+class OptimizerState:
+    """What torch's optimiser keeps for each parameter (moments, steps), by the parameter's name.
+
+    Torch's own `state_dict` numbers parameters by their place in the groups. `torch.distributed`'s
+    helpers name them too, but give parameters without a gradient moments that they do not have.
+    """
+
+    def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
+        names = {id(parameter): name for name, parameter in module.named_parameters()}
+        self._names = [names[id(p)] for group in optimizer.param_groups for p in group["params"]]
+        self._optimizer = optimizer
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and JSON values, PARAMETER/KEY."""
+        return {
+            f"{self._names[place]}/{key}": value
+            for place, values in self._optimizer.state_dict()["state"].items()
+            for key, value in values.items()
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state()` gave; options of the groups stay."""
+        kept: dict[int, dict[str, Any]] = {}
+        for path, value in state.items():
+            name, _, key = path.rpartition("/")
+            kept.setdefault(self._names.index(name), {})[key] = value
+        groups = self._optimizer.state_dict()["param_groups"]
+        self._optimizer.load_state_dict({"state": kept, "param_groups": groups})
 
 
 class MovingAverage:
@@ -69,6 +95,7 @@ class MovingAverage:
         """Take the present weights into the average."""
         for name, tensor in unique_tensors(self._model).items():
             if isinstance(tensor, nn.Parameter):
+                # float32, since a decay near 1 moves the average by less than bf16 resolves
                 self._averages[name].lerp_(tensor.detach().float(), 1 - self._decay)
             else:
                 self._averages[name].copy_(tensor)
@@ -86,13 +113,11 @@ class MovingAverage:
 
     def state(self) -> dict[str, Tensor]:
         """The averages, named as `qgs.io.checkpoint.save` takes weights."""
-        return {name: whole(tensor) for name, tensor in self._averages.items()}
+        return dict(self._averages)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on from the averages in `state`."""
-        own = self._averages
-        refuse_other_tensors(state, own)
-        _copy({name: placed_like(state[name], tensor) for name, tensor in own.items()}, own)
+        _copy(state, self._averages)
 
 
 @torch.no_grad()

@@ -21,8 +21,7 @@ from qgs.drawing.images import (
     side_by_side,
     write_png,
 )
-from qgs.engine.checkpoint import RandomStates
-from qgs.engine.distributed import StopRequest, mean, sharded
+from qgs.engine.distributed import RandomStates, StopRequest
 from qgs.engine.evaluation import Measures, evaluate
 from qgs.engine.parameters import MovingAverage
 from qgs.engine.protocol import index_of
@@ -46,9 +45,8 @@ class _StoppedError(Exception):
 class PeriodicEvaluation:
     """Judges the model on the recipe's test views, beside its moving average where there is one.
 
-    Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png; random states and the
-    model's mode are afterwards what they were. One process judges and the others wait, unless the
-    weights lie in shards.
+    Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png; restores random states and
+    the model's mode. One process judges and the others wait.
 
     latest: the step of the latest evaluation of this session.
     """
@@ -65,22 +63,21 @@ class PeriodicEvaluation:
         self.latest: int | None = None
         self._accelerator, self._recipe, self._model = accelerator, recipe, model
         self._average, self._folder, self._trackers = average, folder, trackers
-        self._in_shards = bool(sharded(model))
         self._random = RandomStates(accelerator)
         self._stop = StopRequest()
-        Measures(recipe)  # a fault of a metric is raised now, not after the training
+        Measures(recipe)  # a metric that is wrong must fail now, not after the training
 
     def run(self, step: int, stop: StopRequest | None = None) -> None:
         """Evaluate after `step` optimiser steps. All processes must call this.
 
-        stop: given up between two scenes once this is asked for. An evaluation that fails is
-        logged as a warning and ends no training.
+        stop: where it is requested, the evaluation ends between two scenes. A failing evaluation is
+        logged as a warning and does not end the training.
         """
         self.latest = step
         self._stop = StopRequest() if stop is None else stop
         states = self._random.state()
         try:
-            if self._accelerator.is_main_process or self._in_shards:
+            if self._accelerator.is_main_process:
                 self._evaluate(step)
         except _StoppedError:
             _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
@@ -97,12 +94,8 @@ class PeriodicEvaluation:
             with self._average.applied():
                 records.append(self._record("ema", step))
         picture = self._picture()
-        if not self._accelerator.is_main_process:
-            return
-        if not self._folder.is_dir():  # the training tells of it with its next step
-            raise FileNotFoundError(f"{self._folder} was deleted or moved")
         place = self._folder / "evaluations.jsonl"
-        # Records of this step and later ones, from before a resume, go.
+        # A resumed run evaluates again what lies after its last save.
         kept = [record for record in read_records(place) if record["step"] < step]
         write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
         write_png(picture, self._folder / "pictures" / f"step-{step}.png")
@@ -112,9 +105,7 @@ class PeriodicEvaluation:
         self._trackers.picture("evaluation", picture, step)
 
     def _between_scenes(self, done: int, wanted: int) -> None:
-        """Raise _StoppedError when a stop was asked for, of any process where all take part."""
-        asked = torch.tensor(float(bool(self._stop)), device=self._accelerator.device)
-        if float(mean(self._accelerator, asked) if self._in_shards else asked):
+        if self._stop:
             raise _StoppedError
 
     def _record(self, weights: str, step: int) -> dict[str, Any]:

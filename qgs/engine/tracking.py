@@ -1,78 +1,154 @@
-"""Progress of a training on the terminal, and logging to experiment trackers."""
+"""Experiment trackers, and the progress of a training on the terminal.
+
+A distribution adds a tracker by an entry point in the group `qgs.trackers` that names a `Tracker`.
+"""
 
 import time
 import uuid
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
-from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
+from accelerate.tracking import TensorBoardTracker, WandBTracker
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from qgs.composer import Recipe
 from qgs.composer.recipe import flat
 from qgs.contracts import MissingExtraError
+from qgs.extensions import installed, load
 from qgs.io.files import write_text
 from qgs.metrics.images import Psnr
+from qgs.wording import listed
+
+GROUP = "qgs.trackers"
 
 _REFRESH_SECONDS = 0.25
 _LOG_SECONDS = 15.0
 
 
+class Tracker(ABC):
+    """Where the numbers and pictures of one run go, besides its folder."""
+
+    package: ClassVar[str] = ""
+    """The package that it needs, an extra of query-gaussians."""
+
+    @abstractmethod
+    def __init__(self, run: Path, options: Mapping[str, bool | int | float | str], step: int):
+        """Start, or go on after `step` steps. run: the run's folder; options: of its recipe."""
+
+    @abstractmethod
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take the numbers of a step, by name."""
+
+    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
+        """Take a uint8 (H, W, 3) picture; the default ignores it."""
+        return
+
+    def close(self) -> None:
+        """Bring what was logged to its place."""
+        return
+
+
+class _OfAccelerate(Tracker):
+    """A tracker that accelerate has."""
+
+    def _start(self, tracker: Any, options: Mapping[str, bool | int | float | str]) -> None:
+        self._tracker = tracker
+        tracker.start()
+        tracker.store_init_configuration(dict(options))
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        self._tracker.log(dict(values), step=step)
+
+    def close(self) -> None:
+        self._tracker.finish()
+
+
+class TensorBoard(_OfAccelerate):
+    """Writes into RUN/tensorboard."""
+
+    package = "tensorboard"
+
+    def __init__(self, run: Path, options: Mapping[str, bool | int | float | str], step: int):
+        # A resumed run repeats steps after its last save: TensorBoard drops those it has.
+        self._start(TensorBoardTracker(self.package, run, purge_step=step + 1), options)
+
+    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
+        self._tracker.log_images({name: picture[None]}, step=step, dataformats="NHWC")
+
+
+class WeightsAndBiases(_OfAccelerate):
+    """Writes into RUN/wandb; a resumed training goes on in the same wandb run."""
+
+    package = "wandb"
+
+    def __init__(self, run: Path, options: Mapping[str, bool | int | float | str], step: int):
+        place = run / "wandb" / "id"
+        if not place.is_file():
+            write_text(place, uuid.uuid4().hex)
+        own = {"name": run.resolve().name, "dir": str(run), "id": place.read_text()}
+        self._start(WandBTracker("qgs", **own, resume="allow"), options)
+
+    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
+        self._tracker.log_images({name: [picture]}, step=step)
+
+
+def tracker_kind(name: str) -> type[Tracker]:
+    """The tracker that `training.trackers` calls `name`.
+
+    Raises ValueError for one that is not installed, MissingExtraError if its package is missing.
+    """
+    kinds: dict[str, type[Tracker]] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
+    offered = {entry.name: entry for entry in installed(GROUP)}
+    if name not in {*kinds, *offered}:
+        raise ValueError(
+            f"training.trackers names {name!r}, which no installed distribution offers; there are "
+            f"{listed(sorted({*kinds, *offered}))}"
+        )
+    kind = kinds.get(name) or load(offered[name], Tracker)
+    if kind.package and find_spec(kind.package) is None:
+        raise MissingExtraError(
+            f"training.trackers names {name}, which is not installed: run "
+            f'`pip install "query-gaussians[{name}]"`, or take it out of training.trackers'
+        )
+    return kind
+
+
 class Trackers:
     """The trackers of a recipe, opened when the run's folder exists; all on the main process.
 
-    TensorBoard writes into RUN/tensorboard, wandb into RUN/wandb; its run goes on when training is
-    resumed. Raises MissingExtraError for a tracker whose package is not installed.
+    Raises as `tracker_kind`.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        for name in names:
-            if find_spec(name) is None:
-                raise MissingExtraError(
-                    f"training.trackers names {name}, which is not installed: run "
-                    f'`pip install "query-gaussians[{name}]"`, or take it out of training.trackers'
-                )
-        self._names = names
-        self._open: list[GeneralTracker] = []
+        self._kinds = [tracker_kind(name) for name in names]
+        self._open: list[Tracker] = []
 
     def open(self, run: Path, recipe: Recipe, step: int = 0) -> None:
         """Track into the folder `run` from step `step` + 1 on; log the options of `recipe`."""
         options = flat(recipe.tree).items()
         plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in options}
-        for name in self._names:
-            if name == "tensorboard":
-                tracker = TensorBoardTracker(name, logging_dir=run, purge_step=step + 1)
-            else:
-                place = run / "wandb" / "id"
-                if not place.is_file():
-                    write_text(place, uuid.uuid4().hex)
-                own = {"name": run.resolve().name, "dir": str(run), "id": place.read_text()}
-                tracker = WandBTracker("qgs", **own, resume="allow")
-            tracker.start()
-            tracker.store_init_configuration(plain)
-            self._open.append(tracker)
+        self._open = [kind(run, plain, step) for kind in self._kinds]
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Numbers of a step, by name."""
         for tracker in self._open:
-            tracker.log(dict(values), step=step)
+            tracker.log(values, step)
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
         """A uint8 (H, W, 3) picture."""
         for tracker in self._open:
-            if isinstance(tracker, TensorBoardTracker):
-                tracker.log_images({name: picture[None]}, step=step, dataformats="NHWC")
-            elif isinstance(tracker, WandBTracker):
-                tracker.log_images({name: [picture]}, step=step)
+            tracker.picture(name, picture, step)
 
     def close(self) -> None:
-        """End tracking; what was logged is on the disk then."""
+        """End tracking."""
         for tracker in self._open:
-            tracker.finish()
+            tracker.close()
         self._open = []
 
 

@@ -4,17 +4,16 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import gather_object, set_seed
+from accelerate.utils import set_seed
 from rich.console import Console
 from torch import Tensor, nn
 
@@ -22,45 +21,35 @@ from qgs.composer import Recipe
 from qgs.composer.flow import keys_are_read
 from qgs.composer.recipe import annotated
 from qgs.contracts import Outcome, TrainingConfig
+from qgs.contracts.schedule import follow
 from qgs.data.sampling import Batch
 from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
-from qgs.engine.checkpoint import (
-    OptimizerState,
-    RandomStates,
-    Saver,
-    number_in,
-    refuse_other_data,
-    saved_state,
-)
 from qgs.engine.distributed import (
+    RandomStates,
     StopRequest,
-    average_gradients,
     choose_device,
+    gathered,
     make_accelerator,
     mean,
-    shard,
     stop_requests,
-    unsynchronised,
-    wants_shards,
-    whole,
 )
-from qgs.engine.fit import explained, refuse_unfit
-from qgs.engine.folder import FolderGoneError, RunFolder
-from qgs.engine.guard import Guard, not_finite
+from qgs.engine.folder import RunFolder, Saver, State, refuse_other_data, saved_state
+from qgs.engine.guard import Guard, OutOfMemoryError, not_finite
 from qgs.engine.initial import initialise
-from qgs.engine.objective import TrainingPass
-from qgs.engine.parameters import MovingAverage, make_optimizer
+from qgs.engine.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
+from qgs.engine.training_pass import TrainingPass
 from qgs.io.files import write_text
+from qgs.memory import is_out_of_memory
 from qgs.model import QueryGaussianModel
 
-MAX_REASONS = 100
-"""Reasons of samples left out that a process counts on their own; further ones are OTHERS."""
+ELSEWHERE = "another process of this training has no next batch; see its own message"
 
-OTHERS = "for other reasons"
-
-ELSEWHERE = "another process of this training has no next batch; its own message tells why"
+LESS_MEMORY = (
+    "lower training.batch_size, training.render_views, views.inputs, views.targets, "
+    "data.image_size, model.queries.count or model.head.gaussians_per_query"
+)
 
 _log = logging.getLogger(__name__)
 
@@ -110,7 +99,7 @@ def train(
     raises; the run is then saved where it stood, and a note of the error says so.
     """
     if not resume:
-        RunFolder(run).refuse_other(resume)
+        RunFolder(run).refuse_other(resume)  # before the data is opened, which may take minutes
     terminal = console or Console(stderr=True)
     chosen = choose_device(device, terminal.print)
     set_seed(recipe.seed)
@@ -120,11 +109,7 @@ def train(
         for note in trainer.notes:
             terminal.print(note, highlight=False)
         with TrainingProgress(terminal) as progress, stop_requests(terminal.quiet) as stop:
-            try:
-                return trainer.run(progress, stop)
-            except FolderGoneError as error:
-                trainer.save_elsewhere(error)
-                raise
+            return trainer.run(progress, stop)
 
 
 class Trainer:
@@ -149,77 +134,97 @@ class Trainer:
         with ExitStack() as resources:
             resources.callback(self.folder.close)
             resources.callback(self.trackers.close)
-            self._build(device, resources)
+            # The order matters: the state is read before memory is taken for the model, the model
+            # draws its random numbers before anything else does, and the data comes last, since
+            # its first batch depends on how many samples the restored run has seen.
+            self.optimizer = recipe.build_optimizer()
+            self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
+            saved = self._claim_folder()
+            self._build_model(initial=saved is None)
+            source = recipe.build_data()
+            self._conditions = {
+                "step_size": self._batch_samples * self.config.accumulate,
+                "scenes": scenes_fingerprint(source),
+            }
+            self._build_parts()
+            if saved is not None:
+                self.saver.restore(saved)
+            self.resumed_at = self.step if saved is not None else None
+            self._follow_schedules()
+            batches = training_batches(
+                source,
+                recipe.views,
+                self.config.batch_size,
+                recipe.seed,
+                start=self.samples // self._batch_samples,
+                share=Share(self.accelerator.process_index, self.accelerator.num_processes),
+                workers=self.config.workers,
+                skips=self.config.on_bad_sample == "skip",
+            )
+            resources.callback(batches.close)
+            self.feed = Feed(batches, self.config.accumulate)
+            self._fetch_first()
             self._resources = resources.pop_all()
 
-    def _build(self, device: str, resources: ExitStack) -> None:
-        """Everything that has a state, as it is saved where the run is continued; then the data."""
-        recipe, config = self.recipe, self.config
-        self.optimizer = recipe.build_optimizer()
-        self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
-        saved = None
-        if self._resumes:  # a folder that holds a run is this one's from now on
-            self.folder.refuse_other(resume=True)
-            if self.accelerator.is_main_process and not self.folder.is_new:
-                self.folder.take()
-            self.accelerator.wait_for_everyone()
-            saved = saved_state(self.folder, recipe)
-        refuse_unfit(recipe, self.accelerator)
-        self.model = recipe.build_model(self.accelerator.device, pretrained=not saved).train()
-        warnings = [f"warning: {text}" for text in recipe.warnings]
-        self.notes = warnings + ([] if saved else initialise(self.model, recipe))
-        objective = TrainingPass.of(recipe, self.model).to(self.accelerator.device)
-        if wants_shards(self.accelerator):  # before the optimiser, whose moments lie in shards too
-            shard(self.model)
-        factors = recipe.rate_factors(objective)
-        prepared: Any = objective, make_optimizer(objective, self.optimizer, factors)
-        if not wants_shards(self.accelerator):
-            prepared = self.accelerator.prepare(*prepared)
-        self.objective, self.torch_optimizer = prepared
-        self.average = MovingAverage(self.model, config.ema) if config.ema else None
-        self.saver = Saver(self.accelerator, self.folder, self.model)
-        self._gradients = partial(compute_gradients, self.accelerator, self.objective, config)
-        self.guard = Guard(self.accelerator, objective, self.saver, recipe, self._gradients)
+    @property
+    def _batch_samples(self) -> int:
+        """Samples of a batch over all processes."""
+        return self.config.batch_size * self.accelerator.num_processes
+
+    def _claim_folder(self) -> Mapping[str, State] | None:
+        """Lock the folder of a run that is continued; its saved parts, None to start at step 0."""
+        if not self._resumes:
+            return None
+        self.folder.refuse_other(resume=True)
+        if self.accelerator.is_main_process and not self.folder.is_new:
+            self.folder.take()
+        self.accelerator.wait_for_everyone()
+        saved = saved_state(self.folder, self.recipe)
+        return saved.parts if saved else None
+
+    def _build_model(self, initial: bool) -> None:
+        """The model, what trains it, and torch's optimiser; initial: load `init_from`."""
+        recipe, accelerator = self.recipe, self.accelerator
+        self.model = recipe.build_model(accelerator.device, pretrained=initial).train()
+        self.notes = [f"warning: {text}" for text in recipe.warnings]
+        self.notes += initialise(self.model, recipe) if initial else []
+        self.training_pass = TrainingPass.of(recipe, self.model).to(accelerator.device)
+        factors = recipe.rate_factors(self.training_pass)
+        optimizer = make_optimizer(self.training_pass, self.optimizer, factors)
+        prepared: Any = accelerator.prepare(self.training_pass, optimizer)
+        wrapped, self.torch_optimizer = prepared
+        self._gradients = partial(compute_gradients, accelerator, wrapped, self.config)
+        self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
+
+    def _build_parts(self) -> None:
+        """What watches, saves and judges; `saver.parts` is everything that continues the run."""
+        accelerator, training_pass = self.accelerator, self.training_pass
+        self.saver = Saver(accelerator, self.folder, self.model)
+        self.guard = Guard(accelerator, training_pass, self.saver, self.config, self._gradients)
         self.evaluations = PeriodicEvaluation(
-            self.accelerator, recipe, self.model, self.average, self.folder.path, self.trackers
+            accelerator, self.recipe, self.model, self.average, self.folder.path, self.trackers
         )
-        source, processes = recipe.build_data(), self.accelerator.num_processes
-        self._conditions = {
-            "step_size": config.batch_size * config.accumulate * processes,
-            "scenes": scenes_fingerprint(source),
-        }
         self.saver.parts |= {  # besides the weights
             "guard": self.guard,
             "good": self.guard.good,
             "counters": self,
-            "moments": OptimizerState(objective, self.torch_optimizer),
+            "moments": OptimizerState(training_pass, self.torch_optimizer),
             "schedule": self.optimizer,
-            "random": RandomStates(self.accelerator),
+            # Last: restoring a part may draw random numbers.
+            "random": RandomStates(accelerator),
             **({"ema": self.average} if self.average else {}),
         }
-        if saved:
-            self.saver.restore(saved)
-        self.resumed_at = self.step if saved else None
-        self._follow = objective.follow
-        self._follow(self.step)
-        batches = training_batches(
-            source,
-            recipe.views,
-            config.batch_size,
-            recipe.seed,
-            start=self.samples // (config.batch_size * processes),
-            share=Share(self.accelerator.process_index, processes),
-            workers=config.workers,
-            skips=config.on_bad_sample == "skip",
-        )
-        resources.callback(batches.close)
-        self.feed = Feed(batches, config.accumulate)
+
+    def _follow_schedules(self) -> None:
+        self.training_pass.follow(self.step)
+        follow([self.optimizer], self.step)
+
+    def _fetch_first(self) -> None:
+        """Fetch the first batch; where one process fails, all raise, and none waits for it."""
         self.feed.fetch()
-        flag = torch.tensor(float(bool(self.feed.error)))
-        failed = mean(self.accelerator, flag.to(self.accelerator.device))
-        if float(failed):
-            with explained(self.step):
-                raise self.feed.error or SampleError(ELSEWHERE)
+        flag = torch.tensor(float(bool(self.feed.error)), device=self.accelerator.device)
+        if float(mean(self.accelerator, flag)):
+            raise self.feed.error or SampleError(ELSEWHERE)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
@@ -227,63 +232,9 @@ class Trainer:
             if not self.folder.checkpoint.exists():
                 self.guard.save(self.step)
             return self._result(None)
-        stopped_by, alone = None, self.accelerator.num_processes == 1
+        stopped_by = None
         while self.used < 1 and not stopped_by:
-            # Gradients of this step's batches; those of the next step are fetched meanwhile.
-            rate = self.optimizer.learning_rate(self.step, self.seconds)
-            for group in self.torch_optimizer.param_groups:
-                group["lr"] = rate * group["factor"]
-            self.torch_optimizer.zero_grad(set_to_none=True)
-            batches = self.feed.batches
-            with explained(self.step, self.guard.save_to_go_on if alone else None):
-                measured = self._gradients(batches)
-            for bad in (bad for batch in batches for bad in batch.left_out):
-                known = bad in self.left_out or len(self.left_out) < MAX_REASONS
-                reason = bad if known else OTHERS
-                if not self.left_out[reason]:
-                    _log.warning("a sample is left out: %s", bad)
-                self.left_out[reason] += 1
-            if not stop and self.step + 1 < self.config.steps:
-                self.feed.fetch()
-            numbers, asked_to_stop, no_data = self._means(measured, stop)
-
-            # The optimiser step, unless something is not finite.
-            symptom = not_finite(numbers, self.model)
-            if symptom:
-                self._open_folder()
-                self.guard.leave_out(self.step, batches, symptom)
-            else:
-                with explained(self.step):
-                    self.torch_optimizer.step()
-                if self.average:
-                    self.average.update()
-                self.guard.passed(numbers)
-                self.saver.see(batches)
-            self.step += 1
-            self._follow(self.step)
-            self.samples += sum(len(b.scenes) for b in batches) * self.accelerator.num_processes
-            self._tick()
-
-            # What is told, saved and evaluated.
-            self._open_folder()
-            record = {"step": self.step, "seconds": self.seconds, "lr": rate, **numbers}
-            self._report(record | ({"skipped": True} if symptom else {}), progress)
-            self.guard.refuse_collapse(self.step)
-            evaluates = self._every(self.config.evaluate_every)
-            self.guard.keep_good(self.step)
-            saves = self._every(self.config.save_every) or evaluates
-            if saves and not self.guard.detector.dead_steps:
-                self.guard.save(self.step)
-            if evaluates:
-                self._evaluate(stop)
-            if asked_to_stop or evaluates:
-                stopped_by = self._stopped_by(stop)
-            if no_data and self.used < 1 and not stopped_by:
-                self.guard.save_to_go_on(self.step)
-                error = self.feed.error or SampleError(ELSEWHERE)
-                error.add_note(f"The run is saved at step {self.step}; continue with --resume")
-                with explained(self.step, lambda step: None):  # it is saved
-                    raise error
+            stopped_by = self._one_step(progress, stop)
         stopped_by = stopped_by or self._stopped_by(stop)
         self.guard.finish(self.step, stopped=stopped_by is not None)
         if self.average and not stopped_by and self.evaluations.latest != self.step:
@@ -291,20 +242,85 @@ class Trainer:
             stopped_by = self._stopped_by(stop)
         return self._result(stopped_by)
 
-    def save_elsewhere(self, gone: FolderGoneError) -> None:
-        """Save the run beside its lost folder, and note so on `gone`; needs one process alone."""
-        if self.accelerator.num_processes > 1:
-            return
-        places = (Path(f"{self.folder.path}-saved-{n}") for n in count(1))
-        place = next(path for path in places if not path.exists())
-        self.folder.close()
-        self.folder = self.saver.folder = RunFolder(place)
-        self.folder.take()
-        write_text(self.folder.recipe, annotated(self.recipe) + "\n")
-        self.saver.save(self.step)
-        self.folder.close()
-        note = f"The run, without its history, is saved at step {self.step} in {place}; it goes on"
-        gone.add_note(f"{note} there with --resume --out {place}")
+    def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> str | None:
+        """One optimiser step, and what is due after it; the signal that asked to stop, or None."""
+        rate = self._set_learning_rate()
+        batches = self.feed.batches
+        with self._memory_explained(saves=True):
+            measured = self._gradients(batches)
+        # The next batches are fetched before the step's numbers are read, so that a GPU computes
+        # gradients meanwhile, and processes learn of a failure together with the numbers.
+        if not stop and self.step + 1 < self.config.steps:
+            self.feed.fetch()
+        numbers, asked_to_stop, no_data = self._read(measured, stop)
+        symptom = not_finite(numbers, self.model)
+        if symptom:
+            self._open_folder()  # an incident is saved in it
+            self.guard.leave_out(self.step, batches, symptom)
+        else:
+            self._update(numbers, batches)
+        self.step += 1
+        self.samples += self._batch_samples * len(batches)
+        self._follow_schedules()
+        self._open_folder()
+        record = {"step": self.step, "seconds": self.seconds, "lr": rate, **numbers}
+        self._report(record | ({"skipped": True} if symptom else {}), batches, progress)
+        # A dead model must not be saved as a good one, so this comes before saving.
+        self.guard.refuse_collapse(self.step)
+        self.guard.keep_good(self.step)
+        return self._save_and_evaluate(stop, asked_to_stop, no_data)
+
+    def _set_learning_rate(self) -> float:
+        rate = self.optimizer.learning_rate(self.step, self.seconds)
+        for group in self.torch_optimizer.param_groups:
+            group["lr"] = rate * group["factor"]
+        self.torch_optimizer.zero_grad(set_to_none=True)
+        return rate
+
+    def _update(self, numbers: Mapping[str, float], batches: Sequence[Batch]) -> None:
+        with self._memory_explained():
+            self.torch_optimizer.step()
+        if self.average:
+            self.average.update()
+        self.guard.passed(numbers)
+        self.saver.see(batches)
+
+    def _save_and_evaluate(
+        self, stop: StopRequest, asked_to_stop: bool, no_data: bool
+    ) -> str | None:
+        evaluates = self._every(self.config.evaluate_every)
+        saves = evaluates or self._every(self.config.save_every)
+        if saves and not self.guard.detector.dead_steps:
+            self.guard.save(self.step)
+        if evaluates:
+            self._evaluate(stop)
+        stopped_by = self._stopped_by(stop) if asked_to_stop or evaluates else None
+        if no_data and self.used < 1 and not stopped_by:
+            self.guard.save_to_go_on(self.step)
+            error = self.feed.error or SampleError(ELSEWHERE)
+            error.add_note(f"The run is saved at step {self.step}; continue with --resume")
+            raise error
+        return stopped_by
+
+    @contextmanager
+    def _memory_explained(self, saves: bool = False) -> Iterator[None]:
+        """Raise OutOfMemoryError where the block finds no memory; saves: weights are untouched."""
+        try:
+            yield
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+            # Saving, too, takes memory; the files of the last save are whole in any case. With
+            # several processes the others would wait for this one in vain.
+            if saves and self.step and self.accelerator.num_processes == 1:
+                with suppress(Exception):
+                    self.guard.save_to_go_on(self.step)
+            raise OutOfMemoryError(
+                f"out of memory in step {self.step + 1}: {str(error).splitlines()[0][:300]}. "
+                "What was saved continues with --resume, if training.batch_size is lowered where "
+                "training.accumulate is raised as much, or training.render_views is set. A new "
+                f"run takes less when you {LESS_MEMORY}."
+            ) from error
 
     @property
     def used(self) -> float:
@@ -313,37 +329,39 @@ class Trainer:
         return max(self.step / self.config.steps, of_seconds)
 
     def state(self) -> dict[str, Any]:
-        """What was counted so far, and what must not change for this to mean the same."""
+        """Counters, and what must not change for them to mean the same."""
         counted = {"step": self.step, "samples": self.samples, "seconds": self.seconds}
         return counted | self._conditions | {"left_out": self._all_left_out()}
-
-    def _all_left_out(self) -> dict[str, int]:
-        """Samples left out by all processes, which must all call this."""
-        own = [self.left_out]
-        counts = gather_object(own) if self.accelerator.num_processes > 1 else own
-        return dict(sum(counts, Counter[str]()))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
         refuse_other_data(state, self._conditions, self.folder)
-        self.step, self.samples = number_in(state, "step"), number_in(state, "samples")
-        self.seconds = float(number_in(state, "seconds", float))
-        if self.step > self.samples:
-            raise ValueError(f"{self.step} steps of {self.samples} samples")
-        if self.accelerator.is_main_process:
-            self.left_out = Counter({key: int(n) for key, n in state["left_out"].items()})
+        self.step, self.samples, self.seconds = (state[n] for n in ("step", "samples", "seconds"))
+        if self.accelerator.is_main_process:  # of all processes: one counts on
+            self.left_out = Counter(state["left_out"])
+
+    def _all_left_out(self) -> dict[str, int]:
+        """Samples left out by all processes, which must all call this."""
+        return dict(sum(gathered(self.accelerator, self.left_out), Counter[str]()))
 
     def close(self) -> None:
         """Stop reading ahead, close the history and leave the folder to others."""
         self._resources.close()
 
-    def _means(
+    def _read(
         self, measured: Mapping[str, Tensor], stop: StopRequest
     ) -> tuple[dict[str, float], bool, bool]:
-        """Means of a step's numbers over processes; whether any must stop, or has no next batch."""
-        flags = torch.tensor([bool(stop), bool(self.feed.error)]).to(self.accelerator.device)
-        values = torch.stack([value.float() for value in (*measured.values(), *flags)])
-        *numbers, asked_to_stop, no_data = mean(self.accelerator, values).tolist()
+        """Means of a step's numbers over processes; whether any must stop, or has no next batch.
+
+        The one time in a step that the host waits for the device, so the clock is read here too:
+        its mean over processes, so that all use up a budget of time together.
+        """
+        now = time.perf_counter()
+        spent, self._last_tick = now - (self._last_tick or now), now
+        own = torch.tensor([spent, bool(stop), bool(self.feed.error)]).to(self.accelerator.device)
+        values = torch.stack([value.float() for value in (*measured.values(), *own)])
+        *numbers, spent, asked_to_stop, no_data = mean(self.accelerator, values).tolist()
+        self.seconds += spent
         return dict(zip(measured, numbers, strict=True)), asked_to_stop > 0, no_data > 0
 
     def _open_folder(self) -> None:
@@ -360,12 +378,18 @@ class Trainer:
             self.trackers.open(self.folder.path, self.recipe, self.resumed_at or 0)
         self.accelerator.wait_for_everyone()
 
-    def _report(self, record: Mapping[str, float], progress: TrainingProgress) -> None:
+    def _report(
+        self, record: Mapping[str, float], batches: Sequence[Batch], progress: TrainingProgress
+    ) -> None:
+        for bad in (bad for batch in batches for bad in batch.left_out):
+            if bad not in self.left_out:
+                _log.warning("a sample is left out: %s", bad)
+            self.left_out[bad] += 1
         if self.accelerator.is_main_process:
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)
             self.trackers.log(finite, self.step)
-        judged = self.recipe.training.judge_inputs * self.recipe.views.inputs
+        judged = self.config.judge_inputs * self.recipe.views.inputs
         images = self.samples * (self.recipe.views.targets + judged)
         shown = record["loss"], record["psnr"], images, self.seconds, self.used
         if progress.update(self.step, *shown):
@@ -375,18 +399,12 @@ class Trainer:
         """Whether this step is one of every `steps`; none is where that is 0."""
         return bool(steps) and self.step % steps == 0
 
-    def _tick(self) -> None:
-        """Bring `seconds` up to date: the mean over processes, so that all decide alike."""
-        now = time.perf_counter()
-        spent = torch.tensor(now - (self._last_tick or now), device=self.accelerator.device)
-        self.seconds += float(mean(self.accelerator, spent))
-        self._last_tick = now
-
     def _evaluate(self, stop: StopRequest) -> None:
-        """Evaluate, which takes no time on the clock."""
-        self._tick()
+        """Evaluate, with the clock stopped."""
+        started = time.perf_counter()
         self.evaluations.run(self.step, stop)
-        self._last_tick = time.perf_counter()
+        if self._last_tick is not None:
+            self._last_tick += time.perf_counter() - started
 
     def _stopped_by(self, stop: StopRequest) -> str | None:
         """The signal's name when any process was asked to stop."""
@@ -396,7 +414,7 @@ class Trainer:
 
     def _result(self, stopped_by: str | None) -> TrainingResult:
         return TrainingResult(
-            self.saver.whole_model().eval(),
+            self.model.eval(),
             self.folder,
             self.step,
             self.seconds,
@@ -412,13 +430,13 @@ def compute_gradients(
 ) -> dict[str, Tensor]:
     """Leave the gradients of the mean loss of `batches`, clipped; what was measured, 0-d.
 
-    objective: as accelerate wraps it. Only the last batch exchanges gradients between processes.
-    "gradient" is the norm before clipping, over all processes; the rest is of this one.
+    objective: a `TrainingPass` as accelerate wraps it. "gradient" is the norm before clipping, over
+    all processes; the rest is of this one. Nothing waits for the device.
     """
     device, sums = accelerator.device, dict[str, Tensor]()
     for number, batch in enumerate(batches, start=1):
-        last = number == len(batches)
-        with nullcontext() if last else unsynchronised(accelerator, objective):
+        # Only the last batch exchanges gradients between processes.
+        with nullcontext() if number == len(batches) else accelerator.no_sync(objective):
             inputs, targets = batch.inputs.to(device), batch.targets.to(device)
             with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
                 outcome: Outcome = objective(inputs, targets)
@@ -426,7 +444,6 @@ def compute_gradients(
         found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
         for name, value in found.items():
             sums[name] = sums.get(name, 0) + value / len(batches)
-    average_gradients(accelerator, objective)
     norm = accelerator.clip_grad_norm_(objective.parameters(), config.clip)
-    sums["gradient"] = whole(torch.as_tensor(norm)).to(device)
+    sums["gradient"] = torch.as_tensor(norm, device=device)
     return sums

@@ -146,8 +146,14 @@ def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def nonfinite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
-    """Names of the tensors that hold NaN or infinity."""
-    return [name for name, tensor in tensors if not bool(tensor.isfinite().all())]
+    """Names of the tensors, all on one device, that hold NaN or infinity."""
+    names, finite = [], []
+    for name, tensor in tensors:
+        names.append(name)
+        finite.append(tensor.isfinite().all())
+    # One read for all: each read would make the host wait for the device.
+    flags = torch.stack(finite).tolist() if finite else []
+    return [name for name, is_finite in zip(names, flags, strict=True) if not is_finite]
 
 
 def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()) -> list[str]:

@@ -15,7 +15,7 @@ from qgs.composer import Recipe, RecipeError, registry, resolve
 from qgs.composer.slots import SLOTS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import inline
 from qgs.contracts import Component
-from qgs.engine.objective import TrainingPass
+from qgs.engine.training_pass import TrainingPass
 
 PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "tokengs2026"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")

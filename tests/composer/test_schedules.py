@@ -81,7 +81,7 @@ def test_another_schedule_replaces_the_one_below_whole() -> None:
             "model.queries.count={schedule: constant, value: 3}",
             "`count` of `qgs/latent` takes no schedule",
         ),
-        ("optimizer.learning_rate={schedule: constant, value: 3}", "(options that can: none)"),
+        ("optimizer.warmup={schedule: constant, value: 3}", "(options that can: learning_rate)"),
         ("losses.visibility.clamp={schedule: constant, value: 3}", "(options that can: weight)"),
         (f"{DILATION}={{schedule: linaer, values: [1, 2], at: [1, 2]}}", "mean `linear`?"),
         (

@@ -11,7 +11,6 @@ import qgs
 from qgs.composer import Recipe
 from qgs.contracts import TrainingConfig
 from qgs.data.evaluation import evaluation_samples
-from qgs.engine.causes import blamed
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder
 from qgs.engine.guard import (
@@ -22,9 +21,9 @@ from qgs.engine.guard import (
     broken_tensors,
     not_finite,
 )
-from qgs.engine.objective import measure
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
+from qgs.engine.training_pass import measure
 from qgs.io.checkpoint import CheckpointFile
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
@@ -102,21 +101,13 @@ def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     assert recipe.training.collapse_window == TrainingConfig().collapse_window
     with pytest.raises(CollapseError) as caught:
         run_anywhere(recipe, tmp_path / "run")
-    message = str(caught.value)
-    assert "checkpoint.safetensors" in message
-    assert message.count("learning_rate") == 1
-    for cause in ("visibility", "opacity_bias"):
-        assert cause not in message
+    assert "checkpoint.safetensors" in str(caught.value)
     folder = RunFolder(tmp_path / "run")
     history = folder.history()
     kept = CheckpointFile(folder.checkpoint).step
     last_alive = max(record["step"] for record in history if record["alpha"] >= EMPTY_ALPHA)
     assert len(history) <= last_alive + 100
     assert last_alive - 50 < kept <= last_alive < len(history) < 300
-    assert (
-        f"most likely in this recipe: optimizer.learning_rate is {0.5:g} (default 0.0004)"
-        in message
-    )
     assert mean_alpha(folder.checkpoint, recipe) > EMPTY_ALPHA
 
 
@@ -128,28 +119,6 @@ def test_gaussians_invisible_from_the_start_are_noticed_within_the_window(
         run_anywhere(tiny("tokengs", INVISIBLE, *options), tmp_path / "run")
     history = RunFolder(tmp_path / "run").history()
     assert [record["step"] for record in history] == list(range(1, 21))
-
-
-def test_the_option_to_blame_is_that_of_the_recipe(tiny: Tiny) -> None:
-    dark, stands_out = blamed(tiny("tokengs", INVISIBLE), None, {})
-    assert stands_out
-    assert "model.head.opacity_bias is -20 (default -2.0)" in dark
-    assert "opacity of 2e-09" in dark
-    far, stands_out = blamed(tiny("tokengs"), None, {})
-    assert "views.scale_factor is 0.4" in far
-    assert not stands_out
-    far, _ = blamed(tiny("tokengs", "views.scale=auto"), None, {})
-    assert "views.scale is auto" in far
-    assert "scale_factor" not in far
-    owners = {"mse": "photometric", "visibility": "visibility"}
-    heavy = tiny("tokengs", "losses.visibility.weight=50.0", "optimizer.learning_rate=1e-3")
-    named, _ = blamed(heavy, {"mse": 0.1, "visibility": 3.0}, owners)
-    assert "losses.visibility.weight is 50" in named
-    assert "97% of the loss" in named
-    fast = tiny("tokengs", "optimizer.learning_rate=0.5")
-    named, stands_out = blamed(fast, {"mse": 0.1, "visibility": 3.0}, owners)
-    assert stands_out
-    assert "optimizer.learning_rate is 0.5" in named
 
 
 def test_no_copy_is_made_while_the_images_get_worse() -> None:
@@ -172,13 +141,8 @@ def test_nan_stops_at_once_with_finite_weights(tiny: Tiny, tmp_path: Path) -> No
     trainer = Trainer(tiny("locus"), tmp_path / "run")
     with torch.no_grad():
         trainer.model.decoder[0].feed_forward_scale.gamma.fill_(torch.nan)
-    with closing(trainer), pytest.raises(CollapseError, match=r"step 1: .*nan") as caught:
+    with closing(trainer), pytest.raises(CollapseError, match=r"step 1: .*nan"):
         trainer.run(TrainingProgress(QUIET), StopRequest())
-    for cause in ("learning_rate", "precision", "images, poses"):
-        assert cause in str(caught.value)
-    assert "opacity_bias" not in str(caught.value)
-    named = "most likely in this recipe: optimizer.learning_rate is 0.0015"
-    assert str(caught.value).count("learning_rate") == str(caught.value).count(named) == 1
     model = qgs.load(trainer.folder.checkpoint)
     assert all(p.isfinite().all() for p in model.parameters())
 

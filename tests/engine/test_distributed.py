@@ -13,27 +13,24 @@ import yaml
 from safetensors.torch import load_file
 from training_runs import TWO, Tiny, losses, read_jsonl, run, run_calling
 
-import qgs
 from qgs.composer import Recipe
-from qgs.engine.checkpoint import read_state
 from qgs.engine.distributed import StopRequest
+from qgs.engine.folder import read_state
 from qgs.engine.training import ELSEWHERE, Trainer
 
 WORKER = Path(__file__).with_name("distributed.py")
-FSDP = {"ACCELERATE_USE_FSDP": "true"}
-"""What `accelerate launch --use_fsdp` tells its processes."""
 PARTS = 'optimizer.parts={"decoder.0.feed_forward": 0, "head": 0.5}'
 """One sublayer stays as it is, and the head learns slower."""
 
 
-def told_by_two(recipe: Recipe, run: Path, spoil: str = "", **environment: str) -> str:
+def told_by_two(recipe: Recipe, run: Path, spoil: str = "") -> str:
     """Continue or start `run` by torchrun; what both processes print."""
     file = run.with_suffix(".yaml")
     file.write_text(yaml.safe_dump(dict(recipe.tree)))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     done = subprocess.run(
         [*command, str(WORKER), str(file), str(run), spoil],
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=240,
@@ -42,9 +39,9 @@ def told_by_two(recipe: Recipe, run: Path, spoil: str = "", **environment: str) 
     return done.stdout
 
 
-def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "", **environment: str) -> None:
+def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "") -> None:
     """As `told_by_two`; both processes must say the same of the run."""
-    told = told_by_two(recipe, run, spoil, **environment)
+    told = told_by_two(recipe, run, spoil)
     # wherever they stand: what libraries print meanwhile lands in the same lines
     said = re.findall(r"(True|False) (\d+) (\d+\.\d+)", told)
     assert sorted(main for main, *_ in said) == ["False", "True"]
@@ -78,12 +75,9 @@ def test_two_processes_train_a_model_whose_keys_nothing_reads(tiny: Tiny, tmp_pa
     train_in_two_processes(tiny("tokengs", *NO_LAYERS), tmp_path / "two")
 
 
-@pytest.mark.parametrize("accumulate", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_shards_continue_what_one_process_began(
-    tiny: Tiny, tmp_path: Path, accumulate: int
-) -> None:
+def test_two_processes_continue_what_one_began(tiny: Tiny, tmp_path: Path) -> None:
     options = ("training.save_every=2", "training.ema=0.9", PARTS)
-    alone = tiny("locus", "training.batch_size=4", *options)
+    alone = tiny("locus", "training.batch_size=2", *options)
     run(alone, tmp_path / "alone")
 
     def kill(trainer: Trainer, stop: StopRequest) -> None:
@@ -91,29 +85,24 @@ def test_shards_continue_what_one_process_began(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_calling(kill, alone, tmp_path / "shards")
-    part = f"training.batch_size={2 // accumulate}", f"training.accumulate={accumulate}"
-    train_in_two_processes(tiny("locus", *part, *options), tmp_path / "shards", **FSDP)
-    assert losses(tmp_path / "shards") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
+        run_calling(kill, alone, tmp_path / "two")
+    train_in_two_processes(tiny("locus", "training.batch_size=1", *options), tmp_path / "two")
+    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
     ours, theirs = (
-        read_state(tmp_path / n / "state.safetensors").parts for n in ("shards", "alone")
+        read_state(tmp_path / name / "state.safetensors").parts for name in ("two", "alone")
     )
     for name in ("weights", "moments", "ema", "good"):
         assert ours[name].keys() == theirs[name].keys()
-        for key, tensor in ours[name].items():
-            torch.testing.assert_close(tensor, theirs[name][key], rtol=1e-3, atol=1e-4)
-    qgs.load(tmp_path / "shards" / "checkpoint.safetensors")
+        for key, value in ours[name].items():
+            torch.testing.assert_close(value, theirs[name][key], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", [{}, FSDP], ids=["copies", "shards"])
-def test_two_processes_make_two_passes_as_one_does(
-    tiny: Tiny, tmp_path: Path, two: None, environment: dict[str, str]
-) -> None:
+def test_two_processes_make_two_passes_as_one_does(tiny: Tiny, tmp_path: Path, two: None) -> None:
     alone = tiny("locus", *TWO, "training.batch_size=2")
     run(alone, tmp_path / "alone")
     pair = tiny("locus", *TWO, "training.batch_size=1", "training.render_views=1")
-    train_in_two_processes(pair, tmp_path / "two", **environment)
+    train_in_two_processes(pair, tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
 
 

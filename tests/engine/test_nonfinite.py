@@ -16,12 +16,12 @@ from training_runs import Tiny
 import qgs
 from qgs.composer import Recipe
 from qgs.data.stream import training_batches
-from qgs.engine.checkpoint import Saver
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.folder import RunFolder
-from qgs.engine.guard import MAX_SAVED, BadTensor, Guard, Watch
-from qgs.engine.objective import TrainingPass
+from qgs.engine.folder import RunFolder, Saver
+from qgs.engine.guard import MAX_SAVED, Guard
+from qgs.engine.incidents import BadTensor, first_bad_tensor
 from qgs.engine.training import compute_gradients
+from qgs.engine.training_pass import TrainingPass
 from qgs.types import named_tensors
 
 GUIDE = Path(__file__).parents[2] / "docs/training.md"
@@ -44,10 +44,7 @@ class Step:
         stream.close()
 
     def first(self) -> BadTensor | None:
-        watch = Watch()
-        with watch.on(self.objective):
-            self.gradients(self.batches)
-        return watch.first
+        return first_bad_tensor(self.objective, lambda: self.gradients(self.batches))
 
     def first_bad(self) -> BadTensor:
         found = self.first()
@@ -164,7 +161,7 @@ def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPat
 
 def guard_of(step: Step, folder: Path) -> Guard:
     saver = Saver(step.accelerator, RunFolder(folder), step.model)
-    return Guard(step.accelerator, step.objective, saver, step.recipe, step.gradients)
+    return Guard(step.accelerator, step.objective, saver, step.recipe.training, step.gradients)
 
 
 def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_plugin
 from qgs.contracts import Objective, Outcome, Passes
 from qgs.engine.distributed import StopRequest
-from qgs.engine.objective import TrainingPass
 from qgs.engine.training import Trainer
+from qgs.engine.training_pass import TrainingPass
 from qgs.types import Cameras, Views
 
 TERMS = {"alpha_consistency", "depth_consistency"}

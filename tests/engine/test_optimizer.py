@@ -14,7 +14,7 @@ from training_runs import Tiny, run, same, weights
 
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.composer import resolve
-from qgs.engine.checkpoint import CheckpointError, OptimizerState, read_state, write_state
+from qgs.engine.folder import read_state, write_state
 from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups
 from qgs.io.checkpoint import unique_tensors
 
@@ -105,14 +105,11 @@ def test_the_last_pattern_that_matches_counts(tiny: Tiny) -> None:
 @pytest.mark.parametrize(
     ("pattern", "fix"),
     [
-        ("encodr", r"did you mean `encoder`\?"),
-        ("decoder.9.self_attention", r"did you mean `decoder\.\*\.self_attention`\?"),
-        ("decoder.1.self_atention", r"did you mean `decoder\.1\.self_attention`\?"),
-        ("decoder.*.self_atention", r"did you mean `decoder\.\*\.self_attention`\?"),
-        ("decoder.layers.*.self_atention", r"did you mean `decoder\.layers\.\*\.self_attention`\?"),
-        ("decoder.refinment.x", r"did you mean `decoder\.refinement`\?"),
-        ("*.*.*.*.*.*.*.*", "its parts: encoder, queries, decoder, refinements, head"),
-        ("xy", "its parts: encoder, queries, decoder, refinements, head"),
+        ("encodr", "`encoder`"),
+        ("decoder.9.self_attention", "`decoder.*.self_attention`"),
+        ("decoder.1.self_atention", "`decoder.1.self_attention`"),
+        ("decoder.refinment.x", "`decoder.refinement`"),
+        ("*.*.*.*.*.*.*.*", "encoder, queries, decoder, refinements, head"),
     ],
 )
 def test_a_pattern_that_matches_nothing_ends_the_start(
@@ -121,8 +118,7 @@ def test_a_pattern_that_matches_nothing_ends_the_start(
     recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
     problem = refused(recipe, tmp_path / "run", by=run)
     assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
-    assert f"`{pattern}`" in problem.reason
-    assert re.search(fix, problem.fix)
+    assert fix in problem.fix
     assert not (tmp_path / "run").exists()
 
 
@@ -160,21 +156,14 @@ def test_frozen_parts_stay_and_are_not_remembered(tiny: Tiny, tmp_path: Path) ->
 
 
 PLAIN = """
-from pydantic import Field
 from torch.optim import SGD
-from qgs.contracts import Optimizer, OptimizerConfig, Plugin
+from qgs.contracts import Optimizer, Plugin
 
 class Plain(Optimizer):
     \"\"\"Gradient descent with momentum at one rate.\"\"\"
     name = "sgd"
-    class Config(OptimizerConfig):
-        \"\"\"Its only option.\"\"\"
-        rate: float = Field(default=0.01, gt=0)
-        \"\"\"The learning rate.\"\"\"
     def build(self, groups):
-        return SGD(groups, lr=self.config.rate, momentum=0.9)
-    def learning_rate(self, step, seconds):
-        return self.config.rate
+        return SGD(groups, lr=self.config.learning_rate, momentum=0.9)
 
 plugin = Plugin("plain", 1, (Plain,))
 """
@@ -185,7 +174,8 @@ def test_a_plugin_adds_an_optimiser_by_one_class(
 ) -> None:
     install("plain", "plain", PLAIN)
     tree = {**tiny("tokengs", "training.save_every=2").tree, "plugins": ["rooms", "plain"]}
-    tree["optimizer"] = {"type": "plain/sgd", "rate": 0.02, "parts": {"encoder": 0, "head": 0.5}}
+    parts = {"encoder": 0, "head": 0.5}
+    tree["optimizer"] = {"type": "plain/sgd", "learning_rate": 0.02, "parts": parts}
     recipe = resolve(tree)
     assert recipe.tree["optimizer"] == tree["optimizer"]
     through = run(recipe, tmp_path / "through")
@@ -195,7 +185,7 @@ def test_a_plugin_adds_an_optimiser_by_one_class(
     assert again.resumed_at == 2
     assert same(weights(again), weights(through))
     moments = read_state(again.folder.state).parts["moments"]
-    assert {key.rsplit("/")[-1] for key in moments} == {"idle", "momentum_buffer"}
+    assert {key.rsplit("/")[-1] for key in moments} == {"momentum_buffer"}
 
 
 @pytest.mark.parametrize("made", ["Adafactor(groups, lr=0.01)", "SGD(groups, lr=0.01)"])
@@ -203,7 +193,8 @@ def test_moments_of_any_shape_and_none_are_restored(
     tiny: Tiny, tmp_path: Path, install: Callable[..., None], made: str
 ) -> None:
     code = PLAIN.replace("import SGD", "import SGD, Adafactor").replace('("plain"', '("other"')
-    install("other", "other", code.replace("SGD(groups, lr=self.config.rate, momentum=0.9)", made))
+    own = "SGD(groups, lr=self.config.learning_rate, momentum=0.9)"
+    install("other", "other", code.replace(own, made))
     tree = {**tiny("tokengs").tree, "plugins": ["rooms", "other"]}
     tree["optimizer"] = {"type": "other/sgd"}
     through = run(resolve(tree), tmp_path / "through")
@@ -239,8 +230,8 @@ def test_parameters_that_no_gradient_reaches_do_not_hinder_going_on(
         "model.centers.type=locus/anchor_offset",
     )
     run(tiny("locus", *fixed, "training.steps=3"), tmp_path / "run")
-    idle = read_state(tmp_path / "run" / "state.safetensors").parts["moments"]["idle"]
-    assert "model.queries.raw_radius" in idle
+    moments = read_state(tmp_path / "run" / "state.safetensors").parts["moments"]
+    assert not [key for key in moments if "raw_radius" in key]
     assert run(tiny("locus", *fixed), tmp_path / "run", resume=True).resumed_at == 3
 
 
@@ -286,15 +277,8 @@ def test_it_is_applied_for_a_while_only() -> None:
 
 
 def test_the_average_of_half_precision_weights_is_float32() -> None:
-    model = Small().to(torch.bfloat16)
-    average = MovingAverage(model, 0.999)
-    with torch.no_grad():
-        model.first.weight.add_(1.0)
-    average.update()
+    average = MovingAverage(Small().to(torch.bfloat16), 0.999)
     assert average.state()["first.weight"].dtype == torch.float32
-    assert not torch.equal(
-        average.state()["first.weight"], MovingAverage(model, 0.9).state()["first.weight"]
-    )
 
 
 def test_a_restored_average_goes_on_alike(tiny: Tiny) -> None:
@@ -309,38 +293,3 @@ def test_a_restored_average_goes_on_alike(tiny: Tiny) -> None:
     restored.update()
     assert average.state().keys() == unique_tensors(model).keys()
     assert all(torch.equal(t, average.state()[name]) for name, t in restored.state().items())
-
-
-def restored(made: type[torch.optim.Optimizer], change: Callable[[dict[str, Any]], Any]) -> None:
-    """Restore the moments of a step of two groups, with a change, into a new optimiser."""
-    states = []
-    for _ in range(2):
-        model = nn.Sequential(nn.Linear(3, 2), nn.Linear(2, 2))
-        optimizer = made([{"params": list(part.parameters())} for part in model], lr=0.1)
-        states.append(OptimizerState(model, optimizer))
-        model(torch.ones(1, 3)).sum().backward()
-        optimizer.step()
-    state = states[0].state()
-    change(state)
-    states[1].load_state(state)
-
-
-@pytest.mark.parametrize("name", ["AdamW", "Adafactor"])
-def test_moments_of_a_parameter_that_has_none_are_refused(name: str) -> None:
-    made = getattr(torch.optim, name)
-    restored(made, lambda state: None)
-    with pytest.raises(CheckpointError, match=r"with moments and without: 1\.weight"):
-        restored(made, lambda s: s.update({"idle": ["1.weight"], "1.weight/step": torch.ones(())}))
-
-
-def test_moments_are_compared_where_a_step_needs_numbers() -> None:
-    for key in ("0.weight/row_var", "1.weight/col_var"):
-        with pytest.raises(CheckpointError, match=key):
-            restored(
-                torch.optim.Adafactor, lambda state, key=key: state.update({key: torch.ones(7)})
-            )
-
-
-def test_what_an_optimiser_does_not_keep_is_refused() -> None:
-    with pytest.raises(CheckpointError, match=r"not of this optimiser: 0\.weight/foo"):
-        restored(torch.optim.AdamW, lambda state: state.update({"0.weight/foo": torch.ones(1)}))

@@ -18,19 +18,11 @@ import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from safetensors import safe_open
-from safetensors.torch import save_file
 from training_runs import QUIET, Tiny, run, run_calling, same, weights
 
 from qgs.composer import Recipe
-from qgs.engine.checkpoint import (
-    OtherRunError,
-    RandomStates,
-    read_state,
-    write_state,
-)
-from qgs.engine.distributed import StopRequest
-from qgs.engine.folder import RunFolder
+from qgs.engine.distributed import RandomStates, StopRequest
+from qgs.engine.folder import OtherRunError, RunFolder, read_state, write_state
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointFile
@@ -158,7 +150,7 @@ def test_a_kill_between_the_first_two_files_loses_nothing(
     recipe, folder = tiny("tokengs", "training.save_every=0"), tmp_path / "run"
 
     with monkeypatch.context() as patch:
-        patch.setattr("qgs.engine.checkpoint.save", Mock(side_effect=Killed))
+        patch.setattr("qgs.engine.folder.save", Mock(side_effect=Killed))
         with pytest.raises(Killed):
             run(recipe, folder)
     assert not (folder / "checkpoint.safetensors").exists()
@@ -259,69 +251,14 @@ def test_one_process_at_a_time_trains_in_a_folder(tiny: Tiny, tmp_path: Path) ->
     assert resumed(recipe, tmp_path / "run").steps == 4
 
 
-def test_a_state_that_is_damaged_or_newer_is_refused(tiny: Tiny, tmp_path: Path) -> None:
+def test_a_state_that_is_cut_off_or_something_else_is_refused(tiny: Tiny, tmp_path: Path) -> None:
     recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
     kill_after(2, recipe, folder)
     file = folder / "state.safetensors"
-    whole = file.read_bytes()
-    newer = whole.replace(b'"qgs.state_version":"1"', b'"qgs.state_version":"9"')
-    for content, message in (
-        (whole[:-100], "not a whole safetensors file"),
-        (newer, "install the newer qgs"),
-        ((folder / "checkpoint.safetensors").read_bytes(), "no training state"),
-    ):
+    for content in (file.read_bytes()[:-100], (folder / "checkpoint.safetensors").read_bytes()):
         file.write_bytes(content)
-        with pytest.raises(CheckpointError, match=message):
+        with pytest.raises(CheckpointError, match=str(file)):
             resumed(recipe, folder)
-
-
-def test_a_state_with_damaged_metadata_is_refused_by_its_name(tiny: Tiny, tmp_path: Path) -> None:
-    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
-    kill_after(2, recipe, folder)
-    file = folder / "state.safetensors"
-    with safe_open(file, "pt") as saved:
-        metadata = saved.metadata()
-        tensors = {name: saved.get_tensor(name) for name in saved.keys()}  # noqa: SIM118
-    parts = json.loads(metadata["qgs.state"])
-
-    def damage(message: str, more: Any = (), **changed: str | None) -> None:
-        changed = {**metadata, **{f"qgs.{key}": value for key, value in changed.items()}}
-        whole = {key: value for key, value in changed.items() if value is not None}
-        save_file(tensors | dict(more), file, whole)
-        with pytest.raises(CheckpointError, match=message) as caught:
-            resumed(recipe, folder)
-        assert str(caught.value).startswith(str(file))
-
-    damage("`qgs.state` .*NoneType", state="null")
-    damage("`qgs.state` .*JSONDecodeError", state=metadata["qgs.state"][:-9])
-    damage("`qgs.state` .*too deep", state='{"a":' * 5000)
-    damage("`qgs.recipe` .*list", recipe="[]")
-    damage("`qgs.recipe`.*KeyError", recipe=None)
-    damage("has `extends`", recipe=json.dumps({**recipe.tree, "extends": "/dev/zero"}))
-    damage("`qgs.state_version` ", state_version="one")
-    damage("`qgs.state_version` .*KeyError", state_version=None)
-    for name in ("foo", "foo/bar"):
-        damage(f"the tensor `{name}` belongs to no part", {name: torch.zeros(2)})
-    for part, key, value, message in (
-        ("counters", "step", None, r"`counters` .*step is 'None'"),
-        ("counters", "step", -1, "step is '-1'"),
-        ("counters", "seconds", float("nan"), "seconds is 'nan'"),
-        ("counters", "samples", {}, "samples is"),
-        ("random", "0/python", [3, [1], None], "`random` cannot be restored"),
-        ("random", "0/numpy", 3, "`random` cannot be restored"),
-        ("guard", "skipped", "inf", "skipped is 'inf'"),
-        ("guard", "detector", {"dead": -1, "symptom": "", "has_drawn": False}, "dead is '-1'"),
-        ("guard", "detector", [], "`guard` cannot be restored"),
-        ("good", "steps", [0.5], "steps is '0.5'"),
-        ("schedule", "descent_starts", 1e999, "descent_starts is inf"),
-        ("domain", "samples", "many", "samples is"),
-        ("domain", "values", {"fov": [float("nan")]}, "fov is"),
-    ):
-        damaged = {**parts, part: {**parts[part], key: value}}
-        damage(message, state=json.dumps(damaged))
-    damage("`guard` cannot be restored", state=json.dumps({**parts, "guard": []}))
-    del parts["counters"]["step"]
-    damage("`counters` cannot be restored .*'step'", state=json.dumps(parts))
 
 
 def test_random_states_come_back() -> None:

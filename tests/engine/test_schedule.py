@@ -1,7 +1,12 @@
-"""The schedule against torch's, and under a time budget."""
+"""The learning rate: one cycle against torch's, under a time budget, and any schedule."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from training_runs import Tiny, run, same, weights
 
 from qgs.components import OneCycleAdamW
 from qgs.contracts import TrainingConfig
@@ -60,9 +65,9 @@ def test_a_linear_warm_up_and_an_end_above_the_first_rate() -> None:
 
 
 def test_a_warm_up_that_never_ends_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"optimizer\.warmup is 10, but training\.steps is 10"):
-        adamw(10, 10)
-    adamw(10, 10, seconds=5.0)
+    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
+        adamw(10, 10).check()
+    adamw(10, 10, seconds=5.0).check()
 
 
 def test_steps_take_over_when_time_is_plenty() -> None:
@@ -79,3 +84,33 @@ def test_without_warm_up_the_peak_comes_first(warmup: int) -> None:
     schedule = adamw(10, warmup)
     assert schedule.learning_rate(0, 0.0) == pytest.approx(schedule.peak)
     assert schedule.learning_rate(9, 0.0) == pytest.approx(schedule.last)
+
+
+def ramp(step: int) -> float:
+    return 2e-3 * min(step, 2) / 2
+
+
+def halving_cosine(step: int) -> float:
+    return 5e-4 * (1 + math.cos(math.pi * step / 4))
+
+
+@pytest.mark.parametrize(
+    ("schedule", "rate"),
+    [
+        ("{schedule: linear, values: [0, 2.0e-3], at: [0, 2]}", ramp),
+        ("{schedule: cosine, values: [1.0e-3, 0], at: [0, 4]}", halving_cosine),
+        ("{schedule: steps, values: [1.0e-3, 1.0e-4], at: [3]}", lambda s: [1e-3, 1e-4][s >= 3]),
+    ],
+)
+def test_any_schedule_is_a_learning_rate(
+    tiny: Tiny, tmp_path: Path, schedule: str, rate: Callable[[int], float]
+) -> None:
+    recipe = tiny("tokengs", f"optimizer.learning_rate={schedule}", "optimizer.warmup=2000")
+    through = run(recipe, tmp_path / "through")
+    rates = [record["lr"] for record in through.folder.history()]
+    assert rates == pytest.approx([rate(step) for step in range(4)])
+    part = (f"optimizer.learning_rate={schedule}", "optimizer.warmup=2000", "training.steps=3")
+    run(tiny("tokengs", *part), tmp_path / "run")
+    again = run(recipe, tmp_path / "run", resume=True)
+    assert [record["lr"] for record in again.folder.history()] == rates
+    assert same(weights(again), weights(through))

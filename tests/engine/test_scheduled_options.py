@@ -29,7 +29,7 @@ def test_each_step_has_its_own_numbers(tiny: Tiny, tmp_path: Path) -> None:
     seen = []
 
     def note(trainer: Trainer, stop: StopRequest) -> None:
-        loss = trainer.objective.losses["photometric"]
+        loss = trainer.training_pass.losses["photometric"]
         seen.append((trainer.model.renderer.config.dilation, loss.config.ssim_weight))
 
     result = run_calling(note, tiny("tokengs", *SCHEDULED), tmp_path / "run")

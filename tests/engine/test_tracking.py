@@ -1,16 +1,18 @@
 """What trackers are told, and what a person reads while a model trains."""
 
 import io
+import json
 import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
 from rich.console import Console
-from training_runs import Tiny, tensorboard_events
+from training_runs import Tiny, run, tensorboard_events
 
 from qgs.contracts import MissingExtraError
 from qgs.engine.distributed import make_accelerator
@@ -26,6 +28,36 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     with pytest.raises(MissingExtraError, match=r'pip install "query-gaussians\[wandb\]"'):
         Trackers(("wandb",))
     Trackers(()).log({"loss": 1.0}, 1)
+
+
+FILE_TRACKER = """
+import json
+from qgs.engine.tracking import Tracker
+
+class Lines(Tracker):
+    def __init__(self, run, options, step):
+        self.file = (run / "lines.jsonl").open("w")
+        self.log({"width": options["model.width"]}, step)
+    def log(self, values, step):
+        self.file.write(json.dumps([step, values]) + "\\n")
+    def close(self):
+        self.file.close()
+
+plugin = Lines
+"""
+
+
+def test_a_distribution_offers_a_tracker_by_an_entry_point(
+    tiny: Tiny, tmp_path: Path, install: Callable[..., None]
+) -> None:
+    install("qgs-lines", "lines", FILE_TRACKER, group="qgs.trackers")
+    result = run(tiny("tokengs", "training.trackers=[lines]"), tmp_path / "run")
+    lines = [json.loads(line) for line in (tmp_path / "run" / "lines.jsonl").open()]
+    assert lines[0] == [0, {"width": 32}]
+    losses = [(step, values["loss"]) for step, values in lines[1:]]
+    assert losses == [(record["step"], record["loss"]) for record in result.folder.history()]
+    with pytest.raises(ValueError, match="lines, tensorboard, wandb"):
+        Trackers(("linez",))
 
 
 def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Path) -> None:

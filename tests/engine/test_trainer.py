@@ -13,8 +13,6 @@ from training_runs import Tiny, run_anywhere
 import qgs
 from qgs.composer import resolve
 from qgs.data.stream import training_batches
-from qgs.engine import distributed as interrupt
-from qgs.engine.distributed import stop_requests
 from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.models import checkpoint_path
@@ -131,24 +129,7 @@ def test_the_thread_that_reads_ahead_ends_with_the_run(tiny: Tiny, tmp_path: Pat
     assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
 
 
-def test_only_a_later_second_ctrl_c_is_not_caught(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    now = 100.0
-    monkeypatch.setattr(interrupt.time, "monotonic", lambda: now)
-    with stop_requests() as stop:
-        for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGINT, signal.SIGINT):
-            signal.raise_signal(number)
-        assert stop.signal is signal.SIGTERM
-        now += interrupt.PAUSE
-        signal.raise_signal(signal.SIGTERM)
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    told = "SIGTERM: finishing the step, saving; Ctrl-C again to give up"
-    assert capfd.readouterr().err.count(told) == 1
-
-
-def test_the_checkpoint_path_a_run_is_found(tmp_path: Path) -> None:
+def test_the_checkpoint_of_a_run_is_found(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="give a run folder"):
         checkpoint_path(tmp_path)
     (tmp_path / "checkpoint.safetensors").touch()

@@ -24,7 +24,7 @@ from qgs.composer import Recipe
 from qgs.contracts import MissingExtraError
 from qgs.data.sampling import Batch
 from qgs.engine import tracking as trackers
-from qgs.engine.checkpoint import read_state
+from qgs.engine.folder import read_state
 from qgs.engine.guard import MAX_SKIPPED, NonFiniteError
 from qgs.io.checkpoint import CheckpointFile
 
@@ -107,8 +107,8 @@ def test_a_bad_gradient_ends_the_run_too(
 ) -> None:
     build = Recipe.build_model
 
-    def poisoned(recipe: Recipe, device: Any = None) -> Any:
-        model = build(recipe, device)
+    def poisoned(recipe: Recipe, device: Any = None, **options: Any) -> Any:
+        model = build(recipe, device, **options)
         parameter = next(model.parameters())
         parameter.register_hook(lambda gradient: gradient * float("inf"))
         return model

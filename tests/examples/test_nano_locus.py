@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from qgs.composer import resolve
-from qgs.engine.objective import TrainingPass
+from qgs.engine.training_pass import TrainingPass
 from qgs.types import Cameras, Gaussians, Views
 
 ROOT = Path(__file__).parents[2]

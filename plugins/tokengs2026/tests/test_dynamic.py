@@ -18,7 +18,7 @@ from qgs.components import LatentQueries
 from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
 from qgs.contracts.schedule import follow
-from qgs.engine.objective import TrainingPass
+from qgs.engine.training_pass import TrainingPass
 from qgs.model import QueryGaussianModel
 from qgs.types import ImageMemory, LayerPrediction, Photos
 

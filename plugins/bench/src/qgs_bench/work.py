@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from qgs.composer import Recipe
-from qgs.engine.objective import TrainingPass
 from qgs.engine.parameters import make_optimizer
+from qgs.engine.training_pass import TrainingPass
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
 

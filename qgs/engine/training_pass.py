@@ -1,4 +1,4 @@
-"""What a training step runs: its objective, and what that calls, the model and the losses."""
+"""What a training step runs: the objective with the model and the losses that it calls."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -30,20 +30,18 @@ RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "grad
 
 
 class TrainingPass(nn.Module):
-    """The model, its losses and its objective: the `Passes` that the objective is given.
+    """The model, its losses and its objective; `forward` hands itself to the objective as `Passes`.
 
-    One module, so that distributed wrappers see one forward however often the model runs in it.
+    forward (a batch) -> objective.forward -> predict (the model) and judge (renderings, losses):
+    one module, so that DDP sees one forward however often the objective runs the model.
 
-    `judge` takes the losses' gradients with respect to the Gaussians too, one layer and
-    `render_views` target views at a time (0: all views), and frees each part's graph before it
-    makes the next; the backward pass starts from their sums. Memory thus grows neither
-    with layers nor with views. Where a loss needs all renderings at once, only the renderer's
-    graphs are made in parts.
+    `judge` computes the losses' gradients with respect to the Gaussians at once, one layer and
+    `render_views` target views at a time (0: all views), and frees each part's graph before the
+    next; the backward pass starts from their sums. Memory thus grows neither with layers nor with
+    views. Where a loss needs all renderings at once, only the renderer's graphs are in parts.
 
-    objective: None for `qgs/one_pass`. judge_inputs: the input views are targets too, the last.
-
-    owners: the names of terms that were computed so far, to those of their losses.
-    hook: called with the name and the value (tensors, or a nest of them) of what is computed.
+    objective: None for `qgs/one_pass`. judge_inputs: the input views become targets too, the last.
+    hook: called with the name and value (tensors, or a nest of them) of each intermediate result.
     """
 
     def __init__(
@@ -65,14 +63,15 @@ class TrainingPass(nn.Module):
         self.objective = objective or OnePass(OnePass.Config())
         self._judged = 0
         self.hook: Callable[[str, Any], None] = lambda name, value: None
-        self.owners: dict[str, str] = {}
+        self._owners: dict[str, str] = {}  # names of terms to those of their losses
 
     @classmethod
     def of(cls, recipe: Recipe, model: QueryGaussianModel) -> "TrainingPass":
-        """As `recipe` says, with `model`, which was built from it."""
+        """The losses and objective of `recipe`, for a `model` that was built from it."""
         config, objective = recipe.training, recipe.build_objective()
-        shown = config.render_views, objective, config.judge_inputs
-        return cls(model, recipe.build_losses(), *shown)
+        return cls(
+            model, recipe.build_losses(), config.render_views, objective, config.judge_inputs
+        )
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
         """What the objective makes of a batch.
@@ -88,7 +87,7 @@ class TrainingPass(nn.Module):
         return outcome
 
     def follow(self, step: int) -> None:
-        """Give every component the options that it has after `step` optimiser steps."""
+        """Set every scheduled option to its value after `step` optimiser steps."""
         follow((*self.modules(), self.objective), step)
 
     def predict(self, inputs: Views) -> Prediction:
@@ -96,7 +95,7 @@ class TrainingPass(nn.Module):
         return self.model(inputs)
 
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
-        """See `Passes`: layers are weighted by the supervision, the signs are of the last one.
+        """See `Passes`: layers are weighted by the supervision; `signs` are of the last layer.
 
         Raises ValueError when two losses name a term alike.
         """
@@ -109,7 +108,7 @@ class TrainingPass(nn.Module):
         for number, weight in self.model.supervision.weights().items():
             self.hook(f"prediction of layer {number}{judgement}", prediction.layers[number])
             layer = DetachedLayer(prediction.layers[number], parameters)
-            signs = []
+            signs = []  # of this layer: those of the last one remain
             for part in self._parts(targets):
                 views = part.images.shape[1]
                 rendering = self.render(layer.prediction.gaussians, part.cameras)
@@ -118,7 +117,7 @@ class TrainingPass(nn.Module):
                 seen = rendering, part, inputs
                 found = self._terms(self._of_images, layer.prediction, *seen, number)
                 layer.add(found, weight * views / count)
-            if self._of_gaussians:
+            if self._of_gaussians:  # once for all parts, with a rendering of no view
                 no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
                 seen = no_views, targets, inputs
                 found = self._terms(self._of_gaussians, layer.prediction, *seen, number)
@@ -134,7 +133,7 @@ class TrainingPass(nn.Module):
         return Outcome(total, terms, {**mean, "deviation": deviation})
 
     def _parts(self, targets: Views) -> list[Views]:
-        """The target views as the losses take them."""
+        """The target views in slices of `render_views`, or whole where a loss compares views."""
         if not self.render_views or any(loss.renderings == "all" for loss in self.losses.values()):
             return [targets]
         return [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
@@ -162,10 +161,10 @@ class TrainingPass(nn.Module):
         terms: dict[str, Tensor] = {}
         for name in names:
             new = self.losses[name](layer, rendering, target, inputs)
-            repeated = sorted(term for term in new if self.owners.setdefault(term, name) != name)
+            repeated = sorted(term for term in new if self._owners.setdefault(term, name) != name)
             if repeated:
                 raise ValueError(
-                    f"losses.{name} and losses.{self.owners[repeated[0]]} both have terms "
+                    f"losses.{name} and losses.{self._owners[repeated[0]]} both have terms "
                     f"{repeated}; a recipe can use each such loss once"
                 )
             terms |= new
@@ -181,14 +180,14 @@ class TrainingPass(nn.Module):
 
 
 class DetachedLayer:
-    """A copy of what a layer predicts, cut off the network, and the gradients of its losses.
+    """A copy of a layer's prediction, detached from the network, and the gradients of its losses.
 
     gradients: the sums so far, by name, without those of tensors that no loss reads. terms: the
     sums of the losses' terms, detached.
     """
 
     def __init__(self, layer: LayerPrediction, parameters: Mapping[str, Tensor]) -> None:
-        """parameters: of the losses, by name: what they have gradients for besides the layer."""
+        """parameters: of the losses, by name, whose gradients are taken too."""
         self.prediction: LayerPrediction = map_tensors(
             lambda x: x.detach().requires_grad_() if x.requires_grad else x, layer
         )
@@ -204,7 +203,7 @@ class DetachedLayer:
         loss = _sum(weighted)
         if not loss.requires_grad:
             return
-        with torch.autocast(loss.device.type, enabled=False):
+        with torch.autocast(loss.device.type, enabled=False):  # gradients as autograd's backward
             found = torch.autograd.grad(loss, list(self._copies.values()), allow_unused=True)
         for name, gradient in zip(self._copies, found, strict=True):
             if gradient is not None:
@@ -218,7 +217,7 @@ class DetachedLayer:
 
 
 class _KnownGradients(torch.autograd.Function):
-    """value, gradients, sources -> value, whose gradients with respect to the sources are known."""
+    """(value, gradients, *sources) -> value; backward returns `gradients` for the sources."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, gradients: tuple[Tensor, ...], *sources: Tensor) -> Tensor:
@@ -233,7 +232,7 @@ class _KnownGradients(torch.autograd.Function):
 def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
     """Mean alpha, and the largest of the views' mean |rgb - background|; both 0-d.
 
-    rgb: (B, V, 3, H, W). Means over a view's pixels, so that a stray splat is no sign of life.
+    rgb: (B, V, 3, H, W). Means over a view's pixels: a stray splat must not count as life.
     """
     deviation = (rgb - background[:, None, None]).abs().mean((-3, -2, -1))
     return alpha.mean(), deviation.amax()

@@ -15,7 +15,7 @@ from varying_head import VaryingHead
 
 from qgs.composer import Recipe
 from qgs.contracts import Loss, Outcome
-from qgs.engine.objective import TrainingPass, measure
+from qgs.engine.training_pass import TrainingPass, measure
 from qgs.losses import Mask, Opacity
 from qgs.metrics.images import psnr
 from qgs.types import Views, map_tensors

@@ -1,0 +1,12 @@
+"""What does not fit into memory is refused with numbers."""
+
+import pytest
+
+from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
+
+
+def test_only_what_does_not_fit_is_refused() -> None:
+    refuse_beyond_memory("this", {"a": 4, "b": 6}, "Less.", 10)
+    with pytest.raises(TooLargeError, match=r"11 bytes.*10 bytes.*b 7 bytes, a 4"):
+        refuse_beyond_memory("this", {"a": 4, "b": 7}, "Less.", 10)
+    assert [in_words(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]
