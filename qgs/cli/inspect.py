@@ -1,14 +1,17 @@
-"""`qgs list`, `qgs compose`, `qgs diff`, `qgs schema`: looking at recipes and components."""
+"""`qgs list`, `qgs compose`, `qgs diff`, `qgs schema`, `qgs recipes`: recipes and components."""
 
 import json
+from itertools import takewhile
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Overrides
 from qgs.wording import short_names
+
+RecipeFile: TypeAlias = Annotated[Path, typer.Argument(help="Recipe file.")]
 
 
 def list_components(
@@ -20,7 +23,7 @@ def list_components(
     ] = None,
 ) -> None:
     """Installed components by slot, and trained models; with NAME all options and meanings."""
-    from qgs.cli.listing import details, overview
+    from qgs.cli.tables import details, overview
     from qgs.composer.registry import load_sound_plugins
 
     registry, broken = load_sound_plugins()
@@ -30,14 +33,12 @@ def list_components(
         Console(stderr=True).print(f"plugin left out: {message}", markup=False)
 
 
-def compose(
-    recipe: Annotated[Path, typer.Argument(help="Recipe file.")], overrides: Overrides = None
-) -> None:
+def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
     """The resolved recipe, where each value comes from, and parameters per component.
 
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
-    from qgs.cli.recipe_tables import parameter_table
+    from qgs.cli.tables import parameter_table
     from qgs.composer import resolve
     from qgs.composer.recipe import annotated
 
@@ -51,8 +52,8 @@ def compose(
 
 
 def diff(
-    first: Annotated[Path, typer.Argument(help="Recipe file.")],
-    second: Annotated[Path, typer.Argument(help="Recipe file.")],
+    first: RecipeFile,
+    second: RecipeFile,
     set_a: Annotated[
         list[str] | None, typer.Option("--set-a", help="Override of the first; repeatable.")
     ] = None,
@@ -61,7 +62,7 @@ def diff(
     ] = None,
 ) -> None:
     """Which slots and options of two recipes differ, and what that costs in parameters."""
-    from qgs.cli.recipe_tables import difference_tables
+    from qgs.cli.tables import difference_tables
     from qgs.composer import resolve
 
     resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
@@ -79,9 +80,46 @@ def schema(
     from qgs.composer.schema import recipe_schema
     from qgs.io.files import write_text
 
-    registry, _ = load_sound_plugins()
-    text = json.dumps(recipe_schema(registry), indent=1) + "\n"
-    if out is None:
-        typer.echo(text, nl=False)
+    text = json.dumps(recipe_schema(load_sound_plugins()[0]), indent=1) + "\n"
+    typer.echo(text, nl=False) if out is None else write_text(out, text)
+
+
+def recipes(
+    name: Annotated[
+        str | None, typer.Argument(help="One of them, such as tiny/locus.yaml; shows its text.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to copy it to, with what it extends; never overwrites."),
+    ] = None,
+) -> None:
+    """The recipes that come with qgs; every command takes their names.
+
+    A file of that name in the working directory comes first.
+    """
+    from qgs.composer.errors import did_you_mean
+    from qgs.composer.files import files_of, recipe_folder
+    from qgs.io.files import refuse_existing, write_text
+
+    home = recipe_folder().resolve()
+    found = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
+    known = {label: path for label, path in found.items() if not label.startswith("studies/")}
+    if name is None and out is None:
+        width = max(map(len, known), default=0)
+        for label, path in known.items():
+            lines = path.read_text(encoding="utf-8").splitlines()
+            comment = takewhile(lambda line: line.startswith("#"), lines)
+            first = " ".join(line.lstrip("# ") for line in comment).partition(". ")[0]
+            typer.echo(f"{label:<{width}}  {first.rstrip('.')}".rstrip())
+    elif name not in known:
+        hint = did_you_mean(name, known, "recipes") if name else "give its name before --out"
+        raise ValueError(f"there is no recipe `{name}` in {home}; {hint}" if name else hint)
+    elif out is None:
+        typer.echo(known[name].read_text(encoding="utf-8"), nl=False)
     else:
-        write_text(out, text)
+        copies = {out / path.relative_to(home): path for path in files_of(known[name])}
+        for target in copies:  # all of them or, where one lies in the way, none
+            refuse_existing(target)
+        for target, path in copies.items():
+            write_text(target, path.read_text(encoding="utf-8"))
+            typer.echo(f"wrote {target}")

@@ -11,7 +11,6 @@ from qgs import DISTRIBUTIONS
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
 
-
 HELP = {
     "data": "Check and pack data sets.",
     "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
@@ -41,14 +40,10 @@ class CommandGroup(TyperGroup):
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
-        offers = [*entry_points(group=GROUP, name=cmd_name)]
-        if offers:
+        if offers := [*entry_points(group=GROUP, name=cmd_name)]:
             return OfferedCommand(cmd_name, offers)
-        if own_distribution := DISTRIBUTIONS[GROUP].get(cmd_name):
-            raise ValueError(
-                f"the command `qgs {cmd_name}` belongs to {own_distribution}, which is not "
-                f"installed: run `pip install {own_distribution}`"
-            )
+        if missing := DISTRIBUTIONS[GROUP].get(cmd_name):
+            raise ValueError(f"`qgs {cmd_name}` is not installed: run `pip install {missing}`")
         return None
 
 
@@ -57,33 +52,24 @@ class OfferedCommand(TyperCommand):
 
     def __init__(self, name: str, offers: list[EntryPoint]) -> None:
         self.offers = offers
-        releases = (f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist)
-        self.releases = ", ".join(sorted(releases))
-        summaries = {entry.dist.metadata["Summary"] for entry in offers if entry.dist}
-        told = f"{'; '.join(sorted(filter(None, summaries))) or 'Commands'} ({self.releases})"
-        own = self.releases.startswith(f"{DISTRIBUTIONS[GROUP].get(name)} ")
-        super().__init__(name, help=HELP[name] if own else told)
+        dists = [entry.dist for entry in offers if entry.dist]
+        self.releases = ", ".join(sorted(f"{dist.name} {dist.version}" for dist in dists))
+        own = {DISTRIBUTIONS[GROUP].get(name)} == {dist.name for dist in dists}
+        summary = "; ".join(dist.metadata["Summary"] or "Commands" for dist in dists)
+        super().__init__(name, help=HELP[name] if own else f"{summary} ({self.releases})")
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
         """The context of the real command. Raises ValueError where there is none."""
-        entry, command = self.offers[0], f"the command `qgs {self.name}`"
+        entry, command = self.offers[0], f"the command `qgs {self.name}` of {self.releases}"
         if len(self.offers) > 1:
-            raise ValueError(
-                f"several distributions offer {command}: {self.releases}; uninstall all but one"
-            )
+            raise ValueError(f"{command} is offered several times; uninstall all but one")
         try:
             app = entry.load()
+            assert isinstance(app, typer.Typer), f"it is a {type(app)}, not a typer.Typer"
         except (Exception, SystemExit) as error:
-            raise ValueError(
-                f"{command} of {self.releases} cannot be imported from `{entry.value}`: "
-                f"{type(error).__name__}: {error}; update {self.releases}"
-            ) from error
-        if not isinstance(app, typer.Typer):
-            raise ValueError(
-                f"{command} of {self.releases} is no command: `{entry.value}` is "
-                f"{type(app).__name__}, not a typer.Typer; update {self.releases}"
-            )
+            reason = f"cannot be used: `{entry.value}`: {type(error).__name__}: {error}"
+            raise ValueError(f"{command} {reason}; update {self.releases}") from error
         app._add_completion = False  # what it would install completes no command of qgs
         return typer.main.get_command(app).make_context(info_name, args, parent, **extra)

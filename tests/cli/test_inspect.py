@@ -11,7 +11,7 @@ from commands import run_qgs
 from rich.console import Console
 
 from qgs.cli import main
-from qgs.cli.recipe_tables import difference_tables
+from qgs.cli.tables import difference_tables
 from qgs.composer import resolve
 
 SMALL = """recipe: 1

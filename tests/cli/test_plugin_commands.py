@@ -70,7 +70,7 @@ def test_it_is_listed_without_an_import_and_imported_when_called(offer: Offer) -
     ("code", "reason"),
     [
         ("import no_such_package", "`_test_colours:plugin`: ModuleNotFoundError: No module named"),
-        ("plugin = 3", "`_test_colours:plugin` is int, not a typer.Typer; update colours 2.1"),
+        ("plugin = 3", "not a typer.Typer; update colours 2.1"),
         ("", "AttributeError"),
         ("raise SystemExit('no display')", "SystemExit: no display; update colours 2.1"),
     ],
@@ -91,8 +91,7 @@ def test_of_two_with_one_name_neither_runs(offer: Offer) -> None:
     offer("paint", distribution="more-colours")
     result = run_qgs("paint", "first", "1")
     assert "a command" not in result.output
-    told = "several distributions offer the command `qgs paint`: colours 2.1, more-colours 2.1; un"
-    assert told in str(result.exception)
+    assert "`qgs paint` of colours 2.1, more-colours 2.1" in str(result.exception)
 
 
 def test_own_commands_are_never_hidden(offer: Offer) -> None:
