@@ -75,6 +75,18 @@ def test_tokengs_and_locusgs_have_the_same_budget(pair: str) -> None:
     assert type(first.centers) is not type(second.centers)
 
 
+@pytest.mark.parametrize(
+    "pair", [("c3g", "tokengs"), ("gslrm", "locus"), ("globalsplat", "locus")], ids="-".join
+)
+def test_tiny_recipes_of_other_models_have_the_same_budget(pair: tuple[str, str]) -> None:
+    ours, theirs = (resolve(RECIPES / f"tiny/{name}.yaml") for name in pair)
+    for section in ("data", "views"):
+        assert ours.tree[section] == theirs.tree[section]
+    assert ours.training.seconds == theirs.training.seconds
+    sizes = [sum(p.numel() for p in r.build_model("meta").parameters()) for r in (ours, theirs)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
+
+
 @pytest.mark.parametrize("model", ["tokengs", "locus"])
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if "4096" in name])
 def test_finetunes_change_no_more_than_they_say(model: str, name: str) -> None:

@@ -120,20 +120,6 @@ def _unmet(chosen: dict[str, Choice]) -> dict[str, set[str]]:
     return unmet
 
 
-def test_there_is_something_to_combine() -> None:
-    assert {slot: len(choices) > 1 for slot, choices in CHOICES.items()} == dict.fromkeys(
-        SLOTS, True
-    )
-    assert {choice[0] for choices in CHOICES.values() for choice in choices} >= {
-        "qgs/latent",
-        "locus/anchored",
-        "locus/ray_biased",
-        "locus/anchor_aware",
-        "locus/refine",
-        "locus/radius_scaled",
-    }
-
-
 @pytest.mark.parametrize("parts", list(product(*PLAIN.values())), ids=_names)
 def test_a_combination_runs_or_is_refused(parts: tuple[Choice, ...]) -> None:
     chosen = dict(zip(SLOTS, parts, strict=True))
@@ -160,29 +146,3 @@ def test_every_two_options_run_together_or_are_refused(parts: tuple[Choice, ...]
 @pytest.mark.parametrize("parts", list(product(*CHOICES.values())), ids=_names)
 def test_a_combination_of_options_runs_or_is_refused(parts: tuple[Choice, ...]) -> None:
     test_a_combination_runs_or_is_refused(parts)
-
-
-ENCODERS = {
-    "qgs/multiview_vit": {"depth": 1},
-    "tokengs2026/multiscale_vit": {"depth": 2, "blocks": [1, 2]},
-    "tokengs2026/latent_bottleneck": {"depth": 1, "blocks": [1], "latents": 4, "latent_depth": 1},
-}
-
-
-MET = [p for p in product(*PLAIN.values()) if not _unmet(dict(zip(SLOTS, p, strict=True)))]
-
-
-@pytest.mark.parametrize("parts", MET, ids=_names)
-@pytest.mark.parametrize("encoder", ENCODERS)
-def test_an_encoder_runs_with_all_that_need_no_rays(
-    encoder: str, parts: tuple[Choice, ...]
-) -> None:
-    chosen = dict(zip(SLOTS, parts, strict=True))
-    recipe = _recipe(chosen)
-    recipe["model"]["encoder"] = {"type": encoder, **ENCODERS[encoder]}
-    needed = chosen["cross_attention"][1].fields_read(chosen["cross_attention"][2])
-    if encoder == "tokengs2026/latent_bottleneck" and "memory.patch_rays" in needed:
-        with pytest.raises(RecipeError, match=r"needs memory.patch_rays .*latent_bottleneck"):
-            resolve(recipe)
-    else:
-        run_training_step(resolve(recipe), Case(chosen["queries"][2]))

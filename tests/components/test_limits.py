@@ -13,7 +13,7 @@ from torch import Tensor
 
 from qgs import Cameras, Views, compose
 from qgs.components import COMPONENTS
-from qgs.composer import RecipeError, resolve
+from qgs.composer import resolve
 from qgs.contracts import Component
 from qgs.losses import COMPONENTS as LOSSES
 from qgs.types import LayerPrediction, Rendering
@@ -171,25 +171,6 @@ def test_no_limit_was_forgotten() -> None:
     walked |= {(part.rpartition("/")[2], option) for part, option, *_ in LOSS_LIMITS}
     radius = {(name, "radius_min") for name in ("ray_biased", "refine", "radius_scaled")}
     assert set(numbers((*COMPONENTS, *LOSSES, *plugin.components))) == walked | radius
-
-
-@pytest.mark.parametrize(
-    ("overrides", "option"),
-    [
-        ([f"{REFINE}.center=false", f"{REFINE}.output_limit=1.0"], "output_limit"),
-        (["model.centers.offset=linear", "model.centers.output_limit=1.0"], "output_limit"),
-        (["model.head.norm_eps=0.1"], "norm_eps"),
-    ],
-)
-def test_a_limit_without_effect_is_refused(overrides: list[str], option: str) -> None:
-    with pytest.raises(RecipeError, match=f"`{option}` has no effect"):
-        resolve(LOCUS, overrides)
-
-
-@pytest.mark.parametrize("path", RADIUS_MIN)
-def test_the_floor_of_the_radius_is_changed_everywhere_or_nowhere(path: str) -> None:
-    with pytest.raises(RecipeError, match=r"max\(softplus\(x\), 3\)"):
-        resolve(LOCUS, [f"{path}=3.0"])
 
 
 @pytest.mark.parametrize(

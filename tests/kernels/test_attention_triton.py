@@ -162,22 +162,11 @@ def test_gradients_are_those_of_float64(sizes: tuple[int, ...], kind: str) -> No
 
 @runs
 @kinds
-def test_all_pairs_at_the_bound(kind: str) -> None:
-    case = _case((2, 2, 40, 70, 16))
-    assert _assert_exact(kind, case, lower=-1e-9) == 1.0
-
-
-@runs
-@kinds
-def test_no_pair_at_the_bound(kind: str) -> None:
-    case = _case((2, 2, 40, 70, 16), radius=20.0)
-    assert _assert_exact(kind, case, lower=-1e9) < 0.001
-
-
-@runs
-@kinds
-def test_radius_at_its_floor(kind: str) -> None:
-    _assert_exact(kind, _case((2, 2, 40, 70, 16), radius=0.1))
+def test_pairs_at_the_bound_and_radii_at_their_floor(kind: str) -> None:
+    sizes = 2, 2, 40, 70, 16
+    assert _assert_exact(kind, _case(sizes), lower=-1e-9) == 1.0
+    assert _assert_exact(kind, _case(sizes, radius=20.0), lower=-1e9) < 0.001
+    _assert_exact(kind, _case(sizes, radius=0.1))
 
 
 @runs

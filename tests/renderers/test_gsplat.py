@@ -72,12 +72,6 @@ def test_harmonics_and_features_reach_gsplat(calls, make_scene):
     assert rendering.depth.eq(5).all()
 
 
-def test_background_override_reaches_gsplat(calls, make_scene):
-    gaussians, cameras = make_scene()
-    GsplatRenderer(RendererConfig())(gaussians, cameras, torch.tensor([1.0, 0.0, 0.5]))
-    assert calls[0]["backgrounds"].tolist() == [[[1.0, 0.0, 0.5]]]
-
-
 @pytest.mark.parametrize(
     "changed", [{"alpha_cap": 0.99}, {"alpha_min": 0.01}, {"transmittance_min": 1e-3}]
 )
@@ -108,12 +102,6 @@ def test_intrinsics_that_want_a_gradient_are_refused(make_scene):
     cameras.intrinsics.requires_grad_()
     with pytest.raises(ValueError, match="no gradient for intrinsics"):
         gsplat_module._check_supported(SimpleNamespace(means=_OnCuda()), cameras)
-
-
-def test_missing_gsplat_says_what_to_do(make_scene, monkeypatch):
-    monkeypatch.setattr(gsplat_module, "find_spec", lambda name: None)
-    with pytest.raises(RuntimeError, match=r'pip install "query-gaussians\[gsplat\]".*qgs/torch'):
-        gsplat_module._check_supported(SimpleNamespace(means=_OnCuda()), make_scene()[1])
 
 
 def test_auto_goes_by_where_the_gaussians_are(make_scene, monkeypatch):

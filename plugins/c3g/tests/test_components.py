@@ -64,41 +64,6 @@ def test_a_layer_follows_its_formula(options: dict[str, float]) -> None:
     assert made.mlp.fc1.out_features == 16 * options.get("mlp_ratio", 2.0)
 
 
-def test_a_layer_keeps_what_it_does_not_change() -> None:
-    start, seen = state(), memory()
-    after, read = layer()(start, seen)
-    assert after["some.field"] is start["some.field"]
-    assert read.keys is seen.keys
-    assert read.values is seen.values
-    assert read.patch_rays is seen.patch_rays
-    assert read.grid == seen.grid
-
-
-def test_there_is_no_layer_scale() -> None:
-    start, seen = state(), memory()
-    made, other = layer(), layer(scale=1e-9)
-    other.load_state_dict(made.state_dict())
-    assert torch.equal(made(start, seen)[0].features, other(start, seen)[0].features)
-
-
-def test_nobody_reads_a_masked_query() -> None:
-    mask = torch.tensor([[True, True, False, True, False], [True] * 5])
-    made, start, seen = layer(), state(mask=mask), memory()
-    after, read = made(start, seen)
-    assert after.mask is mask
-    changed = QueryState(torch.where(mask[..., None], start.features, 50.0), start.fields, mask)
-    others, images = made(changed, seen)
-    torch.testing.assert_close(others.features[mask], after.features[mask])
-    torch.testing.assert_close(images.features, read.features)
-    alone = ImageMemory(seen.features[:1])
-    kept, tokens = made(QueryState(start.features[:1, mask[0]]), alone)
-    torch.testing.assert_close(kept.features[0], after.features[0, mask[0]])
-    torch.testing.assert_close(tokens.features, read.features[:1])
-    whole, _ = made(QueryState(start.features, start.fields), seen)
-    torch.testing.assert_close(whole.features[1], after.features[1])
-    assert not torch.allclose(whole.features[0, 0], after.features[0, 0])
-
-
 def test_the_head_follows_its_formula() -> None:
     config = C3GHead.Config(gaussians_per_query=3, scale_unit=0.02)
     head, start = C3GHead(config, DIMS).double(), state()

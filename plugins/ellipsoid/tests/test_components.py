@@ -180,20 +180,6 @@ def test_options_without_effect_are_refused(options: dict, path: str, why: str) 
     assert why in problem.reason
 
 
-@pytest.mark.parametrize(
-    ("queries", "reader"),
-    [
-        ("qgs/latent", {"centers": {"type": "ellipsoid/axis_scaled"}}),
-        ("locus/anchored", {"decoder": {"cross_attention": {"type": "ellipsoid/ray_biased"}}}),
-        ("locus/anchored", {"head": {"type": "ellipsoid/gaussian_head"}}),
-        ("ellipsoid/anchored", {"centers": {"type": "locus/radius_scaled"}}),
-    ],
-)
-def test_components_that_lack_a_shape_are_refused_with_the_fix(queries: str, reader: dict) -> None:
-    problem = refused({**ELLIPSOID, "model": {"queries": {"type": queries}, **reader}})
-    assert "in the slot `queries`" in problem.fix
-
-
 def test_radii_that_are_read_in_two_ways_are_refused() -> None:
     centers = {"type": "ellipsoid/axis_scaled", "radius_bound": "offset"}
     with pytest.raises(RecipeError, match="softplus"):

@@ -5,9 +5,8 @@ import torch
 import torch.nn.functional as F
 from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
+from qgs_ellipsoid.fields import RAW_RADII, ROTATION
 from qgs_ellipsoid.head import EllipsoidHead, radii_along
-from qgs_ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.cross_attention import RayBiasedCrossAttention
@@ -67,23 +66,6 @@ def test_attention_pictures_and_decoding_speak_of_one_ellipsoid() -> None:
     assert bias.max() > -1.0
 
 
-@pytest.mark.parametrize("eps", [1e-6, 0.5])
-def test_the_floor_of_a_direction_is_an_option(eps: float) -> None:
-    state, rays = _state(), patch_rays(plucker_rays(_cameras()), 4)
-    rays = rays * torch.linspace(0.1, 1.0, rays.shape[1])[:, None]
-    memory = _memory(rays, (2, 3, 4))
-    config = EllipsoidCrossAttention.Config(**CHOSEN, **OFFSET, direction_eps=0.9)
-    EllipsoidCrossAttention(config, DIMS).bias(state, memory).dense()
-    config = EllipsoidCrossAttention.Config(**CHOSEN, **OFFSET, direction_eps=eps)
-    attention = EllipsoidCrossAttention(config, DIMS)
-    sigma_sq = (0.3 * _radii(state[RAW_RADII])).square()
-    rotation = anchor_rotation(state[ROTATION])
-    place = state[CENTER], rotation, sigma_sq, ray_tokens(rays, eps)
-    expected = EllipsoidBias.of(*place, -7.0, attention.gamma).dense()
-    seen = attention.bias(state, memory).dense()
-    torch.testing.assert_close(seen, expected, rtol=1e-4, atol=1e-4)
-
-
 def test_a_fixed_bandwidth_is_that_of_locusgs() -> None:
     state, memory = _state(), _memory(patch_rays(plucker_rays(_cameras()), 4), (2, 3, 4))
     options = {"bandwidth": "fixed", "sigma0": 0.3, "bias_min": -7.0}
@@ -107,16 +89,6 @@ def test_the_step_of_a_centre_follows_its_options(options: dict, step) -> None:
     refinement, state = EllipsoidRefinement(EllipsoidRefinement.Config(**options), DIMS), _state()
     expected = state[CENTER] + step(refinement.center_mlp(state.features))
     torch.testing.assert_close(refinement(state)[CENTER], expected)
-
-
-def test_the_head_reads_radii_as_told() -> None:
-    head, state = EllipsoidHead(EllipsoidHead.Config(**OFFSET, init_std=0.5), DIMS), _state()
-    plain = EllipsoidHead(EllipsoidHead.Config(init_std=0.5), DIMS)
-    plain.load_state_dict(head.state_dict())
-    ratio = head(state).scales / plain(state).scales
-    local = super(EllipsoidHead, head).forward(state).quats
-    read, floored = _radii(state[RAW_RADII]), F.softplus(state[RAW_RADII])
-    torch.testing.assert_close(ratio, radii_along(read, local) / radii_along(floored, local))
 
 
 def test_quaternions_of_no_use_become_the_identity() -> None:
@@ -147,12 +119,3 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise() -> None:
     assert torch.equal(state[CENTER][1], queries.center)
     lengths = queries.support(state).axes.norm(dim=-2)
     torch.testing.assert_close(lengths[1], _radii(queries.raw_radii))
-
-
-def test_growing_copies_whole_anchors() -> None:
-    few = EllipsoidQueries(EllipsoidQueries.Config(count=4), DIMS)
-    many = EllipsoidQueries(EllipsoidQueries.Config(count=9), DIMS)
-    grown = many.resized(few.state_dict(), torch.Generator().manual_seed(0))
-    many.load_state_dict(grown)
-    torch.testing.assert_close(many.center[4:8], few.center, atol=0.06, rtol=0)
-    torch.testing.assert_close(many.start(1)[ROTATION].norm(dim=-1), torch.ones(1, 9))

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from pydantic import ValidationError
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters, NormalCenters
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
@@ -70,11 +69,6 @@ def test_frustum_centers_lie_in_the_frustum() -> None:
     assert z.min() >= 0.5
     assert z.max() <= 2.0
     assert (centers[:, :2].abs() <= 0.7 * z).all()
-
-
-def test_an_unknown_center_init_is_refused() -> None:
-    with pytest.raises(ValidationError, match="kind"):
-        AnchoredQueries.Config.model_validate_json('{"center_init": {"kind": "uniform"}}')
 
 
 def test_refinement_moves_only_what_it_is_told_to() -> None:
@@ -168,28 +162,6 @@ def test_idle_options_at_their_defaults_compose_again() -> None:
     model = {"queries": {"type": "locus/anchored", "radius": False}, "centers": centers}
     recipe = resolve({**LOCUS, "model": {**model, "decoder": decoder}})
     assert resolve(recipe.tree).tree == recipe.tree
-
-
-@pytest.mark.parametrize(
-    "decoder",
-    [
-        {"self_attention": {"type": "locus/anchor_aware"}},
-        {"cross_attention": {"type": "locus/ray_biased"}},
-        {"refinement": {"type": "locus/refine"}},
-    ],
-)
-def test_without_anchors_the_fix_is_to_use_anchored_queries(decoder: dict) -> None:
-    problem = problem_of({"decoder": decoder})
-    assert "use `locus/anchored` in the slot `queries`" in problem.fix
-    assert "locus/refine" not in problem.fix
-
-
-def test_option_of_another_kind_of_start_is_no_suggestion() -> None:
-    center_init = {"kind": "frustum", "mean": [0.0, 0.0, 1.0]}
-    queries = {"type": "locus/anchored", "center_init": center_init}
-    problem = problem_of({"queries": queries})
-    assert problem.reason == "there is no option `mean`"
-    assert problem.fix == "options: depth, kind, slope"
 
 
 @pytest.mark.parametrize("depth", [[0.0, 1.0], [2.0, 1.0], [-1.0, 1.0], [1.0]])
