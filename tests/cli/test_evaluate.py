@@ -189,13 +189,3 @@ def test_averaged_weights_of_a_run_are_told(runs: Path, tmp_path: Path) -> None:
 )
 def test_tune_says_what_and_how_often(tune: str, steps: int, what: list[str]) -> None:
     assert tuning_settings(tune) == [f"evaluation.tuning_steps={steps}", *what]
-
-
-@pytest.mark.parametrize("tune", ["", ":", ":5", "latents:", "tokens:5", "-3", "5:latents"])
-def test_what_tune_cannot_be(tune: str) -> None:
-    with pytest.raises(ValueError, match=r"--tune must be STEPS, queries\[:STEPS\] or"):
-        tuning_settings(tune)
-
-
-def test_no_tune_sets_nothing() -> None:
-    assert tuning_settings(None) == []

@@ -115,15 +115,6 @@ def test_photos_seen_in_training_are_not_called_novel(photos, tmp_path):
     assert "seen in training, mean" in result.output
 
 
-def test_a_missing_checkpoint_and_missing_photos_are_told(checkpoint, photos, tmp_path):
-    no_checkpoint = run(tmp_path / "none.safetensors", photos, "--out", tmp_path / "a")
-    assert "none.safetensors" in str(no_checkpoint.exception)
-    no_photos = run(checkpoint, tmp_path / "nowhere", "--out", tmp_path / "b")
-    assert "nowhere" in str(no_photos.exception)
-    assert not (tmp_path / "a").exists()
-    assert not (tmp_path / "b").exists()
-
-
 def test_photos_are_named_by_number_or_file(checkpoint, photos, tmp_path):
     named = ("--frames", "0.png,images/3.png", "--holdout", "1, 2.png")
     result = run(checkpoint, photos, "--out", tmp_path, *named)

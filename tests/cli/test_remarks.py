@@ -13,15 +13,9 @@ from photo_formats import row_of_frames
 from PIL import Image
 
 import qgs
-from qgs.components import GaussianHead
 from qgs.composer import resolve
-from qgs.contracts import Column, ModelDims, Scene, ViewsConfig
 from qgs.data.domain import KEY, trained_domain
 from qgs.data.evaluation import EvaluationPlan
-from qgs.data.images import framing
-from qgs.metrics.baselines import worse_than_nearest
-from qgs.metrics.scales import TOLD, too_many_capped
-from qgs.types import Cameras
 
 FRAMING = "(20% is cut off)"
 NEAREST = "result is worse than the nearest photo, copied: PSNR "
@@ -115,60 +109,3 @@ def test_a_reconstruction_says_the_same(checkpoint: Path, photos: Path, tmp_path
     (remark,) = json.loads((tmp_path / "refined/cameras.json").read_text())["remarks"]
     assert NEAREST in remark
     assert remark in result.output
-
-
-def test_photos_as_the_model_wants_them_are_not_remarked_on(
-    checkpoint: Path, photos: Path, tmp_path: Path
-) -> None:
-    size = ("--size", "16x20")
-    result = run_qgs("reconstruct", checkpoint, photos, "--out", tmp_path, *size)
-    assert "the model sees" not in result.output
-
-
-def test_what_a_frame_of_another_shape_or_size_loses() -> None:
-    class Stored(Scene):
-        size: tuple[int, int] = (1, 1)
-        stored: tuple[int, int] = (1, 1)
-
-        @property
-        def cameras(self) -> Cameras:
-            return Cameras(torch.eye(4)[None], torch.ones(1, 4), self.size)
-
-        def images(self, frames):
-            raise NotImplementedError
-
-        def frame_name(self, frame: int) -> str:
-            return "a.jpg"
-
-        def stored_size(self, frame: int) -> tuple[int, int] | None:
-            return self.stored
-
-    scene = Stored()
-    photo, part = "photos such as frame 0 (a.jpg), ", "the middle 720 x 720 (44% is cut off)"
-    for scene.stored, scene.size, told in (
-        ((720, 1280), (64, 64), f"{part} of {photo}1280 x 720 pixels, reduced to 64 x 64"),
-        ((720, 1280), (720, 720), f"{part} of {photo}1280 x 720 pixels"),
-        ((720, 1280), (36, 64), f"all of {photo}1280 x 720 pixels, reduced to 64 x 36"),
-        ((32, 32), (64, 64), f"all of {photo}32 x 32 pixels, enlarged to 64 x 64"),
-    ):
-        assert framing(scene, 0) == f"the model sees {told}"
-    scene.stored = scene.size
-    assert framing(scene, 0) == ""
-
-
-def test_what_is_as_good_as_the_nearest_photo_is_not_worse() -> None:
-    psnr, lpips = Column("PSNR", "higher", 2, "dB"), Column("LPIPS", "lower")
-    assert worse_than_nearest(psnr, 20.0, 20.0) == worse_than_nearest(psnr, 20.1, 20.0) == ""
-    assert worse_than_nearest(lpips, 0.2, 0.3) == worse_than_nearest(lpips, None, 0.3) == ""
-    assert "LPIPS 0.300 against 0.200" in worse_than_nearest(lpips, 0.3, 0.2)
-
-
-def test_few_scales_at_the_cap_are_not_told() -> None:
-    head = GaussianHead(GaussianHead.Config(scale_cap=0.1), ModelDims(16, 2, 1))
-    assert too_many_capped(head, TOLD - 0.01, ViewsConfig()) == ""
-    told = too_many_capped(head, TOLD, ViewsConfig())
-    assert told.startswith("25% of the scales of visible Gaussians are at the cap, ")
-    assert told.endswith("take a smaller views.scale_factor")
-    auto = too_many_capped(head, TOLD, ViewsConfig(scale="auto"))
-    assert auto.endswith("take a smaller views.scale_factor with views.scale: constant")
-    assert "model.head.scale_cap: 0.1," in told

@@ -111,12 +111,6 @@ def test_a_missing_extra_is_told_without_a_traceback(
     assert 'pip install "query-gaussians[cpu]"' in capsys.readouterr().err
 
 
-def test_eval_refuses_to_change_the_model(run: Path) -> None:
-    result = run_qgs("eval", run, "--set", "model.queries.count=9")
-    assert isinstance(result.exception, ValueError)
-    assert "would change the trained model" in str(result.exception)
-
-
 def test_a_second_run_in_one_folder_is_refused(run: Path) -> None:
     before = (run / "checkpoint.safetensors").stat().st_mtime_ns
     result = train(run)

@@ -10,11 +10,8 @@ from photo_formats import row_of_frames
 from PIL import Image
 from plyfile import PlyData
 from qgs_viewer.contest import (
-    WINDOWS,
     checkpoints,
-    describe,
     judge,
-    remarks,
     resolve_fairly,
 )
 from qgs_viewer.curves import curves_of
@@ -75,7 +72,6 @@ def test_all_systems_can_be_compared():
     compared = resolve_fairly([Path(f"tiny/{n}.yaml") for n in names], seconds=1, seed=0)
     assert [*compared] == [*names]
     assert compared["c3g"].training.judge_inputs
-    assert describe(compared["c3g"]).endswith("Trained on its input views too.")
 
 
 def test_budget_and_seed_are_those_asked_for(recipes):
@@ -125,19 +121,12 @@ def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
         ply = tmp_path / "demo" / name / "example.ply"
         assert PlyData.read(ply)["vertex"].count == 4 * queries
         assert not (ply.parent / "checkpoint.safetensors").exists()
-    for word in ("PSNR", "Nearest input", "Mean colour"):
-        assert word in result.output
-    assert "seconds" not in result.output
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "test/000001" in page
-    assert "These trained models come with qgs" not in page
-    assert "judged on the test split of their recipe" in page
-    assert "qgs/latent: N learned vectors" in page
     for text in (page, result.output):
         assert "few: step 7,000 of 150,000; more: step 7,000 of 150,000" in text
-        assert "qgs demo PHOTOS" in text
+        assert "Mean colour" in text
     assert "<h2>Training</h2>" not in page
-    assert "<small>seconds</small>" not in page
 
 
 def test_a_report_of_runs_shows_how_they_were_trained(models, tmp_path):
@@ -150,7 +139,6 @@ def test_a_report_of_runs_shows_how_they_were_trained(models, tmp_path):
     assert result.exit_code == 0, result.output
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<h2>Training</h2>" in page
-    assert "judged on the test split of their recipe" in page
     assert "run: report/run/example.ply" in result.output, "no checkpoint was written there"
     photos = photos_in(tmp_path / "mine", 6, step=0.1)
     assert run_qgs("report", "run", "--photos", photos).exit_code == 0
@@ -176,14 +164,10 @@ def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
     assert result.exit_code == 0, result.output
     assert result.output.count("few, more: the views lie outside what this model was trained") == 1
     assert result.output.count("(views.scale: auto)") == 1
-    assert "Unseen" not in result.output
     apart = re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: ", result.output)
     assert bool(apart) == (count == 3), "of many photos in a row, neighbours stand close enough"
-    assert "their axes meet at no point before them (trained: " in result.output
     page = (tmp_path / "demo" / "report.html").read_text()
     assert page.index("lie outside what this model") < page.index("<table>")
-    assert "<h2>Your photos</h2>" in page
-    assert "Unseen" not in page
 
 
 def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
@@ -196,60 +180,20 @@ def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
     assert figures[0] == pytest.approx(figures[1], abs=1e-3)
 
 
-def test_the_sentence_on_photos_is_of_all_views_that_are_judged(models, tmp_path, monkeypatch):
-    files = checkpoints(models[1:2])
-    told = "qgs.engine.evaluation.verdict"
-    monkeypatch.setattr(told, lambda _, found: f"{found.samples} windows")
-    (entry,) = judge(files, str(photos_in(tmp_path / "mine", 80, step=0.1)), "cpu")
-    assert sum(len(score.views) for score in entry.evaluation.scores) == WINDOWS
-    assert remarks([entry])[0] == f"few: {WINDOWS} windows."
-
-
-def test_models_of_one_file_name_are_all_shown(models, tmp_path):
-    other = tmp_path / "aa" / "few.safetensors"
-    other.parent.mkdir()
-    other.write_bytes((tmp_path / "models" / "few.safetensors").read_bytes())
-    result = run_qgs("demo", *models[:2], "--model", other)
-    assert result.exit_code == 0, result.output
-    for name in ("models/few", "aa/few"):
-        assert (tmp_path / "demo" / name / "example.ply").is_file()
-        assert name in result.output
-
-
-def test_an_own_folder_of_recipes_comes_first(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert resolve("recipes/tiny/locus.yaml").tree["model"]["queries"]["count"] == 256
-    mine = tmp_path / "recipes" / "tiny" / "locus.yaml"
-    mine.parent.mkdir(parents=True)
-    mine.write_text(yaml.safe_dump(RECIPE))
-    assert resolve("recipes/tiny/locus.yaml").tree["model"]["queries"]["count"] == 8
-
-
 @pytest.mark.parametrize(
-    ("words", "told"),
+    "words",
     [
-        (["--seconds", 3], "are for training: add --train"),
-        (["--train", "--model", "rooms/locus-64"], "--model names trained models"),
-        (["one", "two"], "one folder of photos is shown at a time, got one, two"),
-        (["--model", "none.safetensors"], "no checkpoint at none.safetensors"),
-        (
-            ["recipes/tiny/locus.yaml", "b.yaml"],
-            "locus.yaml is a recipe, no folder of photos: add --train",
-        ),
+        ["--seconds", 3],
+        ["--train", "--model", "rooms/locus-64"],
+        ["one", "two"],
+        ["--model", "none.safetensors"],
+        ["recipes/tiny/locus.yaml"],
     ],
 )
-def test_words_without_meaning_are_refused(words, told, tmp_path, monkeypatch):
+def test_options_without_meaning_are_refused(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    error = run_qgs("demo", *words).exception
-    assert told in str(error)
-    assert not hasattr(error, "__notes__")
+    assert isinstance(run_qgs("demo", *words).exception, ValueError | FileNotFoundError)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_without_the_models_that_come_with_qgs_training_is_pointed_to(tmp_path, monkeypatch):
-    monkeypatch.setattr("qgs_viewer.demo.MODELS", ("rooms/gone-64",))
-    error = run_qgs("demo", "--out", tmp_path / "demo").exception
-    assert "qgs demo --train" in error.__notes__[0]
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
@@ -260,14 +204,6 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo" / "report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo")
-
-
-@pytest.mark.parametrize(("depth", "reader"), [(0, "qgs/multiview_vit: "), (1, "qgs/content: ")])
-def test_a_model_is_told_by_its_queries_and_by_what_reads_the_photos(depth, reader):
-    model = {"decoder": {"depth": depth}, "supervision": {"layers": [depth]}}
-    told = describe(resolve({"recipe": 1, "model": model}))
-    assert told.startswith("qgs/latent: ")
-    assert reader in told
 
 
 def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch):

@@ -10,36 +10,26 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from PIL import Image
-from qgs_viewer.curves import Curves
 from qgs_viewer.figures import (
     anchors,
     attention,
-    curves,
     dispersion,
     global_gaussians,
     graph,
     novel_views,
     refinement,
 )
-from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError, exhibit
+from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
 from qgs_viewer.figures.layers import chosen_layers
 from qgs_viewer.figures.overview import level_axes, overview, seen_points
 from qgs_viewer.figures.paper import DPI, WIDTH, new_figure, write_figure
 from qgs_viewer.figures.plan import ground, plan_of
-from qgs_viewer.queries import attention_pictures
-from small import KINDS, QUERIES, SIDE, VIEWS, Walk, exhibit_of, exhibition_of, sample_of
+from qgs_viewer.pictures import color_error, error_picture
+from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
 
 import qgs
 from qgs.contracts import MetricInput
-from qgs.data.sampling import make_sample
-from qgs.drawing.images import (
-    color_error,
-    depth_picture,
-    depth_range,
-    enlarged,
-    error_picture,
-    rgb_picture,
-)
+from qgs.drawing.images import depth_picture, depth_range, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics import Dispersion
 
@@ -130,24 +120,6 @@ def test_bars_are_the_metric_of_each_scene() -> None:
             np.testing.assert_allclose([b.get_height() for b in bars], expected, rtol=1e-5)
             line = axis.lines[number].get_ydata()
             np.testing.assert_allclose(line, np.mean(expected), rtol=1e-5)
-
-
-def test_values_far_apart_get_a_logarithmic_scale() -> None:
-    near, far = ({"a": {"mean": [1.0, 2.0]}, "b": {"mean": [high, 3.0]}} for high in (5.0, 500.0))
-    scales = [dispersion.figure(found, ["x", "y"]).axes[0].get_yscale() for found in (near, far)]
-    assert scales == ["linear", "log"]
-
-
-def test_a_label_is_what_tells_a_scene_from_others() -> None:
-    assert dispersion.scene_labels([sample_of(), sample_of((0, 5))]) == ["1–4", "0–5"]
-    for names, labels in (
-        (["test/0001", "test/0012"], ["1", "12"]),
-        (["room1", "room12"], ["room1", "room12"]),
-        (["a_x", "a_y"], ["x", "y"]),
-        (["alone"], ["alone"]),
-    ):
-        samples = [replace(sample_of(), scene=name) for name in names]
-        assert dispersion.scene_labels(samples) == labels
 
 
 def test_anchors_are_shown_layer_by_layer_of_models_that_have_them() -> None:
@@ -263,23 +235,6 @@ def test_axes_of_cameras_that_face_each_other_are_those_of_the_first() -> None:
     torch.testing.assert_close(right.mT @ right, torch.eye(2).double(), atol=1e-6, rtol=0)
 
 
-def test_all_photos_that_are_shown_are_said_to_be() -> None:
-    made = attention.made(exhibition_of("locus"))
-    assert "over the patches of the input photos" in made.caption
-    show = exhibition_of("locus")
-    many = make_sample(Walk(), (0, 1, 4), (2, 3), VIEWS, mirror=False)
-    shown = exhibit("locus", show.exhibits[0].model, many)
-    made = attention.made(Exhibition([shown], [many], [None], query=3))
-    assert "over the patches of 2 of 3 input photos" in made.caption
-    depth = shown.look.depth
-    weights = shown.look.attention(3, depth)
-    maps = attention.part_maps(shown, weights, "weights")
-    photos = [enlarged(rgb_picture(i), attention.PHOTO) for i in many.inputs.images[0, :2]]
-    expected = attention_pictures(photos, maps[:2])
-    for picture in expected:
-        assert any(np.array_equal(picture, one) for one in pictures(made.figure.axes))
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_gaussians_of_the_query_that_was_asked_for(kind: str) -> None:
     made = global_gaussians.made(exhibition_of(kind, query=7))
@@ -289,18 +244,6 @@ def test_the_gaussians_of_the_query_that_was_asked_for(kind: str) -> None:
     assert said in words(made.figure.axes)
     with pytest.raises(ValueError, match=f"{kind} has no query {QUERIES}; its queries are 0 to"):
         global_gaussians.made(exhibition_of(kind, query=QUERIES))
-
-
-def test_curves_are_left_out_in_plain_words() -> None:
-    show = exhibition_of(*PAIR)
-    with pytest.raises(NothingToShowError, match=r"tokengs, locus: no history\.jsonl"):
-        curves.made(show)
-    known = Curves([1.0, 2.0, 3.0], [0.5, 0.4, 0.3], [10.0, 12.0, 14.0], [1, 2, 3])
-    first, other = show.exhibits
-    trained = replace(first, curves=known)
-    made = curves.made(Exhibition([trained, other], show.samples, show.depths))
-    np.testing.assert_array_equal(made.figure.axes[1].lines[0].get_ydata(), known.psnr)
-    assert "locus: no history.jsonl" in made.caption
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from qgs_viewer.queries import (
     washed,
 )
 
-from qgs.drawing.figures import CATEGORICAL, figure_picture, running_mean
+from qgs.drawing.figures import CATEGORICAL, running_mean
 from qgs.drawing.images import NOTHING, depth_picture, depth_range, enlarged, finer, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import SpatialSupport
@@ -185,14 +185,6 @@ def test_what_a_mask_hides_has_the_colour_of_nothing_and_no_part_in_the_scale():
     assert (none == picture[3, 3]).all()
 
 
-def test_curves_are_drawn_for_each_model():
-    run = Curves([0.0, 1.0, 2.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0], [1, 2, 3])
-    alone = figure_picture(curves_figure({"a": run}), dpi=60)
-    both = figure_picture(curves_figure({"a": run, "b": run}), dpi=60)
-    assert alone.shape == both.shape
-    assert (alone != both).any()
-
-
 def test_curves_of_hours_which_may_hold_pauses_are_drawn_by_steps():
     run = Curves([0.0, 1.0, 7000.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0], [100, 200, 300])
     paused = replace(run, seconds=[0.0, 1.0, 9000.0])
@@ -217,9 +209,3 @@ def test_one_odd_value_at_an_end_bends_no_running_mean(end: int, most: float) ->
     values = np.full(4000, 3.0)
     values[end] = 13.0
     assert np.abs(running_mean(values) - 3).max() < most
-
-
-@pytest.mark.parametrize("count", [1, 2, 39])
-def test_a_few_values_are_their_own_running_mean(count: int) -> None:
-    values = np.random.default_rng(0).normal(size=count)
-    np.testing.assert_array_equal(running_mean(values), values)

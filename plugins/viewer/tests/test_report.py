@@ -1,4 +1,3 @@
-import re
 from html.parser import HTMLParser
 from importlib.metadata import entry_points
 
@@ -94,30 +93,16 @@ def test_anchors_are_shown_layer_by_layer_and_attention_with_its_geometry():
     assert "geometry bias" in page
 
 
-def test_queries_without_a_place_have_no_anchor_section():
+def test_sections_are_those_of_which_the_model_has_something():
     page = page_of(PLAIN, "plain")
     assert "Where queries look" not in page
-    assert "geometry bias</figcaption>" not in page
-    assert "content logits" in page
-    assert 'alt="Truth, depth"' in page
-    assert page.count('src="data:image/webp;base64,') == 1
-    assert page.count("<h2>") == 7
-    assert '<td class="best">12.34</td>' in page
-    assert '<td class="best">0.500</td>' in page
-    assert "<th>my metric ↓<small>" in page
-    assert "<td>11.11</td>" in page
+    assert "What one query reads" in page
+    for cell in ('<td class="best">12.34</td>', '<td class="best">0.500</td>', "<td>11.11</td>"):
+        assert cell in page
     assert 'Small, see <a href="https://example.org/small"' in page
     assert page.index("The photos lie outside.") < page.index("<table>")
-    assert "<br>What my metric means." in page
-    assert "Next: <code>qgs list</code> lists." in page
-    assert "token" not in re.sub(r"data:[^\"]+|[a-z]*TokenGS", "", page)
-
-
-def test_a_model_without_layers_has_no_attention_to_show():
     model = {**PLAIN["model"], "decoder": {"depth": 0}, "supervision": {"layers": [0]}}
-    page = page_of({**PLAIN, "model": model}, "without layers")
-    assert "What one query reads" not in page
-    assert page.count("<h2>") == 6
+    assert "What one query reads" not in page_of({**PLAIN, "model": model}, "without layers")
 
 
 def test_names_cannot_break_the_page():
@@ -233,27 +218,21 @@ def test_a_model_reads_each_scene_once_for_all_pictures_but_those_of_its_inside(
 
 
 @pytest.mark.parametrize(
-    ("source", "told"),
+    "source",
     [
-        ("import nothing_of_this_name", "ModuleNotFoundError: No module named"),
-        ("other = 1", "AttributeError"),
-        ("plugin = 3", "TypeError: 'int' object is not callable"),
-        ("def plugin(shown, samples):\n    return 'text'", "it gives str, not a ReportSection"),
-        (OFFERED.replace("[Tile(", "['text', Tile("), "has str among its figures, not a Tile"),
-        (OFFERED.replace("Tile(GREY,", "Tile(GREY / 2,"), "must be uint8 (H, W, 3), got float64"),
-        ("def plugin(shown, samples):\n    raise SystemExit('gone')", "SystemExit: gone"),
+        "import nothing_of_this_name",
+        "def plugin(shown, samples):\n    return 'text'",
+        OFFERED.replace("Tile(GREY,", "Tile(GREY / 2,"),
+        "def plugin(shown, samples):\n    raise SystemExit('gone')",
     ],
 )
-def test_a_section_that_fails_is_said_and_left_out(install, caplog, source, told):
+def test_a_section_that_fails_is_named_and_left_out(install, caplog, source):
     install("qgs-broken", "broken", source, group=GROUP)
     warn_once.cache_clear()
     page = page_of(PLAIN, "plain")
     assert "<h2>A walk through the reconstruction</h2>" in page
     assert "Mine" not in page
-    (message,) = (r.message for r in caplog.records if "does without" in r.message)
-    assert "the section `broken` of qgs-broken 1.2" in message
-    assert told in message
-    assert message.endswith("update qgs-broken 1.2, or uninstall it")
+    assert "`broken` of qgs-broken 1.2" in caplog.text
 
 
 def test_large_photos_are_compressed_and_small_ones_exact():

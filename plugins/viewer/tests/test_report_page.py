@@ -2,8 +2,7 @@
 
 import io
 import re
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -16,19 +15,13 @@ from PIL import Image
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
 from browser import CHROMIUM, Page, chromium
-from qgs_viewer import section
-from qgs_viewer.choice import Choice
 from qgs_viewer.figures import dispersion
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
-from qgs_viewer.page import shared_start
-from qgs_viewer.queries import notable_queries
 from qgs_viewer.report import GROUP, Contender, Report, Shown, report_html
 from qgs_viewer.section import (
     dispersion_section,
-    refinement_section,
     scene_section,
     sections,
-    self_attention_section,
 )
 from small import VIEWS, Walk, model_of
 
@@ -74,50 +67,6 @@ def test_the_viewer_offers_its_sections() -> None:
     assert found == [sections]
 
 
-def test_sections_share_one_look_at_each_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(section, "scenes_html", lambda looks, choices: "<p>")
-    samples = [sample_of(1, 2), sample_of(3, 4)]
-    shown = shown_of(samples)
-    encoded = {one.name: 0 for one, _ in shown}
-    decoded = dict(encoded)
-
-    def count(table: dict[str, int], name: str) -> Callable[..., None]:
-        return lambda *_: table.update({name: table[name] + 1})
-
-    with ExitStack() as hooks:
-        for one, _ in shown:
-            for part, table in ((one.model.encoder, encoded), (one.model.decoder[0], decoded)):
-                handle = part.register_forward_pre_hook(count(table, one.name))
-                hooks.callback(handle.remove)
-        made = list(sections(shown, samples))
-    assert [len(section.figures[""]) for section in made] == [1, 1, 1, 1]
-    assert encoded == {"tokengs": 1, "locus": 1}
-    assert decoded == {"tokengs": 2, "locus": 2}, "once to look, once to trace five queries"
-
-
-def test_refinement_is_shown_of_models_with_anchors() -> None:
-    plain, anchored = exhibits()
-    (tile,) = refinement_section([plain, anchored]).figures[""]
-    (single,) = refinement_section([anchored]).figures[""]
-    np.testing.assert_array_equal(tile.image, single.image)
-    assert not refinement_section([plain]).figures
-
-
-def test_self_attention_is_shown_of_models_that_tell_it() -> None:
-    both = exhibits()
-    (tile,) = self_attention_section(both).figures[""]
-    (single,) = self_attention_section(both[:1]).figures[""]
-    assert np.asarray(tile.image).shape[1] > 1.5 * np.asarray(single.image).shape[1]
-    silent = exhibits()[:1]
-    for layer in silent[0].model.decoder:
-        layer.self_attention.explain = lambda *parts: None
-    try:
-        assert not self_attention_section(silent).figures
-    finally:
-        for layer in silent[0].model.decoder:
-            del layer.self_attention.explain
-
-
 def test_bars_are_of_every_scene_of_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn, draw = [], dispersion.figure
     monkeypatch.setattr(
@@ -147,19 +96,6 @@ def test_the_section_has_all_models_and_the_code_of_the_viewer_once() -> None:
     assert not re.search(r"(src|href)=.?http", tile.page)
 
 
-def test_a_notable_query_of_a_model_with_anchors_is_picked(monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen: dict[str, Choice] = {}
-    monkeypatch.setattr(section, "scenes_html", lambda _, choices: chosen.update(choices) or "")
-    both = exhibits()
-    scene_section(both)
-    locus = both[1]
-    view = section._first_camera(shared_start([shown.look for shown in both]))
-    (notable,) = notable_queries(locus.model, locus.gaussians, view, 1)
-    assert [*chosen] == ["locus"]
-    assert (chosen["locus"].query, chosen["locus"].layer) == (notable.index, locus.model.depth)
-    assert chosen["locus"].others == "shown"
-
-
 def drawn(page: Page, folder: Path, name: str) -> np.ndarray:
     shot = page.screenshot(folder / f"{name}.png")
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
@@ -178,7 +114,6 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         _slide(page, tmp_path)
         _zoom(page)
         _darken(page)
-        _print(page)
         _turn(page, tmp_path)
         assert page.targets.count("worker") == 2, "each scene sorts its Gaussians in a worker"
         assert page.errors == []
@@ -248,22 +183,6 @@ def _darken(page: Page) -> None:
     assert page.evaluate(paper) == "rgb(255, 255, 255)", "the button wins"
     page.evaluate("document.documentElement.style.colorScheme = ''")
     assert page.evaluate(paper) == dark
-
-
-def _print(page: Page) -> None:
-    page.call("Emulation.setEmulatedMedia", media="print")
-    assert page.evaluate(SHOWN) == [True, True]
-    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-    for what in ("#theme", ".scenes > label", ".compare input", ".open span"):
-        assert not page.evaluate(f"document.querySelector('{what}').checkVisibility()"), what
-    pair = "[...document.querySelectorAll('.compare:first-child img')].slice(0, 2)"
-    tops, lefts = (
-        page.evaluate(f"{pair}.map(i => i.getBoundingClientRect().{side})")
-        for side in ("top", "left")
-    )
-    assert tops[0] == tops[1]
-    assert lefts[0] < lefts[1]
-    page.call("Emulation.setEmulatedMedia", media="", features=[])
 
 
 def _turn(page: Page, folder: Path) -> None:

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from qgs_viewer.files import FinishedScene
 from qgs_viewer.look import NEUTRAL
-from qgs_viewer.sources import FixedSource, ModelSource, Wanted, _difference, open_source
+from qgs_viewer.sources import FixedSource, ModelSource, Wanted, open_source
 from small import QUERIES, VIEWS, Walk, model_of
 
 import qgs
@@ -129,13 +128,6 @@ def test_a_broken_record_is_told_with_its_file(finished: Path, tmp_path: Path, t
         open_source(str(folder), Wanted())
 
 
-def test_a_missing_picture_is_told(finished: Path, tmp_path: Path) -> None:
-    folder = changed_copy(finished, tmp_path)
-    (folder / "views/00001_input.png").unlink()
-    with pytest.raises(FileNotFoundError, match="00001_input"):
-        open_source(str(folder), Wanted())
-
-
 def test_a_ply_shows_gaussians_alone(finished: Path) -> None:
     source = open_source(str(finished / "scene/gaussians.ply"), Wanted())
     found = source.look(())
@@ -146,13 +138,6 @@ def test_a_ply_shows_gaussians_alone(finished: Path) -> None:
 def test_a_scene_that_the_data_lack_is_told(finished: Path) -> None:
     with pytest.raises(ValueError, match="the data of the recipe holds no scene 'nowhere'"):
         open_source(str(finished / "model.safetensors"), Wanted(scene="nowhere"))
-
-
-def test_options_that_say_nothing_to_a_ply_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="`PHOTOS`, `--set` do not apply to a PLY file"):
-        open_source(str(tmp_path / "a.ply"), Wanted(photos="x", overrides=["views.scale=auto"]))
-    with pytest.raises(ValueError, match=r"`--size` does not apply .* leave it out"):
-        open_source(str(tmp_path / "a.ply"), Wanted(size=(64, 64)))
 
 
 def test_changed_inputs_have_the_scale_of_their_own_distance(tmp_path: Path) -> None:
@@ -167,11 +152,6 @@ def test_changed_inputs_have_the_scale_of_their_own_distance(tmp_path: Path) -> 
     torch.testing.assert_close(seen.cameras.c2w, true.cameras.c2w, atol=1e-4, rtol=1e-4)
 
 
-def test_a_scale_that_was_overridden_is_kept(tmp_path: Path) -> None:
-    finished_by_distance(tmp_path, VIEWS)
-    assert isinstance(open_source(str(tmp_path / "scene"), Wanted()), ModelSource)
-
-
 def test_a_model_is_not_fetched_on_the_word_of_a_file(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,24 +161,3 @@ def test_a_model_is_not_fetched_on_the_word_of_a_file(
     source = open_source(str(changed_copy(finished, tmp_path, model=url)), Wanted())
     assert f"`qgs view {url} PHOTOS`" in source.notes[0]
     assert asked == []
-
-
-def test_a_model_that_cannot_be_read_leaves_the_gaussians(finished: Path, tmp_path: Path) -> None:
-    broken = tmp_path / "broken.safetensors"
-    broken.write_bytes(b"no checkpoint")
-    source = open_source(str(changed_copy(finished, tmp_path, model=str(broken))), Wanted())
-    assert isinstance(source, FixedSource)
-    assert "broken.safetensors" in source.notes[0]
-
-
-def test_what_differs_is_told_in_words() -> None:
-    means = torch.rand(1, 20, 3)
-    assert _difference(means, means) == ""
-    assert _difference(means[:, :10], means) == "10 instead of 20"
-    assert "differ" in _difference(means + 1, means)
-    assert "differ" in _difference(means * float("nan"), means)
-
-
-def test_cameras_without_a_photo_have_their_number_in_the_scene(tmp_path: Path) -> None:
-    scene = FinishedScene("walk", tmp_path, [{"frame": 7, "kind": "input"}])
-    assert scene.label(0) == "frame 7"

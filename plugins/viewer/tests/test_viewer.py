@@ -60,43 +60,6 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel) -> Non
     assert nodes(server) == {*BASE, "/anchors"}
 
 
-def test_numbers_that_no_query_has_change_nothing(panel) -> None:
-    panel.number.value = QUERIES - 1
-    for typed in (QUERIES, 300, -7):
-        panel.number.value = typed
-        assert panel.choice.query == QUERIES - 1
-    panel.pick(2)
-    assert (panel.choice.query, panel.number.value) == (2, 2)
-
-
-def test_a_choice_that_cannot_be_drawn_is_not_kept(panel, monkeypatch) -> None:
-    def fails(*_: object) -> None:
-        raise RuntimeError("not drawn")
-
-    panel.pick(3)
-    monkeypatch.setattr("qgs_viewer.stage.painted", fails)
-    with pytest.raises(RuntimeError, match="not drawn"):
-        panel.choose(query=4)
-    assert panel.choice.query == 3
-
-
-def test_gaussians_are_painted_anew_only_where_their_paint_changes(panel, monkeypatch) -> None:
-    from qgs_viewer import stage
-
-    drawn: list[str] = []
-    update, paint = panel.stage.update, stage.painted
-    monkeypatch.setattr(panel.stage, "update", lambda *a: (drawn.append("stage"), update(*a)))
-    monkeypatch.setattr(stage, "painted", lambda *a: (drawn.append("paint"), paint(*a))[1])
-    panel.pick(3)
-    panel.choose(others="shown", by_query=True)
-    assert drawn == 2 * ["stage", "paint"]
-    panel.choose(layer=1, patches=5, anchors=False, photos=False)
-    panel.choose(layer=1)
-    assert drawn[4:] == ["stage"]
-    panel.boxes[0].value = True
-    assert drawn[5:] == ["stage", "paint"]
-
-
 def test_text_is_shown_as_it_is(server) -> None:
     from html import unescape
 
@@ -150,26 +113,6 @@ def test_a_picked_query_is_let_go(server, panel) -> None:
     assert nodes(server) == {*BASE, "/anchors"}
 
 
-def test_what_is_read_more_has_broader_and_stronger_lines(server, panel) -> None:
-    panel.pick(3)
-    reading = panel.look.strongest(3, panel.choice.layer, panel.choice.patches, 1.0)
-    shares = (reading.shares / reading.shares.max()).numpy()
-    groups = [server.scene.get_handle_by_name(f"/reading/{width}") for width in range(3)]
-    thick = [group.thickness for group in groups if group is not None]
-    assert thick == sorted(set(thick))
-    ends = {tuple(end): (g.thickness, c) for g in groups if g for end, c in lines_of(g)}
-    points = reading.points.float().numpy()
-    assert len(ends) == len(points) == panel.choice.patches
-    marks = np.array(server.scene.get_handle_by_name("/patches").colors).astype(float)
-    behind = 255 * np.array(panel.look.background)
-    apart = np.linalg.norm(marks - behind, axis=1)
-    np.testing.assert_allclose(apart / apart[0], 0.08 + 0.92 * shares, atol=0.03)
-
-
-def lines_of(group: "viser.LineSegmentsHandle") -> list[tuple[np.ndarray, np.ndarray]]:
-    return [(points[1], color[0]) for points, color in zip(group.points, group.colors, strict=True)]
-
-
 @pytest.mark.parametrize("background", [(0.5, 0.5, 0.5), (0.0, 0.25, 1.0)])
 def test_gaussians_stand_before_the_background_of_their_model(background) -> None:
     """In a browser and in pages alike: what a scene serialises is what a page draws."""
@@ -189,23 +132,6 @@ def test_gaussians_stand_before_the_background_of_their_model(background) -> Non
     assert sent.format == "png"
     pixels = np.asarray(Image.open(BytesIO(sent.rgb_data)).convert("RGB")).reshape(-1, 3)
     np.testing.assert_allclose(pixels, 255 * np.array([background] * len(pixels)), atol=1)
-
-
-def test_many_photos_are_named_and_taken_by_a_button(server, monkeypatch) -> None:
-    from qgs_viewer import panel as module
-
-    monkeypatch.setattr(module, "MOST_BOXES", 3)
-    server.gui.reset()
-    panel = module.Panel(server, source_of("locus"))
-    button = button_of(server, "Reconstruct")
-    before = panel.look
-    panel.frames.value = "0,4"
-    assert panel.look is before
-    button.value = True
-    assert panel.look.frames == (0, 4)
-    after = panel.look
-    button.value = True
-    assert panel.look is after
 
 
 @pytest.mark.parametrize("error", [ValueError("too few"), OSError("no photo")])
