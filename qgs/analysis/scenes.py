@@ -17,7 +17,6 @@ from qgs.data.images import framing
 from qgs.data.recognition import open_for
 from qgs.data.sampling import training_frames, views_in
 from qgs.data.scenes import warn_once
-from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
 from qgs.wording import listed
@@ -101,19 +100,15 @@ def reconstruct(
         result = reconstruct_sample(model.eval(), sample, world, seen, tuned, record)
     finally:
         model.train(training)
-    return replace(result, remarks=_remarks(result, found, recipe))
+    return replace(result, remarks=_remarks(result, found))
 
 
-def _remarks(result: Reconstruction, scene: Scene, recipe: Recipe) -> list[str]:
+def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     """What a user must know of photos and result."""
-    sample, found, model = result.sample, Domain(), result.model
+    sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    remarks = (
-        verdict(model.trained_on or Domain(), found),
-        framing(scene, sample.input_frames[0]),
-        too_many_capped(model.head, capped_share(model.head, result.gaussians), recipe.views),
-        result.worse_than_nearest,
-    )
+    likeness = verdict(result.model.trained_on or Domain(), found)
+    remarks = likeness, framing(scene, sample.input_frames[0]), result.worse_than_nearest
     return [*filter(None, remarks)]
 
 

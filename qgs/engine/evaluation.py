@@ -6,7 +6,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from statistics import fmean as mean
 
 import torch
 
@@ -21,7 +20,6 @@ from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
-from qgs.metrics.scales import capped_share, too_many_capped
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
@@ -77,14 +75,12 @@ def evaluate(
         step=step,
     )
     likeness = "" if trained_on is None else verdict(trained_on, judge.seen)
-    said = (likeness, plan.framing, *_remarks(evaluation, plan, recipe, model))
+    said = (likeness, plan.framing, *_remarks(evaluation, plan, recipe))
     return replace(evaluation, remarks=[*filter(None, said)])
 
 
-def _remarks(
-    evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe, model: QueryGaussianModel
-) -> Iterator[str]:
-    """Sentences on what came of an evaluation, "" for those that do not apply."""
+def _remarks(evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe) -> Iterator[str]:
+    """Remarks on the scores; "" for those that do not apply."""
     scores, samples = evaluation.scores, recipe.evaluation.samples
     fixed = [score for score in scores if score.scene not in plan.drawn]
     if samples > 1 and fixed:
@@ -94,8 +90,6 @@ def _remarks(
             why = "{} of {} held-out frames are judged, each once".format(*evaluation.held_out)
         told = f"evaluation.samples={samples} changed nothing{where}"
         yield f"{told}, since no views were drawn: {why}"
-    capped = mean(s.values["scales_at_cap"] for s in scores)
-    yield too_many_capped(model.head, capped, recipe.views)
     if evaluation.columns and not any(score.given for score in scores):
         name, column = next(iter(evaluation.columns.items()))
         nearest = evaluation.mean(name, "nearest_input")
@@ -248,7 +242,7 @@ class _Judge:
         for method, shown in given.items():
             values |= self._measures(method, shown)
         values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
-        return {**values, "scales_at_cap": capped_share(self._model.head, gaussians)}
+        return values
 
 
 def _name(metric: str, key: str) -> str:

@@ -28,27 +28,15 @@ def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
 BASELINES = {"nearest_input": nearest_input, "mean_colour": mean_colour}
 """By their names in results; tables write blanks for underscores."""
 
-_TRAINED_OTHERWISE = "train longer, or on photos like these"
 
-
-def worse_than_nearest(
-    column: Column,
-    model: float | None,
-    nearest: float | None,
-    *,
-    what: str = "the result",
-    or_else: str = _TRAINED_OTHERWISE,
-) -> str:
-    """A sentence where `nearest_input` scores better than the model, else "".
-
-    what: is worse. or_else: what may help beside other inputs.
-    """
+def worse_than_nearest(column: Column, model: float | None, nearest: float | None) -> str:
+    """A remark where `nearest_input` scores better than the model, else ""."""
     if model is None or nearest is None or column.best((model, nearest)) == model:
         return ""
     return (
-        f"{what} is worse than the nearest photo, copied: {column.heading} "
-        f"{column.shown(model)} against {column.shown(nearest)}. Do not rely on it: choose inputs "
-        f"nearer to the views that are wanted, or {or_else}"
+        f"the result is worse than the nearest photo, copied: {column.heading} "
+        f"{column.shown(model)} against {column.shown(nearest)}; choose inputs nearer to the views "
+        "that are wanted, or train on photos like these"
     )
 
 
