@@ -135,9 +135,10 @@ def _fields_of(component: type[Component]) -> Iterator[str]:
     if any(field.is_required() for field in component.Config.model_fields.values()):
         return
     config = component.Config()
-    for verb in ("requires", "provides"):
-        if fields := getattr(component, verb)(config):
-            listed = ", ".join(f"`{name}` ({spec})" for name, spec in fields.items())
+    fields = {"reads": component.fields_read(config), "writes": component.fields_written(config)}
+    for verb, found in fields.items():
+        if found:
+            listed = ", ".join(f"`{name}` ({spec})" for name, spec in found.items())
             yield f"By default it {verb} {listed}."
 
 
