@@ -35,6 +35,7 @@ DISTRIBUTIONS = {
     },
     "qgs.commands": {
         "data": "query-gaussians-datatools",
+        "compare": "query-gaussians-studies",
         "study": "query-gaussians-studies",
         "bench": "query-gaussians-bench",
     }

@@ -1,4 +1,4 @@
-"""`qgs eval`: judge a checkpoint, or compare what was judged."""
+"""`qgs eval`: evaluate a checkpoint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from qgs.cli.options import Device, Overrides, Threads, Tune, tuning_settings, use_threads
+from qgs.cli.options import (
+    Checkpoint,
+    Device,
+    Overrides,
+    Threads,
+    Tune,
+    tuning_settings,
+    use_threads,
+)
 
 if TYPE_CHECKING:
     from qgs.composer import Recipe
@@ -22,13 +30,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN",
-            help="Run folder, checkpoint, its URL, or a shipped model; several with --compare.",
-        ),
-    ],
+    run: Checkpoint,
     overrides: Overrides = None,
     index: Annotated[
         str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
@@ -42,33 +44,18 @@ def evaluate(
             "evaluation_NAME here for a shipped model or a URL."
         ),
     ] = None,
-    compare: Annotated[
-        bool, typer.Option("--compare", help="Compare the first RUN's results with the others'.")
-    ] = False,
-    across_protocols: Annotated[
-        bool, typer.Option("--across-protocols", help="Compare results of different protocols.")
-    ] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
     ] = False,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour.
-
-    With --compare nothing is evaluated: the results in the first RUN are compared with those in
-    each of the others, scene by scene, and written to --out where it is given.
-    """
+    """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour."""
     settings = list(overrides or ())
     if index is not None:
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
     settings += tuning_settings(tune)
     console = Console()
-    if compare:
-        idle = [*settings, *[f"--batch {batch}"] * (batch > 1), *["--strict"] * strict]
-        return _compare(runs, across_protocols, out, idle, console)
-    if len(runs) > 1 or across_protocols:
-        raise ValueError("one RUN is evaluated at a time; add --compare to compare results")
 
     from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
@@ -83,40 +70,20 @@ def evaluate(
                 f"--set {setting} would change the trained model; an evaluation can only set "
                 + ", ".join(SECTIONS)
             )
-    with CheckpointFile(runs[0]) as file:
+    with CheckpointFile(run) as file:
         checkpoint, recipe, step = file.path, file.recipe, file.step
         if settings:
             recipe = resolve(recipe.tree, settings)
         model = file.model(choose_device(device))
-    own = Path(runs[0]).expanduser().exists()  # so that results may be written beside it
+    own = Path(run).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch, model.trained_on)
-    run = RunFolder(checkpoint.parent)
-    if checkpoint.name == run.checkpoint.name and run.checkpoint_ema.is_file():
-        hint = f"the run also has averaged weights: judge them with qgs eval {run.checkpoint_ema}"
+    trained = RunFolder(checkpoint.parent)
+    if checkpoint.name == trained.checkpoint.name and trained.checkpoint_ema.is_file():
+        hint = f"averaged weights of the run are evaluated by: qgs eval {trained.checkpoint_ema}"
         console.print(hint, soft_wrap=True, markup=False)
     if strict and evaluation.missing:
         raise typer.Exit(1)
-
-
-def _compare(
-    runs: list[str], across: bool, out: Path | None, idle: list[str], console: Console
-) -> None:
-    """Show the results in `runs` side by side. Raises ValueError for `idle` options."""
-    if idle:
-        raise ValueError(
-            f"--compare reads results and evaluates nothing, so {idle[0]} has no effect; "
-            "evaluate each run with these settings first"
-        )
-    from qgs.engine.comparison import compare
-    from qgs.engine.results import read_results
-
-    comparisons = compare([read_results(run) for run in runs], across)
-    comparisons.show(console)
-    if out:
-        comparisons.write(out)
-    end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
-    console.print(end, soft_wrap=True)
 
 
 def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:

@@ -17,6 +17,7 @@ HELP = {
     "demo": "Trained models on rooms that none has seen, or on your photos; writes report.html.",
     "report": "Judge trained models side by side and picture their scenes; writes report.html.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",
+    "compare": "Compare the results of the first RUN with those of each other, scene by scene.",
     "study": (
         "Train every variant with every seed, judge them alike, and answer: better, and how sure?"
     ),

@@ -13,8 +13,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from qgs.composer.errors import Problems
-from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
 from qgs.data.sampling import Frames
@@ -26,9 +24,9 @@ from qgs.wording import listed, numbered
 
 METHODS = ("model", *BASELINES)
 TUNING = ("tuning_loss_before", "tuning_loss_after")
-_FRAMES = ("scene", "input_frames", "target_frames")
-_NAMES = ("input_names", "target_names")
-"""Columns of scenes.csv before the values, _NAMES where frames have names; `problem` is last."""
+FRAME_COLUMNS = ("scene", "input_frames", "target_frames")
+NAME_COLUMNS = ("input_names", "target_names")
+"""Columns of scenes.csv before the values, the second if frames have names; `problem` is last."""
 _MOST_MISSING = 10
 """How many missing scenes the notes give the reason of."""
 
@@ -186,15 +184,15 @@ class Evaluation:
         reasons = {failure.scene: failure.reason for failure in self.missing}
         columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
         text = io.StringIO()
-        named = _NAMES if any(score.names for score in self.scores) else ()
-        fields = [*_FRAMES, *named, *columns, "problem"]
+        named = NAME_COLUMNS if any(score.names for score in self.scores) else ()
+        fields = [*FRAME_COLUMNS, *named, *columns, "problem"]
         writer = csv.DictWriter(text, fields, lineterminator="\n")
         writer.writeheader()
         for name in self.wanted:
             row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
             if score := judged.get(name):
                 sides = [*zip(*score.views, strict=True)]
-                for key, side in zip(_FRAMES[1:], sides, strict=True):
+                for key, side in zip(FRAME_COLUMNS[1:], sides, strict=True):
                     row[key] = "; ".join(" ".join(map(str, frames)) for frames in side)
                 for key, side in zip(named, sides, strict=bool(named)):
                     names = ([score.names.get(f, str(f)) for f in frames] for frames in side)
@@ -288,81 +286,3 @@ def print_lines(console: Console, lines: Iterable[str]) -> None:
     """Print lines of plain text."""
     for line in lines:
         console.print(escape(line), highlight=False, soft_wrap=True)
-
-
-@dataclass(frozen=True)
-class StoredResults:
-    """Results of one evaluation. name: the folder, as it was given.
-
-    scenes: `SceneScore.values` of the judged scenes. frames: their input and target frames, as
-    scenes.csv writes them. wanted: how many scenes the protocol names. columns, missing, null and
-    step as in `Evaluation`.
-    Of a run folder, recipe: its resolved recipe as JSON, less seed and evaluation; seed and budget.
-    runs: the trainings whose mean this is, none of a single one.
-    """
-
-    name: str
-    protocol: Protocol
-    columns: Mapping[str, Column]
-    scenes: Mapping[str, Mapping[str, float]]
-    frames: Mapping[str, tuple[str, str]]
-    wanted: int
-    missing: Sequence[str] = ()
-    null: Sequence[str] = ()
-    step: int | None = None
-    recipe: str = ""
-    seed: int | None = None
-    budget: str = ""
-    runs: Sequence["StoredResults"] = ()
-
-
-def read_results(path: str | Path) -> StoredResults:
-    """Results in `path`: a folder that `qgs eval` wrote, or a run folder whose evaluation/ it is.
-
-    Raises FileNotFoundError when there are none, ValueError when they cannot be read.
-    """
-    folders = (Path(path), Path(path) / "evaluation")
-    folder = next((folder for folder in folders if (folder / "summary.json").is_file()), None)
-    if folder is None:
-        raise FileNotFoundError(
-            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder with an "
-            "evaluation/ in it"
-        )
-    try:
-        summary, content = (
-            json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-            for name in ("summary", "protocol")
-        )
-        with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
-            judged = {row["scene"]: row for row in csv.DictReader(file) if not row["problem"]}
-        return StoredResults(
-            name=str(path),
-            protocol=Protocol(summary["protocol"]["name"], content),
-            columns={name: Column(**column) for name, column in summary["columns"].items()},
-            scenes={
-                scene: {k: float(v) for k, v in row.items() if k not in (*_FRAMES, *_NAMES) and v}
-                for scene, row in judged.items()
-            },
-            frames={s: (row["input_frames"], row["target_frames"]) for s, row in judged.items()},
-            wanted=summary["scenes_in_protocol"],
-            missing=list(summary["missing"]),
-            null=summary["null_entries"],
-            step=summary["step"],
-            **_training(folder.parent / "recipe.yaml"),
-        )
-    except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
-        raise ValueError(
-            f"the results in {folder} cannot be read ({type(error).__name__}: {error}): they were "
-            "changed, or written by an earlier version; evaluate again with `qgs eval`"
-        ) from error
-
-
-def _training(recipe: Path) -> dict[str, Any]:
-    """Of the resolved recipe of a run, what `StoredResults` tells; nothing where there is none."""
-    if not recipe.is_file():
-        return {}
-    tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
-    seed, training, _ = tree.pop("seed"), tree["training"], tree.pop("evaluation")
-    seconds = training["seconds"]
-    budget = f"{seconds:g} s" if seconds else f"{training['steps']:,} steps"
-    return {"recipe": json.dumps(tree), "seed": seed, "budget": budget}

@@ -1,4 +1,4 @@
-"""`qgs eval` as a user types it: indices, tuning, batches, comparisons."""
+"""`qgs eval` as a user types it: indices, tuning, batches."""
 
 import json
 import shutil
@@ -104,45 +104,9 @@ def test_other_weights_of_a_run_keep_its_evaluation(tmp_path: Path) -> None:
     assert evaluation_folder(run / "checkpoint.safetensors", True) == run / "evaluation-2"
 
 
-def test_two_runs_compare_scene_by_scene(runs: Path, tmp_path: Path) -> None:
-    first, second = runs / "locus", runs / "tokengs"
-    result = evaluated("--compare", first, second, "--out", tmp_path)
-    assert result.exit_code == 0, result.output
-    assert "…" not in result.output
-    assert "3 scenes" in result.output
-    record = json.loads((tmp_path / "comparison.json").read_text())
-    psnr = record["pairs"][0]["differences"][0]
-    means = [summary(run / "evaluation")["model"]["psnr"] for run in (first, second)]
-    assert psnr["metric"] == "psnr"
-    assert psnr["difference"] == pytest.approx(means[0] - means[1])
-    assert psnr["low"] <= psnr["difference"] <= psnr["high"]
-    assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 3
-    assert "| PSNR ↑" in (tmp_path / "comparison.md").read_text()
-
-
-def test_different_protocols_compare_only_when_told(
-    runs: Path, index: Path, tmp_path: Path
-) -> None:
-    assert evaluated(runs / "tokengs", "--index", index, "--out", tmp_path / "b").exit_code == 0
-    pair = (runs / "locus" / "evaluation", tmp_path / "b")
-    refused = evaluated("--compare", *pair)
-    assert isinstance(refused.exception, ValueError)
-    for word in ("two_rooms", "which differ in", "views", "--across-protocols"):
-        assert word in str(refused.exception)
-    allowed = evaluated("--compare", *pair, "--across-protocols")
-    assert allowed.exit_code == 0, allowed.output
-    assert "the protocols differ" in allowed.output
-    assert "test/000000" in allowed.output
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["RUN", "RUN"], "one RUN is evaluated at a time; add --compare"),
-        (["RUN", "--across-protocols"], "add --compare"),
-        (["--compare", "RUN"], "takes two or more different results"),
-        (["--compare", "RUN", "RUN", "--tune", "3"], "evaluation.tuning_steps=3 has no effect"),
-        (["--compare", "RUN", "RUN", "--strict"], "--strict has no effect"),
         (["RUN", "--set", "training.steps=1"], "would change the trained model"),
         (["RUN", "--index", "it's not there.json"], "no evaluation index at it's not there.json"),
     ],

@@ -21,9 +21,8 @@ from qgs.composer import Recipe
 from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.sampling import Sample
-from qgs.engine.comparison import compare
 from qgs.engine.evaluation import evaluate
-from qgs.engine.results import METHODS, Evaluation, read_results
+from qgs.engine.results import METHODS, Evaluation
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.metrics.dispersion import token_dispersion
 from qgs.metrics.images import Psnr, psnr, ssim
@@ -176,7 +175,6 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_p
     assert rows["gone"]["problem"] == "not among the test scenes of the data"
     assert rows["test/000000"]["input_frames"] == "0 3"
     assert rows["test/000000"]["problem"] == ""
-    assert read_results(tmp_path).missing == ["test/000001", "gone"]
 
 
 def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
@@ -276,7 +274,7 @@ def test_the_table_shows_all_methods_and_why_a_column_is_empty(tiny: Tiny, tmp_p
     assert evaluation.mean("lpips") is None
 
 
-def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny, tmp_path: Path) -> None:
+def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny) -> None:
     plain, sample = tiny("tokengs"), tiny("tokengs", "metrics.ssim.covariance=sample")
     model = plain.build_model()
     evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
@@ -284,13 +282,6 @@ def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny, tmp_p
     assert 0 < abs(first - second) < 1e-3
     assert "covariance" not in shown(evaluations[0])
     assert "SSIM (sample covariance)" in shown(evaluations[1])
-    for name, evaluation in zip("ab", evaluations, strict=True):
-        evaluation.write(tmp_path / name)
-    stored = [read_results(tmp_path / name) for name in "ab"]
-    with pytest.raises(ValueError, match="which differ in metrics:"):
-        compare(stored)
-    text = compare(stored, across_protocols=True).markdown()
-    assert text.count(f"SSIM in {stored[0].name} is SSIM (sample covariance) in") == 1
 
 
 def test_lpips_fills_its_column_where_it_can(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:

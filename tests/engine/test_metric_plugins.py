@@ -26,12 +26,10 @@ from qgs.contracts import (
     Scene,
 )
 from qgs.data.evaluation import evaluation_samples, true_depth
-from qgs.engine.comparison import compare
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.evaluation import Evaluation, Measures, evaluate
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.protocol import protocol_of
-from qgs.engine.results import read_results
 from qgs.engine.tracking import Trackers
 from qgs.engine.training import train
 
@@ -117,21 +115,6 @@ def test_evaluations_and_their_files(judged: Judged, tmp_path: Path) -> None:
     assert "   MAE ↓ |" in (tmp_path / "table.md").read_text()
 
 
-def test_comparisons_need_no_plugin_and_know_which_way_is_better(
-    mine: Tiny, judged: Judged, tmp_path: Path
-) -> None:
-    judged[1].write(tmp_path / "a")
-    other = mine("metrics.error={type: mine/mae}", "seed=1")
-    evaluate(other.build_model(), other).write(tmp_path / "b")
-    stored = [read_results(tmp_path / name) for name in "ab"]
-    comparisons = compare(stored)
-    (found,) = [d for d in comparisons.pairs[0].differences if d.metric == "error"]
-    ours, theirs = ([s["model_error"] for s in result.scenes.values()] for result in stored)
-    assert found.wins == sum(a < b for a, b in zip(ours, theirs, strict=True))
-    assert found.wins + found.losses == found.scenes == 2
-    assert f"{found.difference:+.6f}" in shown(comparisons)
-
-
 def test_the_protocol_has_its_definition_and_options(mine: Tiny) -> None:
     def protocol(options: str) -> object:
         return protocol_of(mine(f"metrics.error={{type: mine/mae{options}}}"), None, ["x"])
@@ -201,8 +184,6 @@ def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(
     evaluation = evaluate(recipe.build_model(), recipe)
     assert evaluation.statement == "over 2 scenes"
     assert "masked is empty: it needs masks, not known for 2 of 2 scenes" in shown(evaluation)
-    evaluation.write(tmp_path)
-    assert read_results(tmp_path).scenes.keys() == {"test/000000", "test/000001"}
 
 
 def test_two_values_of_one_name_are_refused(mine: Tiny) -> None:

@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from qgs_studies.figures import values_figure, write_figures
+from qgs_studies.intervals import crossed_interval
 from qgs_studies.output import latex, markdown, table_rows, write_files
 from qgs_studies.plan import Plan, run_of
 from qgs_studies.results import Results
 from qgs_studies.study import read_study
-
-from qgs.engine.comparison import crossed_interval
 
 Score = Callable[[str, str, int, int], float]
 """Of a variant by an evaluation with a seed on a scene."""

@@ -1,4 +1,4 @@
-"""`qgs study`."""
+"""`qgs study` and `qgs compare`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,35 @@ if TYPE_CHECKING:
     from qgs_studies.plan import Plan
 
 app = typer.Typer(help="Train variants of a model by seeds, and tell what differs.")
+compare_app = typer.Typer(help="Compare results of evaluations.")
+
+
+@compare_app.command()
+def compare(
+    runs: Annotated[
+        list[str], typer.Argument(metavar="RUN...", help="Run folders, or folders of `qgs eval`.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for comparison.json and comparison.md.")
+    ] = None,
+    across_protocols: Annotated[
+        bool, typer.Option("--across-protocols", help="Compare results of different protocols.")
+    ] = False,
+) -> None:
+    """Compare the results of the first RUN with those of each other, scene by scene.
+
+    Nothing is evaluated. Runs of one recipe with several seeds count as one side.
+    """
+    from qgs_studies.comparison import compare as compared
+    from qgs_studies.stored import read_results
+
+    console = Console()
+    comparisons = compared([read_results(run) for run in runs], across_protocols)
+    comparisons.show(console)
+    if out:
+        comparisons.write(out)
+    end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
+    console.print(end, soft_wrap=True)
 
 
 @app.command()

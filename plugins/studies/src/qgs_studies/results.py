@@ -1,7 +1,7 @@
 """What the runs of a study amount to: means, spread over seeds, differences, verdicts.
 
 An interval takes trainings and scenes as random, both: it is for other seeds and other scenes of
-the kind (`qgs.engine.comparison.crossed_interval`). Differences are paired: a seed of a variant is
+the kind (`qgs_studies.intervals.crossed_interval`). Differences are paired: a seed of a variant is
 held against the same seed of the reference, which saw the same data in the same order, and a scene
 against the same scene.
 """
@@ -14,13 +14,13 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from qgs.contracts import Column
-from qgs.engine.comparison import CONFIDENCE, CROSSED, crossed_interval, paired_interval
 from qgs.engine.evaluation import SECTIONS
-from qgs.engine.results import StoredResults, read_results
 from qgs.metrics.baselines import BASELINES
 from qgs.wording import listed
 from qgs_studies.hypotheses import MAIN, Contrast
+from qgs_studies.intervals import CONFIDENCE, CROSSED, crossed_interval, paired_interval
 from qgs_studies.plan import Plan, Run
+from qgs_studies.stored import StoredResults, read_results
 from qgs_studies.study import Hypothesis
 
 Verdict: TypeAlias = Literal["seen", "contradicted", "undecided"]
