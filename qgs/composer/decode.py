@@ -194,38 +194,33 @@ def corners(schedules: Mapping[str, Schedule]) -> list[int]:
 def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[str, str]:
     """Reason and fix for a `type` that names no component of the place's slot."""
     slot = place.slot.name
-    installed = registry.components(slot)
-    choice = f"choose {', '.join(sorted(installed))}"
+    known = registry.components(slot)
+    choice = f"choose {', '.join(sorted(known))}"
     if name is None:
         reason = f"no `type` is given, and the slot `{slot}` has no default component"
-        return reason, f"add `type:`, one of {', '.join(sorted(installed))}"
+        return reason, f"add `type:`; {choice}"
     if not isinstance(name, str):
         return f"`type` names a component, got {kind_of(name)}", choice
     plugin, slash, _ = name.partition("/")
     if not slash and ("." in name or ":" in name):
         reason = f"`{name}` is an import path; `type` only names installed components"
-        fix = "offer the class in a plugin (entry points `qgs.plugins`), name it PLUGIN/NAME"
-        return reason, fix
+        return reason, "offer the class in a plugin (entry points `qgs.plugins`)"
     if not slash:
         reason = f"`{name}` names no plugin: components are called PLUGIN/NAME"
-        same = [known for known in installed if known.endswith(f"/{name}")]
-        fix = f"did you mean `{same[0]}`?" if same else did_you_mean(name, installed, "components")
-        return reason, fix
+        same = [kind for kind in known if kind.endswith(f"/{name}")]
+        return reason, f"did you mean `{same[0]}`?" if same else choice
     if plugin not in registry.plugins:
         reason = f"`{name}` is of the plugin `{plugin}`, which this recipe does not use"
         available = available_plugins()
-        near = nearest(plugin, [*registry.plugins, *available])
-        if plugin in available:
-            listed = [known for known in registry.plugins if known != "qgs"] + [plugin]
-            return reason, f"add `plugins: [{', '.join(listed)}]`"
-        if near:
+        if plugin not in available and (near := nearest(plugin, [*registry.plugins, *available])):
             return reason, f"did you mean the plugin `{near}`?"
-        return reason, f"install the distribution of `{plugin}` and add `plugins: [{plugin}]`"
-    elsewhere = [other for other in SLOTS if name in registry.components(other)]
-    if elsewhere:
+        listed = ", ".join([used for used in registry.plugins if used != "qgs"] + [plugin])
+        install = "" if plugin in available else f"install the distribution of `{plugin}` and "
+        return reason, f"{install}add `plugins: [{listed}]`"
+    if elsewhere := [other for other in SLOTS if name in registry.components(other)]:
         return f"`{name}` belongs in the slot `{elsewhere[0]}`, not in `{slot}`", choice
     reason = f"there is no component `{name}` for the slot `{slot}`"
-    return reason, did_you_mean(name, installed, "components")
+    return reason, did_you_mean(name, known, "components")
 
 
 def decode_config(
@@ -335,12 +330,8 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, An
         sizes_known &= bool(found) or path[:1] != ("model",)
     model, node = settings["model",], tree.child("model")
     if model.width % model.heads:
-        fitting = [n for n in range(1, model.width + 1) if model.width % n == 0]
-        near = min(fitting, key=lambda n: abs(n - model.heads))
-        problems.add(
-            node.origins.get("heads", node.origins.get("width", node.origin)),
-            "model.heads",
-            f"{model.heads} heads do not divide the width {model.width}",
-            f"set model.heads to {near}, or make model.width a multiple of {model.heads}",
-        )
+        reason = f"{model.heads} heads do not divide the width {model.width}"
+        fix = f"set model.heads to a divisor of {model.width}"
+        origin = node.origins.get("heads", node.origins.get("width", node.origin))
+        problems.add(origin, "model.heads", reason, fix)
     return settings, sizes_known

@@ -164,13 +164,7 @@ def resolve(
             p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
         }
         check_flow(sound, dims.depth, registry, problems)
-    _check_tuning(tree, settings["evaluation",], parts["model", "encoder"], registry, problems)
-    _check_layer_scale(tree, decoder, parts, problems)
-    _check_judged_inputs(tree, settings, parts["objective",], problems)
-    if ("data",) in parts and not any(path[0] == "losses" for path in parts):
-        reason = "a recipe with data needs at least one loss to train"
-        fix = "add one under `losses`, or drop the data with `data: null`"
-        problems.add(tree.origins.get("losses", tree.origin), "losses", reason, fix)
+    _check_settings(tree, settings, parts, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
     out = _spell_out(tree, settings, registry, chosen)
@@ -189,67 +183,50 @@ def resolve(
     )
 
 
-def _check_tuning(
+def _check_settings(
     tree: MapNode,
-    evaluation: contracts.EvaluationConfig,
-    encoder: Chosen | None,
+    settings: Mapping[KeyPath, Any],
+    parts: Parts,
     registry: Registry,
     problems: Problems,
 ) -> None:
-    """Report latents to be tuned of an encoder that has none."""
-    if evaluation.tuning != "latents" or encoder is None:
-        return
-    known: dict[str, Any] = dict(registry.components("encoder"))
-    if not known[encoder.type].tunable:
-        node = tree.child("evaluation")
-        others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
-        problems.add(
-            node.origins.get("tuning", node.origin),
-            "evaluation.tuning",
-            f"`{encoder.type}` at model.encoder has no latents to tune",
-            f"write `queries`, or use {others} in the slot `encoder`",
-        )
+    """Report settings that contradict the components, or have no effect with them."""
 
+    def report(path: KeyPath, reason: str, fix: str) -> None:
+        node = tree.child(*path[:-1])
+        problems.add(node.origins.get(path[-1], node.origin), ".".join(path), reason, fix)
 
-def _check_layer_scale(
-    tree: MapNode, decoder: DecoderSettings, parts: Parts, problems: Problems
-) -> None:
-    """Report a LayerScale that no layer of the decoder reads."""
+    encoder, objective = parts["model", "encoder"], parts["objective",]
+    if encoder and settings["evaluation",].tuning == "latents":
+        known: dict[str, Any] = dict(registry.components("encoder"))
+        if not known[encoder.type].tunable:
+            others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
+            reason = f"`{encoder.type}` at model.encoder has no latents to tune"
+            fix = f"write `queries`, or use {others} in the slot `encoder`"
+            report(("evaluation", "tuning"), reason, fix)
+
+    decoder, default = settings["model", "decoder"], DecoderSettings().layer_scale
     layers = [parts["model", "decoder", "layers", str(i), "layer"] for i in range(decoder.depth)]
-    known: list[Any] = [layer.component if layer else contracts.DecoderLayer for layer in layers]
-    node, default = tree.child("model", "decoder"), DecoderSettings().layer_scale
-    if decoder.layer_scale != default and not any(layer.reads_layer_scale for layer in known):
-        kinds = " and ".join(sorted({f"`{layer.type}`" for layer in layers if layer}))
-        problems.add(
-            node.origins.get("layer_scale", node.origin),
-            "model.decoder.layer_scale",
-            f"`layer_scale` has no effect: {kinds or 'a decoder of depth 0'} does not read it",
-            f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one",
-        )
+    kinds: list[Any] = [layer.component if layer else contracts.DecoderLayer for layer in layers]
+    if decoder.layer_scale != default and not any(kind.reads_layer_scale for kind in kinds):
+        names = " and ".join(sorted({f"`{layer.type}`" for layer in layers if layer}))
+        reason = f"it has no effect: {names or 'a decoder of depth 0'} does not read it"
+        fix = f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one"
+        report(("model", "decoder", "layer_scale"), reason, fix)
 
+    if settings["training",].judge_inputs:
+        path, fix = ("training", "judge_inputs"), "set it to false; evaluations do not read it"
+        if settings["views",].pose_noise:
+            reason = "views.pose_noise moves the cameras of input views, which must be exact"
+            report(path, reason, fix)
+        kind: Any = objective.component if objective else contracts.Objective
+        if objective and not kind.judges_inputs:
+            reason = f"`{objective.type}` reconstructs one moment, input views show others"
+            report(path, reason, fix)
 
-def _check_judged_inputs(
-    tree: MapNode,
-    settings: Mapping[KeyPath, Any],
-    objective: Chosen | None,
-    problems: Problems,
-) -> None:
-    """Report input views that are to be judged and are no truth: other moments, noisy poses."""
-    if not settings["training",].judge_inputs:
-        return
-    node, kind = tree.child("training"), objective and objective.component
-    reasons = {
-        "views.pose_noise moves the cameras of input views, which must be exact to be judged": (
-            settings["views",].pose_noise
-        ),
-        f"`{objective and objective.type}` reconstructs one moment, input views show others": (
-            kind and issubclass(kind, contracts.Objective) and not kind.judges_inputs
-        ),
-    }
-    for reason in (reason for reason, holds in reasons.items() if holds):
-        fix = "set training.judge_inputs to false; evaluations do not read it"
-        origin = node.origins.get("judge_inputs", node.origin)
-        problems.add(origin, "training.judge_inputs", reason, fix)
+    if ("data",) in parts and not any(path[0] == "losses" for path in parts):
+        reason = "a recipe with data needs at least one loss to train"
+        report(("losses",), reason, "add one under `losses`, or drop the data with `data: null`")
 
 
 def _with_defaults(tree: MapNode) -> MapNode:

@@ -57,21 +57,6 @@ def test_a_recipe_trains_with_it(fresh: FreshEnvironment, plugin: Path) -> None:
     assert (plugin / "run/checkpoint.safetensors").is_file()
 
 
-def test_a_broken_plugin_beside_it_harms_nobody(fresh: FreshEnvironment, plugin: Path) -> None:
-    workshop = plugin.parent
-    fresh.run("qgs new-plugin broken", workshop)
-    broken = workshop / "qgs-broken"
-    (broken / "src/qgs_broken/__init__.py").write_text("raise RuntimeError('no luck')\n")
-    fresh.run("pip install -q .", broken)
-    listed = fresh.run("qgs list", workshop)
-    assert "qgs-broken 0.1.0" in listed
-    assert "RuntimeError: no luck" in listed
-    fresh.run("qgs compose recipe.yaml", plugin)
-    refused = fresh.run("! qgs compose qgs-broken/recipe.yaml", workshop)
-    assert "recipe.yaml:4: plugins.1" in refused
-    assert "qgs-broken 0.1.0" in refused
-
-
 def test_locus_passes_the_check_of_the_command_line(
     fresh: FreshEnvironment, tmp_path: Path
 ) -> None:
