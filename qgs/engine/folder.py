@@ -18,7 +18,7 @@ from qgs.composer.recipe import flat
 from qgs.data.domain import KEY, SAMPLES, Domain
 from qgs.data.sampling import Batch
 from qgs.io.checkpoint import load_weights, save, unique_tensors
-from qgs.io.files import is_leftover, read_records, told_where_full, write_text
+from qgs.io.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.io.models import CHECKPOINT
 from qgs.io.tensors import CheckpointError, TensorFile, write_tensors
 from qgs.model import QueryGaussianModel
@@ -126,7 +126,7 @@ class RunFolder:
 
     def append(self, record: Mapping[str, float]) -> None:
         """Add one line to the history."""
-        with told_where_full(self._history_file):
+        with naming_full_disk(self._history_file):
             if self._history is None:
                 self._history = self._history_file.open("a", encoding="utf-8")
             self._history.write(json.dumps(record) + "\n")
@@ -134,7 +134,7 @@ class RunFolder:
     def flush(self, to_disk: bool = False) -> None:
         """Let others read the history so far; to_disk: also see that it outlives the system."""
         if self._history is not None:
-            with told_where_full(self._history_file):
+            with naming_full_disk(self._history_file):
                 self._history.flush()
                 if to_disk:
                     os.fsync(self._history.fileno())

@@ -28,6 +28,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         return []
     with CheckpointFile(recipe.init_from) as file:
         path, theirs, stored = file.path, file.recipe, file.tensors
+        count = file.untrained("meta").queries.count
     learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
     options = [
         f"{option}: {their} (here {ours})"
@@ -36,7 +37,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     ]
     adapted = model.encoder.adapted(_part(_ENCODER, learned))
     weights = learned | {_ENCODER + name: values for name, values in adapted.items()}
-    found = _differences(weights, model, theirs.build_model("meta").queries.count)
+    found = _differences(weights, model, count)
     if found:
         first = (
             f"init_from: {path} does not fit this recipe; only the number of queries and, to a "

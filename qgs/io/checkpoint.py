@@ -117,19 +117,23 @@ class CheckpointFile(TensorFile):
         with self.entry(key):
             return Domain.read(self.mapping(key))
 
+    def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
+        """The model with initial parameters; "meta" takes no memory. Raises CheckpointError."""
+        try:
+            return self.recipe.build_model(device, pretrained=False)
+        except (RecipeError, TooLargeError) as error:
+            raise CheckpointError(
+                f"{self.path}: the model of its recipe cannot be built: {error}"
+            ) from error
+
     def model(self, device: str | torch.device | None = None) -> QueryGaussianModel:
         """The model on `device` (default: CPU), in evaluation mode, half precision as float32.
 
         Raises CheckpointError, and ValueError for weights that are NaN or infinite.
         """
-        try:
-            # Sizes are compared on the meta device, before the recipe's model takes memory.
-            refuse_misfit(self.recipe.build_model("meta"), self.tensors, str(self.path))
-            model = self.recipe.build_model(pretrained=False)
-        except (RecipeError, TooLargeError) as error:
-            raise CheckpointError(
-                f"{self.path}: the model of its recipe cannot be built: {error}"
-            ) from error
+        # Sizes are compared on the meta device, before the recipe's model takes memory.
+        refuse_misfit(self.untrained("meta"), self.tensors, str(self.path))
+        model = self.untrained()
         load_weights(model, self.tensors, str(self.path))
         follow(model.modules(), END if self.step is None else self.step)
         model.trained_on = self.domain

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all; files of JSON records."""
+"""Atomic writes of files and folders; files of JSON records."""
 
 import errno
 import json
@@ -24,17 +24,16 @@ class DiskFullError(OSError):
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str], needed: str = "") -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well.
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends without an error.
 
-    Makes missing parent folders; the file gets the usual permissions whatever wrote it. When the
-    block raises, `path` stays as it was. The new file is on the disk before it takes the place of
-    the old one, and its name when the block has ended. needed: see `told_where_full`.
+    Makes missing parent folders; the file gets the usual permissions whatever wrote it. The new
+    file is on the disk before it replaces the old one, which stays where the block raises.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    with told_where_full(target, needed):
+    with naming_full_disk(target):
         try:
             temporary.touch()
             mode = temporary.stat().st_mode
@@ -48,31 +47,22 @@ def replacing(path: str | os.PathLike[str], needed: str = "") -> Iterator[Path]:
 
 
 @contextmanager
-def told_where_full(path: Path, needed: str = "") -> Iterator[None]:
-    """Raise DiskFullError about `path` when the disk is full in the `with` block.
-
-    needed: a sentence about the space that it takes.
-    """
+def naming_full_disk(path: Path) -> Iterator[None]:
+    """Raise DiskFullError about `path` where the block fails for want of space."""
     try:
         yield
     except OSError as error:
         if error.errno not in _FULL:
-            if error.filename is None:
-                error.add_note(f"while {path} was written")
             raise
         free = shutil.disk_usage(path.parent).free
         raise DiskFullError(
-            f"{path} could not be written ({error.strerror}).{needed} {in_words(free)} are free "
-            "there. What was saved before is whole: free space and repeat the command; a training "
-            "goes on with --resume"
+            f"{path} could not be written ({error.strerror}); {in_words(free)} are free. Earlier "
+            "files are whole: free space and repeat the command, a training with --resume"
         ) from error
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether `path` is a file that a process killed inside `replacing` left, or is now writing.
-
-    safetensors, too, writes to a name of its own (.tmpXXXXXX) first.
-    """
+    """Whether `path` is the temporary file of `replacing` or of safetensors (.tmpXXXXXX)."""
     name = r"\..+\.\d+\.tmp|\.tmp[A-Za-z0-9]{6}"
     return bool(re.fullmatch(name, path.name)) and path.is_file()
 
@@ -139,10 +129,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """The records of `path` that tell their "step"; none when the file does not exist.
+    """The records of `path` with a "step"; none when the file does not exist.
 
-    A line that is no such record is left out with a warning; a last line without an end is what a
-    killed process leaves, and is left out too.
+    Damaged lines are skipped with a warning, an unfinished last line silently: a killed process
+    leaves one.
     """
     if not path.is_file():
         return []

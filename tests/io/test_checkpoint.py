@@ -148,14 +148,6 @@ def test_only_plugins_that_are_used_are_needed(
         qgs.compose(RECIPES / "photos.yaml", SMALL)
 
 
-def test_another_release_of_a_plugin_is_named(old_locus: Path) -> None:
-    recipe = json.loads(metadata_of(old_locus)["qgs.recipe"])
-    recipe["model"]["decoder"]["refinement"]["type"] = "locus/gone_since"
-    rewrite(old_locus, **{"qgs.recipe": json.dumps(recipe)})
-    with pytest.raises(CheckpointError, match=r"query-gaussians-locus 0\.0\.7"):
-        qgs.load(old_locus)
-
-
 def test_extra_metadata_comes_back(model: QueryGaussianModel, tmp_path: Path) -> None:
     save(model, tmp_path / "a.safetensors", extra={"step": "7", "note": "ä = b"})
     with CheckpointFile(tmp_path / "a.safetensors") as file:
@@ -280,11 +272,6 @@ def test_a_newer_format_is_refused(saved: Path) -> None:
     rewrite(saved, **{"qgs.format_version": "99"})
     with pytest.raises(CheckpointError, match=r"qgs\.format_version 99"):
         qgs.load(saved)
-
-
-def test_files_get_the_usual_permissions(saved: Path, tmp_path: Path) -> None:
-    (tmp_path / "plain").touch()
-    assert saved.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 @pytest.mark.parametrize("option", ["width", "queries.count", "head.gaussians_per_query"])

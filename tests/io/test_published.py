@@ -70,15 +70,6 @@ def test_an_imported_checkpoint_is_like_any_other(imported: Callable[..., Path])
     assert "#   losses: photometric, visibility, and anchor visibility" in text
 
 
-def test_unused_tensors_may_be_absent(tmp_path: Path) -> None:
-    unused = sorted(name for name in LOCUS if "_norm." in name and "anchor" in name)
-    save_file({k: v for k, v in LOCUS.items() if k not in unused}, tmp_path / "w.safetensors")
-    done = import_weights(tmp_path / "w.safetensors", None, tmp_path / "o.safetensors")
-    assert len(unused) == 4
-    assert len(done.unused) == 18 - 4
-    assert done.count + len(done.unused) + len(unused) == len(LOCUS)
-
-
 LATENT_PRESETS = [f"latent_{n}views_{loss}" for n in (2, 4, 6) for loss in ("ssim", "lpips")]
 
 
@@ -124,14 +115,6 @@ def test_every_ablation_has_a_published_name_for_each_parameter(recipe: Path) ->
     assert not names.unnamed
     assert names.published.keys() == names.shapes.keys()
     assert not set(names.unused) & set(names.published.values())
-
-
-def test_the_published_size_counts_its_unused_parameters() -> None:
-    names = names_of(resolve(RECIPES / "locus/dl3dv_4096_4views.yaml"))
-    width, head, layers = 1024, 64, 12
-    sizes = {"_pos_norm": head, "anchor_norm": width, "plucker_norm": width, "tau_sample": 1}
-    unused = sum(size for n in names.unused for part, size in sizes.items() if part in n)
-    assert unused == layers * (2 * 2 * width + 2 * 2 * head + 1) == 52_236
 
 
 def test_every_difference_is_listed_at_once() -> None:
