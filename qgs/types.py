@@ -201,6 +201,8 @@ class Views(TensorContainer):
     masks: (B, V, 1, H, W) in [0, 1], 1 where the photo shows what is to be modelled; None for
     photos without masks. times: (B, V), when each photo was taken; None where nothing moves.
     target_time: (B, 1), of the scene that is to be reconstructed from them.
+    depths: (B, V, 1, H, W), camera-frame z in world units, 0 where unknown; None without maps, and
+        where no loss reads them.
     """
 
     images: Tensor
@@ -208,10 +210,11 @@ class Views(TensorContainer):
     masks: Tensor | None = None
     times: Tensor | None = None
     target_time: Tensor | None = None
+    depths: Tensor | None = None
 
     def __post_init__(self) -> None:
         size = dict(zip("HW", self.cameras.size, strict=True))
-        shapes = {"images": "B V 3 H W", "masks": "B V 1 H W"}
+        shapes = {"images": "B V 3 H W", "masks": "B V 1 H W", "depths": "B V 1 H W"}
         _check_shapes(self, size, **shapes, times="B V", target_time="B 1")
         _check_unit_images(self)
         if self.images.shape[:2] != self.cameras.shape:

@@ -121,6 +121,10 @@ class Recipe:
         """Factor of the learning rate for every parameter of a model or objective, by name."""
         return rate_factors(module, self.parts["optimizer",])
 
+    def build_view_sampler(self) -> contracts.ViewSampler:
+        """What draws the frames of samples."""
+        return build(self.parts["view_sampler",])
+
     def build_data(self) -> contracts.SceneSource:
         """The source of scenes; raises ValueError for a recipe without data."""
         if ("data",) not in self.parts:

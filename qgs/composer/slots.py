@@ -51,12 +51,14 @@ SLOTS = {
         Slot(contracts.Metric, named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
         Slot(contracts.Optimizer, "qgs/adamw"),
         Slot(contracts.SceneSource),
+        Slot(contracts.ViewSampler, "qgs/span"),
     )
 }
 MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
-SECTIONS = {name: SLOTS[name] for name in ("losses", "objective", "data", "metrics", "optimizer")}
+_SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")
+SECTIONS = {name: SLOTS[name] for name in _SECTIONS}
 """Slots that are top-level sections of a recipe."""
 
 

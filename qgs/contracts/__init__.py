@@ -14,7 +14,7 @@ from qgs.contracts.component import (
     component_of,
     without_effect,
 )
-from qgs.contracts.data import Scene, SceneSource, SceneSourceConfig, Split
+from qgs.contracts.data import Frames, Scene, SceneSource, SceneSourceConfig, Split, ViewSampler
 from qgs.contracts.decoder import (
     AttentionWeights,
     CrossAttention,
@@ -54,6 +54,7 @@ __all__ = [
     "FeedForward",
     "FieldSpec",
     "Fields",
+    "Frames",
     "Head",
     "LayerParts",
     "LayoutError",
@@ -87,6 +88,7 @@ __all__ = [
     "Split",
     "Supervision",
     "TrainingConfig",
+    "ViewSampler",
     "ViewsConfig",
     "WeightLayout",
     "component_of",

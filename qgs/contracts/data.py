@@ -1,18 +1,22 @@
-"""Slot `data`: where scenes come from."""
+"""Slots `data` and `view_sampler`: where scenes come from, and which of their frames to use."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
+import numpy as np
 from pydantic import Field
 from torch import Tensor
 from upath import UPath
 
 from qgs.contracts.component import Component, ComponentConfig
+from qgs.contracts.schedule import at_step
+from qgs.contracts.settings import ViewsConfig
 from qgs.types import Cameras
 from qgs.wording import numbered
 
 Split = Literal["train", "test"]
+Frames: TypeAlias = tuple[int, ...]
 Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 
@@ -60,7 +64,7 @@ class Scene(ABC):
         return None
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
-        """Camera-frame z (len(frames), 1, H, W), world units; None where it is not known."""
+        """Camera-frame z (len(frames), 1, H, W), world units, 0 where unknown; None without."""
         return None
 
     def __len__(self) -> int:
@@ -139,3 +143,27 @@ class SceneSource(Component):
         random order, so that a file is read once an epoch. One group shuffles everything.
         """
         return [range(len(self.scenes(split)))]
+
+
+class ViewSampler(Component):
+    """Which frames of a scene are the inputs and the targets of a sample.
+
+    Sample k of a training is a function of (seed, k): `draw` reads nothing but its arguments and
+    `config`, and all chance comes from `rng`.
+    """
+
+    slot: ClassVar[str] = "view_sampler"
+
+    @abstractmethod
+    def draw(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
+    ) -> tuple[Frames, Frames]:
+        """`views.inputs` input frames, ascending, and `views.targets` target frames.
+
+        Held-out frames are never drawn. step: optimiser steps before the one that the sample is
+        for; `qgs.contracts.schedule.END` in evaluation. Raises ValueError for too few frames.
+        """
+
+    def options(self, step: int) -> Any:
+        """`config` with the numbers of scheduled options after `step` steps."""
+        return at_step(self.config, self.schedules, step)

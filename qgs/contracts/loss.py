@@ -30,6 +30,8 @@ class Loss(Component, torch.nn.Module):
     slot: ClassVar[str] = "losses"
     renderings: ClassVar[Literal["each", "all", "none"]] = "all"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
+    reads_depths: ClassVar[bool] = False
+    """Whether it reads `Views.depths`, which training then decodes where the data has them."""
 
     class Config(ComponentConfig):
         weight: float = Field(default=1.0, ge=0)

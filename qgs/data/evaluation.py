@@ -10,10 +10,12 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor
 
-from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewsConfig
+from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
+from qgs.contracts.schedule import END
 from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
-from qgs.data.sampling import Frames, Sample, draw_frames, gap_range, make_sample, moments, spread
+from qgs.data.samplers import Span
+from qgs.data.sampling import Frames, Sample, gap_range, make_sample, moments, spread
 from qgs.geometry.poses import largest_distance
 from qgs.wording import listed
 
@@ -88,8 +90,9 @@ class EvaluationPlan:
 
     With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
     of a scene with held-out frames `held_out_windows`, evenly thinned to `evaluation.scenes`; of
-    the others `evaluation.samples` samples, inputs drawn as in training with `evaluation.seed`,
-    targets the other frames of the span, or of one time. Targets of T times are T samples.
+    the others `evaluation.samples` samples, inputs drawn by `sampler` (default: `Span`) as at the
+    end of training with `evaluation.seed`, targets the other frames of the span, or of one time.
+    Targets of T times are T samples.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
     drawn: scenes of which samples were, once `samples` has run. Raises ValueError without scenes.
@@ -101,6 +104,7 @@ class EvaluationPlan:
         views: ViewsConfig,
         evaluation: EvaluationConfig,
         index: EvaluationIndex | None = None,
+        sampler: ViewSampler | None = None,
     ) -> None:
         self.framing: str | None = None
         self.drawn = set[str]()
@@ -108,6 +112,7 @@ class EvaluationPlan:
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
+        self._sampler = sampler or Span(Span.Config())
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
         self._times = Counter(names)
@@ -148,17 +153,20 @@ class EvaluationPlan:
             self.drawn.add(scene.name)
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])
-                inputs, drawn = draw_frames(scene, self._views, rng)
+                inputs, drawn = self._sampler.draw(scene, self._views, rng, END)
                 every = range(inputs[0], inputs[-1] + 1) if scene.times is None else drawn
                 yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))
 
 
 def evaluation_samples(
-    source: SceneSource, views: ViewsConfig, evaluation: EvaluationConfig
+    source: SceneSource,
+    views: ViewsConfig,
+    evaluation: EvaluationConfig,
+    sampler: ViewSampler | None = None,
 ) -> Sequence[Sample]:
     """Samples of a plan without an index; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
-    for sample in EvaluationPlan(source, views, evaluation).samples():
+    for sample in EvaluationPlan(source, views, evaluation, sampler=sampler).samples():
         if isinstance(sample, SceneFailure):
             raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
         samples.append(sample)

@@ -7,15 +7,15 @@ Images are moved by NumPy, on one thread: torch's would wait for cores that trai
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.contracts import Scene, ViewsConfig
+from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.scenes import warn_once
 from qgs.geometry.poses import (
     first_camera,
@@ -29,8 +29,6 @@ from qgs.geometry.poses import (
 from qgs.memory import refuse_beyond_memory
 from qgs.types import Cameras, Views, concatenated, map_tensors
 from qgs.wording import listed, numbered
-
-Frames: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -172,13 +170,16 @@ def make_sample(
     views: ViewsConfig,
     mirror: bool,
     noise: np.random.Generator | None = None,
+    depths: bool = False,
 ) -> Sample:
     """Decode frames, normalise poses in the scene's precision, mirror if asked; float32.
 
-    noise: of which `views.pose_noise` is drawn; None leaves poses as they are.
+    noise: of which `views.pose_noise` is drawn; None leaves poses as they are. depths: whether
+    views have depth maps where the scene has them; 0 in views whose pose is noisy, which no longer
+    stand where the surface was seen from.
     """
     world = own_world(scene, input_frames, views)
-    both = views_in(world, scene, (*input_frames, *target_frames))
+    both = views_in(world, scene, (*input_frames, *target_frames), depths)
     count = len(input_frames)
     if both.times is not None:
         both = replace(both, target_time=_asked(both.times, count))
@@ -186,6 +187,8 @@ def make_sample(
         c2w = both.cameras.c2w[0].clone()
         c2w[:count] = shaken(c2w[:count], math.radians(views.pose_noise), noise)
         both = replace(both, cameras=replace(both.cameras, c2w=c2w[None]))
+        if both.depths is not None:
+            both.depths[:, 1:count] = 0
     both = mirrored_views(both) if mirror else both
     inputs, targets = both.select(slice(0, count)), both.select(slice(count, None))
     names = {frame: scene.frame_name(frame) for frame in (*input_frames, *target_frames)}
@@ -209,21 +212,27 @@ def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
     return off
 
 
-def views_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Views:
+def views_in(
+    world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
+) -> Views:
     """Views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
     order = [place[frame] for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
+    surface = scene.depths(wanted) if depths else None
     cameras = scene.cameras[list(frames)]
     reference, scale = world
     c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
+    if surface is not None:
+        surface = torch.from_numpy(surface.numpy()[order] * np.float32(scale.item()))[None]
     return Views(
         torch.from_numpy(images.numpy()[order])[None],
         Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
         None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
         None if scene.times is None else from_0_to_1(scene.times[list(frames)])[None].float(),
+        depths=surface,
     )
 
 
@@ -287,8 +296,9 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    masks = map_tensors(_flipped, views.masks)
-    return replace(views, images=_flipped(views.images), cameras=flipped, masks=masks)
+    masks, depths = map_tensors(_flipped, (views.masks, views.depths))
+    images = _flipped(views.images)
+    return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
 
 
 def _flipped(images: Tensor) -> Tensor:
@@ -311,7 +321,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Views (B, V) of several (b, V), on the CPU; masks of 1 where only others have some.
+    """Views (B, V) of several (b, V), on the CPU.
+
+    Masks of 1 and depths of 0 (unknown) where only others have some.
 
     Raises ValueError where only some have times.
     """
@@ -319,8 +331,17 @@ def stack_views(views: Sequence[Views]) -> Views:
         {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views
     ]
     images = np.concatenate([v.images.numpy() for v in views])
-    masks = None
-    if any(v.masks is not None for v in views):
-        whole = [torch.ones_like(v.images[:, :, :1]) if v.masks is None else v.masks for v in views]
-        masks = torch.from_numpy(np.concatenate([mask.numpy() for mask in whole]))
-    return Views(torch.from_numpy(images), masks=masks, **concatenated(others, 0))
+    masks = _stacked([v.masks for v in views], views, torch.ones_like)
+    depths = _stacked([v.depths for v in views], views, torch.zeros_like)
+    return Views(torch.from_numpy(images), masks=masks, depths=depths, **concatenated(others, 0))
+
+
+def _stacked(
+    maps: Sequence[Tensor | None], views: Sequence[Views], missing: Callable[[Tensor], Tensor]
+) -> Tensor | None:
+    """Maps (b, V, 1, H, W) one after the other, with `missing` ones; None for none at all."""
+    if all(part is None for part in maps):
+        return None
+    pairs = zip(maps, views, strict=True)
+    whole = [missing(v.images[:, :, :1]) if part is None else part for part, v in pairs]
+    return torch.from_numpy(np.concatenate([part.numpy() for part in whole]))

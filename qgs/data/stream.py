@@ -18,9 +18,10 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from qgs.contracts import SceneSource, ViewsConfig
+from qgs.contracts import SceneSource, ViewSampler, ViewsConfig
 from qgs.data.evaluation import one_line
-from qgs.data.sampling import Batch, Sample, collate, draw_frames, make_sample
+from qgs.data.samplers import Span
+from qgs.data.sampling import Batch, Sample, collate, make_sample
 from qgs.memory import is_out_of_memory
 
 
@@ -54,16 +55,21 @@ def training_batches(
     share: Share = Share(),
     workers: int = 0,
     skips: bool = False,
+    sampler: ViewSampler | None = None,
+    accumulate: int = 1,
+    depths: bool = False,
 ) -> Generator[Batch, None, None]:
     """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
     Sample k depends on (seed, k) alone. Global batch n is the samples from n * batch_size *
     processes on, of which every process gets its slice: `start` resumes exactly, and processes and
     workers change nothing. workers: processes that decode; 0 decodes in a thread. Closing ends
-    them. skips: see `SampleStream`.
+    them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an optimiser step.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
-    batches = _Batches(source, views, seed, batch_size, share, skips)
+    per_step = batch_size * share.processes * accumulate
+    options = (views, seed, skips, sampler, per_step, depths)
+    batches = _Batches(source, options, batch_size, share)
     return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
 
 
@@ -107,13 +113,24 @@ class SceneOrder:
 class SampleStream:
     """Samples by number, each a function of (seed, number) alone. Raises ValueError without scenes.
 
-    skips: replace a failing sample by one of the next scene, at most MAX_REPLACED times.
+    skips: replace a failing sample by one of the next scene, at most MAX_REPLACED times. sampler:
+    `Span` by default. per_step: samples of an optimiser step, by which the sampler knows the step
+    of a sample. depths: whether views have them, see `make_sample`.
     """
 
     def __init__(
-        self, source: SceneSource, views: ViewsConfig, seed: int, skips: bool = False
+        self,
+        source: SceneSource,
+        views: ViewsConfig,
+        seed: int,
+        skips: bool = False,
+        sampler: ViewSampler | None = None,
+        per_step: int = 1,
+        depths: bool = False,
     ) -> None:
         self._views, self._seed, self._skips = views, seed, skips
+        self._sampler = sampler or Span(Span.Config())
+        self._per_step, self._depths = per_step, depths
         self._scenes = source.scenes("train")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
@@ -143,9 +160,10 @@ class SampleStream:
         rng = np.random.default_rng([self._seed, 1, number, *[attempt] * bool(attempt)])
         scene = self._scenes[self.order.scene(number + attempt)]
         mirror = bool(rng.random() < self._views.mirror)
-        inputs, targets = draw_frames(scene, self._views, rng)
+        step = number // self._per_step
+        inputs, targets = self._sampler.draw(scene, self._views, rng, step)
         try:
-            return make_sample(scene, inputs, targets, self._views, mirror, rng)
+            return make_sample(scene, inputs, targets, self._views, mirror, rng, self._depths)
         except Exception as error:
             if is_out_of_memory(error):
                 raise
@@ -165,16 +183,10 @@ class _Batches(Dataset[Batch | _Failure]):
     """The batches of one process; a copy in a worker opens the data itself on first use."""
 
     def __init__(
-        self,
-        source: SceneSource,
-        views: ViewsConfig,
-        seed: int,
-        batch_size: int,
-        share: Share,
-        skips: bool,
+        self, source: SceneSource, options: tuple[Any, ...], batch_size: int, share: Share
     ) -> None:
-        self._source, self._settings = (type(source), source.config), (views, seed, skips)
-        self._stream: SampleStream | None = SampleStream(source, *self._settings)
+        self._source, self._options = (type(source), source.config), options
+        self._stream: SampleStream | None = SampleStream(source, *options)
         self._size, self._share = batch_size, share
 
     def __getstate__(self) -> dict[str, Any]:
@@ -184,7 +196,7 @@ class _Batches(Dataset[Batch | _Failure]):
         """This process's slice of global batch `number`."""
         if self._stream is None:
             kind, config = self._source
-            self._stream = SampleStream(kind(config), *self._settings)
+            self._stream = SampleStream(kind(config), *self._options)
         first = (number * self._share.processes + self._share.rank) * self._size
         return self._stream.batch(range(first, first + self._size))
 

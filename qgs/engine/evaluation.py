@@ -48,7 +48,8 @@ def evaluate(
     if batch < 1:
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
     source, index = recipe.build_data(), index_of(recipe)
-    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index)
+    sampler = recipe.build_view_sampler()
+    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index, sampler)
     measures = Measures(recipe)
     judge = _Judge(model, recipe, source, measures)
     training = model.training

@@ -124,7 +124,11 @@ class PeriodicEvaluation:
         """A row per sample: input views, the first target view, its rendering and its depth."""
         recipe, model, training = self._recipe, self._model, self._model.training
         plan = EvaluationPlan(
-            recipe.build_data(), recipe.views, recipe.evaluation, index_of(recipe)
+            recipe.build_data(),
+            recipe.views,
+            recipe.evaluation,
+            index_of(recipe),
+            recipe.build_view_sampler(),
         )
         usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
         model.eval()

@@ -10,6 +10,7 @@ from qgs.composer import Recipe
 from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.contracts.schedule import END, at_step
 from qgs.data.evaluation import EvaluationIndex, read_index
+from qgs.data.samplers import Span
 from qgs.engine.tuning import tuning_loss
 
 
@@ -74,6 +75,9 @@ def protocol_of(
         views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
         rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
         judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
+        sampler = recipe.parts["view_sampler",]
+        if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":
+            judged["drawn"]["sampler"] = {"type": sampler.type, **sampler.options}
     else:
         left_out |= source.split_options
         data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)

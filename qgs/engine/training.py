@@ -160,6 +160,9 @@ class Trainer:
                 share=Share(self.accelerator.process_index, self.accelerator.num_processes),
                 workers=self.config.workers,
                 skips=self.config.on_bad_sample == "skip",
+                sampler=recipe.build_view_sampler(),
+                accumulate=self.config.accumulate,
+                depths=self.training_pass.reads_depths,
             )
             resources.callback(batches.close)
             self.feed = Feed(batches, self.config.accumulate)

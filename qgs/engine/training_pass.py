@@ -86,6 +86,11 @@ class TrainingPass(nn.Module):
             raise ValueError(f"terms of {kinds} are named {taken}, as other numbers of a step are")
         return outcome
 
+    @property
+    def reads_depths(self) -> bool:
+        """Whether a loss reads depth maps."""
+        return any(getattr(loss, "reads_depths", False) for loss in self.losses.values())
+
     def follow(self, step: int) -> None:
         """Set every scheduled option to its value after `step` optimiser steps."""
         follow((*self.modules(), self.objective), step)

@@ -1,15 +1,17 @@
 """What training minimises."""
 
+from qgs.losses.depth import DepthSurface
 from qgs.losses.lpips import LpipsLoss
 from qgs.losses.means import mean_of_gaussians
 from qgs.losses.opacity import Mask, Opacity
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import Visibility, VisibilityOptions, view_visibility
 
-COMPONENTS = (Photometric, Visibility, Mask, Opacity, LpipsLoss)
+COMPONENTS = (Photometric, Visibility, Mask, Opacity, LpipsLoss, DepthSurface)
 
 __all__ = [
     "COMPONENTS",
+    "DepthSurface",
     "LpipsLoss",
     "Mask",
     "Opacity",

@@ -125,8 +125,8 @@ class PhotoScene(EncodedScene):
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
-        """See `Scene`; 0 where a map says nothing. None unless all `frames` have a map."""
-        if any(self._frames[i].depth is None for i in frames):
+        """See `Scene`; 0 in frames without a map. None where none of `frames` has one."""
+        if all(self._frames[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
 
@@ -175,7 +175,8 @@ class PhotoScene(EncodedScene):
         return self._delivered(Image.fromarray(_whole_mask(frame)), frame, frame.mask)
 
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
-        assert frame.depth is not None
+        if frame.depth is None:
+            return np.zeros(self._config.image_size, np.float32)
         depth = open_depth(frame.depth, self._config.depth_unit)
         return self._delivered(Image.fromarray(depth), frame, frame.depth, "nearest")
 

@@ -215,10 +215,12 @@ class Maker:
         return Rendering(rgb, alpha, depth, features)
 
     def target(self) -> Views:
-        """Noise pictures with masks."""
+        """Noise pictures with masks, and with depth maps for a loss that reads them."""
         views = self.views()
         masks = self.uniform(0, 1, *views.images.shape[:2], 1, *self.image).round()
-        return replace(views, masks=masks)
+        if not getattr(self.case.component, "reads_depths", False):
+            return replace(views, masks=masks)
+        return replace(views, masks=masks, depths=1 + self.uniform(0, 1, *masks.shape))
 
     def inputs(self) -> Views:
         """What a prediction was made from: other pictures than the target's."""

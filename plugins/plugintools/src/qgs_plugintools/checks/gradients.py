@@ -111,8 +111,8 @@ def check_gradients_match_differences(case: Case) -> None:
     small = case.with_dims(width=8, heads=2) if case.has_parameters else case
     module = small.lively().double()
     inputs = cast(inputs_of(small, Sizes(batch=1, queries=3)), torch.float64)
-    # Poses must stay rigid, and masks are 0 or 1.
-    fixed = {"cameras", "masks"}
+    # Poses must stay rigid, masks are 0 or 1, and depths are measured.
+    fixed = {"cameras", "masks", "depths"}
     smooth = {n: x for n, x in floating(inputs).items() if not fixed & {*n.split(".")}}
     parameters = {f"parameter {n}": p for n, p in module.named_parameters()}
     points = {n: x.detach().clone().requires_grad_() for n, x in (smooth | parameters).items()}

@@ -1,0 +1,81 @@
+"""`qgs/depth_surface`: Gaussians on the surface that depth maps show."""
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import Loss
+from qgs.geometry.precision import full_precision
+from qgs.types import LayerPrediction, Rendering, Views
+
+
+class DepthSurface(Loss):
+    """Smooth L1 between the camera-frame z of each Gaussian's centre and the depth map behind it.
+
+    Of all target views, and input views if asked for, that have depth maps (`Views.depths`).
+    """
+
+    name = "depth_surface"
+    renderings = "none"
+    reads_depths = True
+
+    class Config(Loss.Config):
+        beta: float = Field(default=0.05, gt=0)
+        """Error at which the loss turns from a parabola into a line, world units."""
+        near: float = Field(default=0.025, gt=0)
+        """Camera-frame z at or below which a centre is behind a view and not compared there."""
+        inputs: bool = True
+        """Whether input views count beside target views."""
+
+    config: Config
+
+    def term(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
+    ) -> Tensor:
+        """See `Loss`. Raises ValueError for views without depth maps."""
+        views = [target, inputs] if self.config.inputs else [target]
+        measured = [view for view in views if view.depths is not None]
+        if not measured:
+            raise ValueError(
+                "the loss qgs/depth_surface needs depth maps, and no scene of this batch has "
+                "any: give `depth_file_path` in transforms.json, or take the loss out"
+            )
+        means, mask = prediction.gaussians.means, prediction.state.mask
+        found = [
+            surface_errors(means, view, self.config.beta, self.config.near) for view in measured
+        ]
+        errors, seen = (torch.cat(parts, 1) for parts in zip(*found, strict=True))  # (B, V, G)
+        if mask is not None:  # places without a query have Gaussians that nobody sees
+            seen = seen & mask.repeat_interleave(means.shape[1] // mask.shape[1], 1)[:, None]
+        # a scene in which no centre meets a measured pixel has the loss 0, with a gradient of 0
+        return ((errors * seen).sum((1, 2)) / seen.sum((1, 2)).clamp_min(1)).mean()
+
+
+@full_precision
+def surface_errors(
+    points: Tensor,  # (B, G, 3) world
+    views: Views,  # (B, V) with depths
+    beta: float,
+    near: float,
+) -> tuple[Tensor, Tensor]:
+    """Smooth L1 error in z of each point in each view, and where it counts; (B, V, G) both.
+
+    It counts in front of `near`, inside the image, and where the depth of the pixel is known. The
+    pixel is constant for the gradient, which moves a point along the view's axis.
+    """
+    assert views.depths is not None
+    w2c = views.cameras.w2c  # (B, V, 4, 4)
+    local = points[:, None] @ w2c[..., :3, :3].mT + w2c[..., None, :3, 3]  # (B, V, G, 3)
+    z, (height, width) = local[..., 2], views.cameras.size
+    with torch.no_grad():
+        focal, centre = views.cameras.intrinsics[:, :, None].split(2, -1)
+        safe = z.clamp_min(near)[..., None]  # points behind are left out below
+        # nearest pixel, as depths of both sides of an edge have no meaningful mean
+        column, row = (focal * local[..., :2] / safe + centre).floor().unbind(-1)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > near)
+        place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+        depth = views.depths.flatten(2).gather(2, place.long())  # (B, V, G)
+        seen = inside & (depth > 0)
+    error = F.smooth_l1_loss(z, torch.where(seen, depth, z), beta=beta, reduction="none")
+    return error, seen
