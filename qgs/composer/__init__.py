@@ -1,6 +1,6 @@
 """The composer: from a recipe to a checked, reproducible model.
 
-`compose` makes the model, `resolve` says everything about a recipe before anything is allocated.
+`compose` makes the model; `resolve` merges and checks a recipe without allocating a tensor.
 """
 
 from collections.abc import Mapping, Sequence

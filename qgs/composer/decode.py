@@ -49,7 +49,7 @@ class DecoderSettings(ComponentConfig):
 
 
 class RecipeSettings(ComponentConfig):
-    """What concerns the recipe as a whole."""
+    """Settings at the top of a recipe."""
 
     recipe: Literal[1]
     """Version of the recipe format."""
@@ -153,7 +153,7 @@ def _decode_options(
     component: type[Component], name: str, node: MapNode, path: KeyPath, problems: Problems
 ) -> tuple[ComponentConfig, dict[str, Schedule]] | None:
     """The first options and the schedules of the rest, all of whose extremes are within limits."""
-    schedules, fields, sound = dict[str, Schedule](), component.Config.model_fields, True
+    schedules, fields, valid = dict[str, Schedule](), component.Config.model_fields, True
     for option, value, origin in node.entries():
         number = option in fields and number_kinds(fields[option].annotation)
         if not number or not isinstance(value, MapNode):
@@ -161,7 +161,7 @@ def _decode_options(
         below, schedule = (*path, option), None
         kind = str(value.get("schedule", ""))
         if option not in component.scheduled:
-            reason = f"`{option}` of `{name}` takes no schedule: it stays for a whole training"
+            reason = f"`{option}` of `{name}` takes no schedule: it is fixed in training"
             can = f"options that can: {', '.join(sorted(component.scheduled)) or 'none'}"
             problems.add(origin, ".".join(below), reason, f"give one number ({can})")
         elif kind in SCHEDULES:
@@ -171,12 +171,12 @@ def _decode_options(
             fix = did_you_mean(kind, SCHEDULES, "schedules")
             where = value.origins.get("schedule", origin)
             problems.add(where, ".".join((*below, "schedule")), reason, fix)
-        sound &= schedule is not None
+        valid &= schedule is not None
         schedules |= {option: schedule} if schedule else {}
     configs = list[ComponentConfig]()
-    for step in corners(schedules) if sound else ():
+    for step in corners(schedules) if valid else ():
         numbers = {n: s.number(step) for n, s in schedules.items()}
-        # Whole ones without a point, since whole options take no others.
+        # Options that are integers refuse 2.0, so that integral numbers are written as 2.
         written = {n: int(x) if x.is_integer() else x for n, x in numbers.items()}
         entries = ((n, written.get(n, value), at) for n, value, at in node.entries())
         config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
@@ -320,7 +320,7 @@ def check_tree(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, Any], bool]:
-    """Settings by section, defaults for one with problems; whether the model's sizes are sound."""
+    """Settings by section, defaults for one with problems; whether the model's sizes are valid."""
     settings: dict[KeyPath, Any] = {}
     sizes_known = True
     for path, config in SETTINGS.items():

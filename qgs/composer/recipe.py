@@ -1,4 +1,4 @@
-"""Resolving a recipe: everything that can be said about it before a tensor is allocated."""
+"""Resolving a recipe: read, merge, check, and write out every default; no tensor is allocated."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -142,7 +142,7 @@ def resolve(
     recipe: path of a YAML file, else the name of one that comes with qgs (tiny/locus.yaml); or a
         mapping of the same form, whose `extends` is relative to the working directory.
     overrides: such as "model.queries.count=128", laid over it in order.
-    plugins: what it may name besides the installed plugins, such as one under test.
+    plugins: plugins that it may name although they are not installed, such as one under test.
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
@@ -164,10 +164,10 @@ def resolve(
         inputs = settings["views",].inputs if data else None
         timed = bool(data and getattr(data.component, "tells_times", False))
         context = contracts.RecipeContext(dims, size, inputs, timed)
-        sound = {
+        checked = {
             p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
         }
-        check_flow(sound, dims.depth, registry, problems)
+        check_flow(checked, dims.depth, registry, problems)
     _check_settings(tree, settings, parts, registry, problems)
     problems.raise_any()
     chosen = {path: part for path, part in parts.items() if part is not None}
@@ -272,7 +272,7 @@ def _spell_out(
             tree.put((), {name: {}}, source, "default")
     for name in ("views", "training", "evaluation"):
         tree.put_settings((name,), settings[name,])
-    # One that offers layouts alone has no component to use, and is there for `qgs export`.
+    # A plugin with weight layouts alone has no component to use: `qgs import` reads it.
     found = registry.plugins.items()
     kept = [n for n, p in found if n in tree.used - {"qgs"} or not p.plugin.components]
     tree.put((), {"plugins": kept}, source, "default")
@@ -292,8 +292,8 @@ def _put_decoder(tree: "_Tree", parts: Mapping[KeyPath, Chosen]) -> None:
         if (*decoder, name) not in parts:
             continue
         standing = [part for path, part in layers.items() if path[-1] == name]
-        alike = [(part.type, part.options) for part in standing]
-        same = alike.count(alike[0]) == len(alike)
+        chosen = [(part.type, part.options) for part in standing]
+        same = chosen.count(chosen[0]) == len(chosen)
         template = standing[0] if same else parts[(*decoder, name)]
         tree.put_component((*decoder, name), template)
         templates[name] = (template.type, template.options)
@@ -382,7 +382,7 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
 
 
 def annotated(recipe: Recipe) -> str:
-    """The resolved recipe in YAML; comments, aligned at the right, say what set each value."""
+    """The resolved recipe in YAML; aligned comments name the file and line that set each value."""
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():

@@ -44,7 +44,7 @@ BUILTIN = Plugin(
 
 
 class PluginError(OptionError):
-    """A plugin that cannot be used: `reason` names its distribution, `fix` says what to do."""
+    """A plugin that cannot be used: `reason` names its distribution, `fix` the remedy."""
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,10 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
     for option in component.scheduled:
         number = dict(properties[option])
-        told = {
+        shown = {
             key: number.pop(key) for key in ("description", "title", "default") if key in number
         }
-        properties[option] = {**told, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
+        properties[option] = {**shown, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
     return schema | {"description": description, "properties": properties}
 
 
