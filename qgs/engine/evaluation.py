@@ -1,4 +1,4 @@
-"""Judging a model on the test views of a recipe, beside two baselines that need none."""
+"""Scores of a model on the test views of a recipe, and of two baselines without a model."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 
 SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
-"""What of a recipe decides which views are judged, and how."""
+"""Sections of a recipe that decide which views are scored, and how."""
 
 
 def evaluate(
@@ -37,13 +37,12 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
-    A scene that fails is named in the result with the reason, and the others go on. Leaves the
-    model in the mode it was in. step: optimiser steps behind the weights. batch: scenes that pass
-    through the model together; with tuned tokens each passes alone. observe: called with how many
-    scenes are done, and how many there are. trained_on: the domain of the model, empty where it
-    is not known; None says nothing of it.
+    A scene that fails is named in the result with the reason, and the others go on. Restores the
+    model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
+    tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
+    of the model, empty where it is unknown; None leaves out the remark on it.
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
-    scene at all could be judged or `batch` is less than 1.
+    scene could be scored or `batch` is less than 1.
     """
     if batch < 1:
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
@@ -51,11 +50,11 @@ def evaluate(
     sampler = recipe.build_view_sampler()
     plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index, sampler)
     measures = Measures(recipe)
-    judge = _Judge(model, recipe, source, measures)
+    scorer = _Scorer(model, recipe, source, measures)
     training = model.training
     model.eval()
     try:
-        scores, missing = _by_scene(plan.wanted, judge.judged(plan.samples(), batch), observe)
+        scores, missing = _by_scene(plan.wanted, scorer.scores(plan.samples(), batch), observe)
     finally:
         model.train(training)
     missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
@@ -67,7 +66,7 @@ def evaluate(
         columns=measures.columns,
         scores=scores,
         wanted=plan.wanted,
-        gaussians=judge.gaussians,
+        gaussians=scorer.gaussians,
         missing=missing,
         null=plan.null,
         unlisted=plan.unlisted,
@@ -75,9 +74,9 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
-    likeness = "" if trained_on is None else verdict(trained_on, judge.seen)
-    said = (likeness, plan.framing, *_remarks(evaluation, plan, recipe))
-    return replace(evaluation, remarks=[*filter(None, said)])
+    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen)
+    remarks = (likeness, plan.framing, *_remarks(evaluation, plan, recipe))
+    return replace(evaluation, remarks=[*filter(None, remarks)])
 
 
 def _remarks(evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe) -> Iterator[str]:
@@ -89,8 +88,8 @@ def _remarks(evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe) -> It
         why = "the index names the views"
         if evaluation.held_out:
             why = "{} of {} held-out frames are judged, each once".format(*evaluation.held_out)
-        told = f"evaluation.samples={samples} changed nothing{where}"
-        yield f"{told}, since no views were drawn: {why}"
+        unused = f"evaluation.samples={samples} changed nothing{where}"
+        yield f"{unused}, since no views were drawn: {why}"
     if evaluation.columns and not any(score.given for score in scores):
         name, column = next(iter(evaluation.columns.items()))
         nearest = evaluation.mean(name, "nearest_input")
@@ -159,8 +158,8 @@ class Measures:
         return found
 
 
-class _Judge:
-    """Scores samples."""
+class _Scorer:
+    """Scores samples; `seen` are their cameras, `gaussians` the most Gaussians of a scene."""
 
     def __init__(
         self, model: QueryGaussianModel, recipe: Recipe, source: SceneSource, measures: Measures
@@ -170,7 +169,7 @@ class _Judge:
         self._device = next(model.parameters()).device
         self._measures = measures
         self.seen = Domain()
-        self.gaussians = 0  # of a scene, the most
+        self.gaussians = 0
         for metric in measures.metrics.values():
             metric.to(self._device)
         self._tune = None
@@ -179,7 +178,7 @@ class _Judge:
             loss = tuning_loss(recipe)
             self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate, what=what)
 
-    def judged(
+    def scores(
         self, samples: Iterable[Sample | SceneFailure], batch: int
     ) -> Iterator[SceneScore | SceneFailure]:
         """The score of every sample, up to `batch` with inputs of one shape at a time."""
@@ -198,7 +197,7 @@ class _Judge:
     @torch.no_grad()
     def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
         if len(samples) > 1 and not self._tune:
-            with suppress(Exception):  # otherwise each runs by itself, to see which one fails
+            with suppress(Exception):  # then each runs by itself, to find the one that fails
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
                 gaussians = self._model(inputs).gaussians
                 return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]

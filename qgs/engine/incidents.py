@@ -54,12 +54,11 @@ class Report(NamedTuple):
         if self.first is None:
             return "repeating the step gave finite numbers everywhere"
         batch = self.batches[self.first.batch]
-        samples = [
+        samples = ", ".join(
             f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
             for scene, inputs, targets in zip(*(batch[name] for name in FRAMES), strict=True)
-        ]
-        name, values, _ = self.first
-        return f"the first bad tensor is {name} ({values}), with {', '.join(samples)}"
+        )
+        return f"the first bad tensor is {self.first.tensor} ({self.first.values}), with {samples}"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""

@@ -19,7 +19,7 @@ class Protocol:
     """Settings of an evaluation under a name; results with one hash are comparable.
 
     content: everything that decides a score of given Gaussians, and nothing else: no path, and not
-    the renderer's type or device, as all render alike.
+    the renderer's type or device, since all renderers give the same image.
     """
 
     name: str
@@ -27,7 +27,7 @@ class Protocol:
 
     @property
     def canonical(self) -> str:
-        """What is hashed: `content` as JSON with sorted keys and no spaces."""
+        """`content` as JSON with sorted keys and no spaces, which is hashed."""
         return _canonical(self.content)
 
     @property
@@ -59,9 +59,9 @@ def protocol_of(
 ) -> Protocol:
     """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
 
-    With an index the kind of data, how it is split, and options at their defaults are left out, so
-    that one data set in two formats has one protocol. Options of the renderer that follow the
-    training are those after `step` steps.
+    With an index the kind of data, its split, and options at their defaults are left out, so that
+    one data set in two formats has one protocol. Scheduled options of the renderer are those after
+    `step` steps.
     """
     evaluation, part = recipe.evaluation, recipe.parts["data",]
     renderer = recipe.parts["model", "renderer"]
@@ -84,14 +84,13 @@ def protocol_of(
         judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
     tuning, metrics = None, {}
     if evaluation.tuning_steps:
-        options = tuning_loss(recipe).config
-        loss = options.model_dump(
-            mode="json", exclude=set() if options.l1_weight else {"l1_weight"}
-        )
-        budget = {"steps": evaluation.tuning_steps, "rate": evaluation.rate}
-        tuning = {**budget, "optimizer": "Adam", "loss": loss}
-        if evaluation.tuning != "queries":  # which protocols did not name when there was no other
-            tuning["what"] = evaluation.tuning
+        tuning = {
+            "what": evaluation.tuning,
+            "steps": evaluation.tuning_steps,
+            "rate": evaluation.rate,
+            "optimizer": "Adam",
+            "loss": tuning_loss(recipe).config.model_dump(mode="json"),
+        }
     for path, chosen in recipe.parts.items():
         metric = chosen.component
         if issubclass(metric, Metric):

@@ -240,7 +240,7 @@ class Evaluation:
         )
         if tuning := self._tuning():
             yield (
-                f"{tuning.get('what', 'queries')} tuned on the input views: {tuning['steps']} "
+                f"{tuning['what']} tuned on the input views: {tuning['steps']} "
                 "steps of Adam at "
                 f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
                 f"{tuning['loss_after']:.4f}"

@@ -287,9 +287,7 @@ def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny) -> No
 def test_lpips_fills_its_column_where_it_can(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = tiny("tokengs", "metrics.lpips={type: qgs/lpips, weights: mine.pth}")
     asked = []
-    monkeypatch.setattr(
-        PerceptualDistance, "_load", lambda self, weights: asked.append(weights) or ""
-    )
+    monkeypatch.setattr(PerceptualDistance, "load", lambda self, weights: asked.append(weights))
     monkeypatch.setattr(
         Lpips, "distance", lambda self, images, truth: (images - truth).abs().mean((-3, -2, -1))
     )

@@ -276,27 +276,16 @@ def test_random_states_come_back() -> None:
     assert draw() == first
 
 
-@pytest.mark.parametrize(
-    ("kills", "inside", "options"),
-    [
-        (2, 0, ("--width=64", "--steps=12", "--longest=0.2")),
-        pytest.param(50, 1, ("--width=192", "--steps=150"), marks=pytest.mark.slow),
-    ],
-)
-def test_killed_runs_go_on_from_whole_files(
-    kills: int, inside: int, options: tuple[str, ...]
-) -> None:
-    """inside: how many kills, at least, must have come inside a save for this to prove anything."""
-    tool = Path(__file__).parents[2] / "tools" / "kill_training.py"
+@pytest.mark.slow
+def test_killed_runs_go_on_from_whole_files() -> None:
+    """Some kills must come inside a save, for this to prove anything."""
+    tool = Path(__file__).parents[2] / "tools" / "kill.py"
     done = subprocess.run(
-        [sys.executable, str(tool), f"--count={kills}", *options],
+        [sys.executable, str(tool), "training", "--kills=12", "--width=192", "--steps=150"],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=1200 if inside else 240,
+        timeout=1200,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    found = re.match(r"(\d+) kills, (\d+) inside a save", done.stdout)
-    assert found, done.stdout
-    assert int(found[1]) == kills
-    assert int(found[2]) >= inside
+    assert re.match(r"12 kills, [1-9]\d* inside a save", done.stdout), done.stdout

@@ -7,7 +7,7 @@ import re
 import subprocess
 from pathlib import Path
 
-import kill_study
+import kill
 import pytest
 from commands import run_qgs
 from qgs_studies.plan import Run, planned
@@ -23,7 +23,7 @@ RECIPES = Path(__file__).parents[3] / "recipes"
 
 @pytest.fixture
 def study(tmp_path: Path) -> Path:
-    text = kill_study.STUDY.format(recipes=RECIPES, steps=12)
+    text = kill.STUDY.format(recipes=RECIPES, steps=12)
     text = text.replace("seeds: [0, 1, 2]", "seeds: [0, 1]")
     text = re.sub(r"  (free|tokengs):.*\n|differs:.*\n", "", text)
     text = re.sub(r"hypotheses:.*", "hypotheses: [flat < locus]", text)
@@ -40,7 +40,8 @@ def begun(out: Path) -> dict[str, int]:
 @pytest.mark.slow
 def test_two_queues_share_a_folder_and_additions_run_alone(study: Path) -> None:
     out = study.parent / "out"
-    queues = [kill_study.started(study, out, 1) for _ in range(2)]
+    command = ["study", str(study), "--out", str(out), "--threads", "1", "--device", "cpu"]
+    queues = [kill.started([*command, "--workers", "1"], study.parent / "log") for _ in range(2)]
     assert [queue.wait(600) for queue in queues] == [0, 0]
     runs = {f"{v}/seed-{s}": 1 for v in ("locus", "flat") for s in (0, 1)}
     assert begun(out) == runs
@@ -121,50 +122,9 @@ def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(
 
 
 @pytest.mark.slow
-def test_a_killed_study_has_the_table_of_a_quiet_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command = ["kill_study.py", str(tmp_path / "out"), "--kills", "3", "--steps", "20"]
-    monkeypatch.setattr("sys.argv", [*command, "--ratio", "inf"])  # tests measure no times
-    assert kill_study.main() == 0
-
-
-@pytest.mark.parametrize(
-    ("two", "table", "kills", "code"),
-    [
-        (5.0, "20.1", 3, 0),
-        (7.0, "20.1", 3, 1),  # too slow
-        (5.0, "20.2", 3, 1),  # another table
-        (5.0, None, 3, 1),  # no table
-        (5.0, "20.1", 2, 1),  # too few kills
-    ],
-)
-def test_the_tool_that_kills_fails_on_each_of_its_bars(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    two: float,
-    table: str | None,
-    kills: int,
-    code: int,
-) -> None:
-    def quiet(study: Path, out: Path, workers: int) -> float:
-        out.mkdir()
-        for name in kill_study.SAME:
-            (out / name).write_text("20.1")
-        return 10.0 if workers == 1 else two
-
-    def disturbed(study: Path, out: Path, *_: object) -> list[str]:
-        quiet(study, out, 2)
-        if table:
-            (out / "table.csv").write_text(table)
-        else:
-            (out / "table.csv").unlink()
-        return ["worker"] * kills
-
-    monkeypatch.setattr(kill_study, "quiet", quiet)
-    monkeypatch.setattr(kill_study, "disturbed", disturbed)
-    monkeypatch.setattr("sys.argv", ["kill_study.py", str(tmp_path / "out"), "--kills", "3"])
-    assert kill_study.main() == code
+def test_a_killed_study_has_the_table_of_a_quiet_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["kill.py", "study", "--kills", "3", "--steps", "20"])
+    assert kill.main() == 0
 
 
 def test_cores_are_counted_where_a_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
