@@ -1,6 +1,6 @@
-"""On what views a model was trained, in a few numbers, and whether other views are like them.
+"""The range of views that a model was trained on, and whether other views lie inside it.
 
-All is told by cameras in the model's frame, which any source of data has, photos of a user too.
+Only cameras in the model's frame are compared, so it works for any data.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from qgs.types import Cameras, Views
 SAMPLES = 256
 """Training samples that are measured, the first ones."""
 OUTLIERS = 0.02
-"""Share of the values at either end of a range that does not count: one pair of parallel axes looks
-infinitely far."""
+"""Share of the values at either end of a range that does not count, such as parallel axes."""
 TOLERANCE = 1.1
 """Views are outside where they leave the trained range by more than this factor."""
 GROSS = 5.0
@@ -70,14 +69,12 @@ class Domain:
         return {"samples": self.samples, "values": self.values}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state`. Raises ValueError, TypeError and the like for anything else."""
-        told = {"samples": [state["samples"]], **state["values"]}
-        for name, numbers in told.items():
-            sound = all(isinstance(n, int | float) and n >= 0 for n in numbers)
-            if not sound or name not in ("samples", *WORDS):
-                raise ValueError(f"{name[:50]} is {str(numbers)[:100]}")
-        self.samples = int(state["samples"])
-        self.values = {name: [*map(float, numbers)] for name, numbers in state["values"].items()}
+        """Go on from `state`. Raises ValueError, TypeError or KeyError for anything else."""
+        values = {name: [*map(float, state["values"][name])] for name in state["values"]}
+        numbers = [int(state["samples"]), *(n for v in values.values() for n in v)]
+        if not (values.keys() <= WORDS.keys() and all(n >= 0 for n in numbers)):
+            raise ValueError(f"these are no ranges of views: {str(state)[:100]}")
+        self.samples, self.values = int(state["samples"]), values
 
     @property
     def text(self) -> str:
@@ -94,7 +91,7 @@ class Domain:
         return domain
 
     def differences(self, found: Domain) -> list[str]:
-        """In what `found` leaves these ranges, in words."""
+        """A phrase for each range that `found` leaves."""
         told, seen = [], found.ranges
         for name, trained in self.ranges.items():
             if name in seen and not _inside(seen[name], trained):
@@ -106,10 +103,7 @@ class Domain:
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """A sentence: how views lie to what a model was trained on; `trained` is empty if unknown.
-
-    The model need not know their content either: only the cameras are compared.
-    """
+    """A sentence on views against those of the training; `trained` is empty if unknown."""
     if not trained.values:
         return (
             "whether the views are like those that this model was trained on is not known: its "
@@ -127,10 +121,8 @@ def verdict(trained: Domain, found: Domain) -> str:
 
 
 def odd_images(images: Tensor) -> str:
-    """What is wrong with the range of `images` (..., H, W), of every eighth pixel; "" if nothing.
-
-    Resampling may leave [0, 1] a little.
-    """
+    """What is wrong with the range of `images` (..., H, W), of each eighth pixel; "" if nothing."""
+    # resampling overshoots [0, 1] a little at edges
     low, high = map(float, images[..., ::8, ::8].aminmax())
     if low >= -0.5 and high <= 1.5:
         return ""
@@ -201,7 +193,7 @@ def trained_domain(source: SceneSource, views: ViewsConfig, seed: int) -> Domain
 
 
 def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]:
-    """Name and values of what WORDS names; distances and axes only where inputs are several."""
+    """Name and values of WORDS; distances and axes only for several inputs."""
     count = inputs.c2w.shape[1]
     yield "views", torch.tensor([float(count)])
     if count > 1:

@@ -69,7 +69,7 @@ def training_frames(scene: Scene) -> list[int]:
 
 
 def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
-    """Frames, by default of training, by their times; one by one, as given, where nothing moves."""
+    """Group frames, by default those of training, by time; a static scene gives groups of one."""
     frames = training_frames(scene) if frames is None else frames
     times = None if scene.times is None else scene.times.tolist()
     together = defaultdict[float, list[int]](list)
@@ -103,7 +103,7 @@ def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
 
 
 def image_bytes(frames: int, size: tuple[int, int]) -> int:
-    """What RGB images of (H, W) `size` take in float32."""
+    """Bytes of RGB images of (H, W) `size` in float32."""
     return frames * 3 * size[0] * size[1] * torch.float32.itemsize
 
 
@@ -133,18 +133,20 @@ def draw_frames(
     gap = int(rng.integers(low, high + 1))
     first = int(rng.integers(0, len(usable) - gap))
     span = usable[first : first + gap + 1]
-    if views.inputs == 1:
+    if views.inputs == 1:  # with no span to be the end of
         places = [int(rng.choice(gap + 1))]
     else:  # the two ends and moments between
         more = views.inputs - 2
         between = rng.choice(range(1, gap), more, replace=False) if more else ()
         places = [0, *sorted(map(int, between)), gap]
     chosen = [span[place] for place in places]
-    inputs = one_of_each(chosen, rng.permutation(max(map(len, span))).tolist())  # of 1: no draw
+    # permuting one camera draws nothing: static scenes have the same numbers after it
+    inputs = one_of_each(chosen, rng.permutation(max(map(len, span))).tolist())
     pool = [frame for moment in span for frame in moment]
     if scene.times is not None:
         novel = [moment for moment in span if {*moment} - {*inputs}] or span
         pool = novel[rng.integers(len(novel))]
+    # new views first, then inputs, then repetitions, so that short scenes can be used too
     targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
     targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
     targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
@@ -152,7 +154,7 @@ def draw_frames(
 
 
 def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
-    """A frame of each of these moments, by `cameras` in turn, as far as there are."""
+    """One frame per moment, cycling through the cameras."""
     return tuple(m[cameras[i % len(cameras)] % len(m)] for i, m in enumerate(chosen))
 
 
@@ -225,7 +227,7 @@ def views_in(
     cameras = scene.cameras[list(frames)]
     reference, scale = world
     c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
-    if surface is not None:
+    if surface is not None:  # z of cameras scales with their translations
         surface = torch.from_numpy(surface.numpy()[order] * np.float32(scale.item()))[None]
     return Views(
         torch.from_numpy(images.numpy()[order])[None],

@@ -87,7 +87,10 @@ def test_depth_maps(folder, suffix):
     assert depths is not None
     assert depths.shape == (2, 1, 30, 40)
     np.testing.assert_allclose(depths[0, 0], depth * 1e-3, rtol=1e-6)
-    assert scene.depths([0, 1]) is None
+    mixed = scene.depths([0, 1])
+    assert mixed is not None
+    assert (bool(mixed[0].any()), bool(mixed[1].any())) == (False, True)
+    assert scene.depths([0]) is None
     halved = read(folder, (15, 20), depth_unit=2.0).depths([1])
     assert halved is not None
     assert set(halved.flatten().tolist()) <= set((2.0 * depth).ravel().tolist())
