@@ -20,9 +20,10 @@ class LayerScale(nn.Module):
 
     def __init__(self, width: int, init: float) -> None:
         super().__init__()
+        # A small start lets updates grow as they learn, which deep decoders need to train at all.
         self.gamma = nn.Parameter(torch.full((width,), init))
 
-    def forward(self, update: Tensor) -> Tensor:
+    def forward(self, update: Tensor) -> Tensor:  # (..., D)
         return update * self.gamma
 
 
@@ -34,7 +35,7 @@ class Mlp(nn.Module):
         self.fc1 = nn.Linear(inputs, hidden)
         self.fc2 = nn.Linear(hidden, outputs)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:  # (..., inputs)
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -50,7 +51,7 @@ def merge_heads(x_BhTd: Tensor) -> Tensor:
 
 def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) -> AttentionWeights:
     """The parts of scaled dot-product attention, computed in float32. bias: for one head or all."""
-    scale = q_BhQd.shape[-1] ** -0.5
+    scale = q_BhQd.shape[-1] ** -0.5  # so that logits keep their spread for any width of a head
     content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
     logits_BhQT = content_BhQT if bias_BhQT is None else content_BhQT + bias_BhQT
     weights_BhQT = logits_BhQT.softmax(-1)
@@ -73,6 +74,7 @@ class SelfAttentionCore(nn.Module):
         q_BhTd, k_BhTd, v_BhTd = (
             split_heads(part_BTD, self.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
         )
+        # LayerNorm gives float32 under autocast, and attention wants all three in one type.
         return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
     def forward(self, x_BTD: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -89,6 +91,7 @@ class SelfAttentionCore(nn.Module):
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
         bias_B1QT = None
         if mask is not None:
+            # As a bias, since pictures show what is added to the logits.
             each = mask[:, None].expand(-1, x_BTD.shape[1], -1) if mask.ndim == 2 else mask
             bias_B1QT = torch.where(each[:, None, queries], 0.0, -torch.inf)
         return attention_weights(q_BhTd[:, :, queries], k_BhTd, bias_B1QT)
@@ -118,6 +121,7 @@ class CrossAttentionCore(nn.Module):
     ) -> Tensor:
         """(B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M), -inf hides a token; or a
         function of query and token, of which the N x M values never exist at once."""
+        # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
         q_BhNd, k_BhMd = self.project(x_BND).to(v_BhMd.dtype), k_BhMd.to(v_BhMd.dtype)
         if isinstance(bias, AttentionBias):
             read_BhNd = biased_attention(q_BhNd, k_BhMd, v_BhMd, bias)

@@ -21,11 +21,12 @@ def posact(
     and 1000; TokenGS: none). The slope is 1 at 0, so that a head which starts at zero can learn,
     and 0 beyond a limit.
     """
-    if input_limit is not None:
+    if input_limit is not None:  # exp of a stray output would be infinite
         t = t.clamp(-input_limit, input_limit)
     if output_limit is not None:
         beyond = math.log1p(output_limit) + 1  # an exponential that overflows has slope 0 * inf
         t = t.clamp(-beyond, beyond)
+    # expm1, not exp - 1, which has no digits left where t is near 0.
     result = torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
     return result if output_limit is None else result.clamp(-output_limit, output_limit)
 
@@ -46,6 +47,7 @@ class FreeCenters(Centers):
     config: Config
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        # A head that starts near zero puts all Gaussians at z_offset, in front of the first camera.
         means = posact(offsets, self.config.input_limit, self.config.output_limit)
         return _further(means, self.config.z_offset)
 

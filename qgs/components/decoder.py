@@ -42,8 +42,9 @@ class CrossSelfMlp(DecoderLayer):
         self.feed_forward_scale = LayerScale(width, layer_scale)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        # Each part reads what the part before it wrote: first the photos, then the other queries.
         x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
-        state = state.replace(features=x_BND)
+        state = state.replace(features=x_BND)  # self-attention reads fields too
         x_BND = x_BND + self.self_scale(self.self_attention(state))
         x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
         return state.replace(features=x_BND), memory
@@ -63,6 +64,7 @@ class ContentCrossAttention(CrossAttention):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
+        # No keys and values of its own: the encoder projects them once for all layers.
         self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
@@ -108,10 +110,10 @@ class MlpFeedForward(FeedForward):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)  # pre-norm: the stream stays as it is
         self.mlp = Mlp(dims.width, int(config.ratio * dims.width), dims.width)
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Tensor) -> Tensor:  # (B, N, D)
         return self.mlp(self.norm(features))
 
 

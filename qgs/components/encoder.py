@@ -71,6 +71,7 @@ class PatchViT(PatchEncoder):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         patch, eps = config.patch_size, config.norm_eps
+        # Each with its own norm: colours and rays have different scales.
         self.rgb_embedding = PatchEmbedding(3, dims.width, patch, eps)
         self.ray_embedding = PatchEmbedding(6, dims.width, patch, eps)
         self.blocks = nn.ModuleList(
@@ -83,7 +84,7 @@ class PatchViT(PatchEncoder):
 
         A patch of f x f times the pixels then gives the token of the small one on means of f x f.
         """
-        own = self.state_dict()
+        own = self.state_dict()  # its shapes tell the size of our patches
         return {
             name: _larger(kernel, own[name].shape[-1]) if name.endswith(_KERNEL) else kernel
             for name, kernel in learned.items()
@@ -113,6 +114,7 @@ class MultiViewViT(PatchViT):
         for block in self.blocks:
             x_BMD = block(x_BMD)
         x_BMD = self.norm(x_BMD)
+        # Here and not in the decoder, whose layers all read the same keys and values.
         keys, values = keys_and_values(x_BMD, self.kv_proj, self.k_norm)
         rays = patch_rays(plucker_BV6HW, self.config.patch_size)
         return ImageMemory(features=x_BMD, keys=keys, values=values, patch_rays=rays, grid=grid)
@@ -137,11 +139,13 @@ def _larger(kernel: Tensor, side: int) -> Tensor:
     if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
         return kernel
     factor = side // kernel.shape[-1]
+    # Divided, so that the sum over more pixels is the mean of what the small patches gave.
     return repeat(kernel / factor**2, "d c h w -> d c (h fh) (w fw)", fh=factor, fw=factor)
 
 
 def imagenet_normalised(images: Tensor) -> Tensor:
     """(RGB - mean) / std of ImageNet, for images (..., 3, H, W) in [0, 1]."""
+    # ImageNet's statistics, as in the release: for other photos they centre well enough.
     options = {"dtype": images.dtype, "device": images.device}
     mean = torch.tensor(IMAGENET_MEAN, **options).view(3, 1, 1)
     std = torch.tensor(IMAGENET_STD, **options).view(3, 1, 1)

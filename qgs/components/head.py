@@ -53,9 +53,10 @@ class GaussianHead(Head):
         super().__init__(config, dims)
         self.norm = nn.LayerNorm(dims.width, config.norm_eps) if config.norm else nn.Identity()
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
+        # Small weights: all Gaussians of a query start at one place, near one size and grey.
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
-        if config.position_std is not None:
+        if config.position_std is not None:  # positions that start apart divide the scene sooner
             rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
             nn.init.trunc_normal_(rows_K3D, std=config.position_std)
             with torch.no_grad():
@@ -76,12 +77,13 @@ class GaussianHead(Head):
         """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
         offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         cap, limit = self.config.scale_cap, self.config.scale_input_limit
-        if limit is not None:
+        if limit is not None:  # exp of a stray output would be infinite, its gradient NaN
             scale = scale.clamp(-limit, limit)
         return GaussianAttributes(
             offsets=offsets,
-            # cap / e at 0, never above the cap (TokenGS release)
+            # cap / e at 0, never above the cap (TokenGS release): one huge Gaussian hides a scene
             scales=torch.exp(scale - (1 - math.log(cap))).clamp_max(cap),
+            # eps: a raw quaternion near 0 would turn by any amount in a step
             quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
             opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
             colors=(torch.tanh(rgb) + 1) / 2,

@@ -21,6 +21,7 @@ class LatentQueries(LearnedQueries):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
+        # Different from the start: equal queries would get equal gradients and stay equal.
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
 
     def start(self, batch_size: int) -> QueryState:

@@ -48,5 +48,6 @@ class LayerSupervision(Supervision):
 
     def weights(self) -> Mapping[int, float]:
         count = len(self.config.layers)
+        # They sum to 1, so that the learning rate does not depend on how many there are.
         total = count * (count + 1) / 2
         return {number: rank / total for rank, number in enumerate(self.config.layers, start=1)}

@@ -95,9 +95,12 @@ class CrossAttention(ModelComponent):
         """The update of the query features, before LayerScale."""
 
     def explain(
-        self, state: QueryState, memory: ImageMemory, queries: Tensor
+        self,
+        state: QueryState,
+        memory: ImageMemory,
+        queries: Tensor,  # (Q,) indices
     ) -> AttentionWeights | None:
-        """Attention of the queries with indices `queries` (Q,); None if it has none to show."""
+        """Attention of some queries; None if it has none to show."""
         return None
 
 
@@ -124,7 +127,7 @@ class FeedForward(ModelComponent):
     slot: ClassVar[str] = "feed_forward"
 
     @abstractmethod
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Tensor) -> Tensor:  # (B, N, D)
         """The update of the query features, before LayerScale."""
 
 

@@ -49,5 +49,9 @@ class Centers(ModelComponent):
     slot: ClassVar[str] = "centers"
 
     @abstractmethod
-    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+    def forward(
+        self,
+        offsets: Tensor,  # (B, N, K, 3) raw
+        state: QueryState,
+    ) -> Tensor:
         """World-frame means."""

@@ -73,11 +73,14 @@ class Renderer(Component, torch.nn.Module):
 
     @abstractmethod
     def forward(
-        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+        self,
+        gaussians: Gaussians,  # (B, G)
+        cameras: Cameras,  # (B, V)
+        background: Tensor | None = None,  # (3,) RGB
     ) -> Rendering:
         """Render every scene from each of its cameras.
 
-        background: RGB (3,); None for the configured one.
+        background: None for the configured one.
         Raises ValueError for Gaussians and cameras of different batch sizes or devices, and for
         cameras that require a gradient which there is not.
         """

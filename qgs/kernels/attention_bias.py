@@ -70,7 +70,7 @@ class AttentionBias(ABC):
     def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
         """Write `value` into `out_nM`."""
         kernels = self._kernels(queries_nF)
-        if kernels is not None:
+        if kernels is not None:  # one pass in registers, without (n, M, 3) tensors
             return _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
         for part_nF, out in zip(*_parts(queries_nF, out_nM), strict=True):
             out.copy_(self.value(part_nF, tokens_GM))
@@ -84,6 +84,7 @@ class AttentionBias(ABC):
         None for `self.queries` or `self.tokens` that require none; one of the two does.
         """
         of_queries, of_tokens = self.queries.requires_grad, self.tokens.requires_grad
+        # Kernels give no gradient of tokens: rays are data, unless poses are optimised.
         kernels = None if of_tokens else self._kernels(queries_nF)
         if kernels is not None:
             out_nF = torch.empty_like(queries_nF)
@@ -91,7 +92,7 @@ class AttentionBias(ABC):
             return out_nF, None
         found: list[tuple[Tensor, ...]] = []
         for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
-            with torch.enable_grad():
+            with torch.enable_grad():  # a backward pass runs without
                 leaves = part_nF.detach(), tokens_GM.detach()
                 leaves = leaves[0].requires_grad_(of_queries), leaves[1].requires_grad_(of_tokens)
                 value_nM = self.value(*leaves)
@@ -192,7 +193,7 @@ class _Dense(torch.autograd.Function):
         out_BNM = queries.new_empty(*queries.shape[:2], tokens.shape[2])
         for scene, rows, _ in bias.blocks(0, out_BNM.dtype):
             bias.write(queries[scene, rows], tokens[scene], out_BNM[scene, rows])
-        ctx.save_for_backward(queries, tokens)
+        ctx.save_for_backward(queries, tokens)  # not the bias, which is made again
         ctx.bias = bias
         return out_BNM
 
@@ -232,7 +233,7 @@ class _BiasedAttention(torch.autograd.Function):
     def forward(
         ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, bias: Any
     ) -> Tensor:
-        exact = torch.promote_types(q.dtype, torch.float32)
+        exact = torch.promote_types(q.dtype, torch.float32)  # a log-sum-exp in bfloat16 is no sum
         out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=exact)
         # `_attend` makes the logits of all heads at once, but for the fused kernel of a CPU.
         heads = 0 if q.device.type == "cpu" else q.shape[1]
@@ -300,11 +301,12 @@ def _attention_gradients(
     scale = q.shape[-1] ** -0.5
     dq, dk, dv = (torch.zeros_like(x) if needs[n] else None for n, x in enumerate(saved[:3]))
     of_bias = _BiasGradients(queries, tokens, bias)
-    q, rowsum = q * scale, (gradient * out).sum(-1)
+    q, rowsum = q * scale, (gradient * out).sum(-1)  # rowsum is that of P * dP, without either
     for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
         bias.write(queries[scene, rows], tokens[scene], b)
         for head in range(q.shape[1]):
             of_queries, of_tokens = (scene, head, rows), (scene, head)
+            # p = exp(q k + b - lse), each step into memory that is there already
             torch.sub(b, lse[of_queries][:, None], out=p)
             p.addmm_(q[of_queries], k[of_tokens].mT).exp_()
             if dv is not None:

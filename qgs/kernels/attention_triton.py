@@ -65,7 +65,7 @@ def _forward(
     WIDTH: tl.constexpr,
 ):  # fmt: skip
     """The result, and the log-sum-exp of each query (B, h, N)."""
-    each = tl.program_id(1).to(tl.int64)
+    each = tl.program_id(1).to(tl.int64)  # offsets exceed 2^31 for large batches
     scene, head = each // heads, each % heads
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
     of_q = _load(q, scene, head, n, N, width, WIDTH)
@@ -79,6 +79,7 @@ def _forward(
         of_v = _load(v, scene, head, m, M, width, WIDTH)
         tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
         logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        # The running maximum keeps exp in range; sums so far shrink by how much it rose.
         above = tl.maximum(greatest, tl.max(logits, 1))
         p = tl.exp(logits - above[:, None])
         shrunk = tl.exp(greatest - above)
@@ -186,6 +187,7 @@ class TritonAttention(torch.autograd.Function):
             _launch(_backward_queries, *given, dq, by_head, VALUE=value, GRADIENTS=of_bias)
         if dk is not None or dv is not None:
             _launch(_backward_tokens, *given, dk, dv, VALUE=value)
+        # By head first: adding in the kernel would need atomics, whose order changes the bits.
         summed = None if by_head is None else by_head.unflatten(0, q.shape[:2]).sum(1)
         return dq, dk, dv, summed, None, None
 

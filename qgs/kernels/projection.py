@@ -135,6 +135,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
             out = splats[v, g]
             out[6] = _ZERO
             out[7] = _ZERO
+            # Written so that NaN is dropped too.
             if not (opacity >= alpha_min and z >= near and z <= far):
                 out[5] = _ONE
                 continue
@@ -146,6 +147,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
             row_y = _image_factor(turned, 1, held_y, fy, z)
             xx, xy, yy = _dot(row_x, row_x), _dot(row_x, row_y), _dot(row_y, row_y)
             minors = _cross(row_x, row_y)
+            # Cauchy-Binet: unlike xx * yy - xy^2 this does not cancel for needles.
             determinant = _dot(minors, minors) + dilation * (xx + yy) + dilation * dilation
             out[0] = cx + fx * x
             out[1] = cy + fy * y

@@ -92,6 +92,7 @@ def _touching_rows(order, splats, top, bottom, out):
         g = order[i]
         v, ey = splats[g, 1], splats[g, 7]
         out[n] = g
+        # no branch: where splats are cut off follows no pattern that a processor could guess
         n += 1 if v + ey > top and v - ey < bottom else 0
     return n
 
@@ -184,7 +185,7 @@ def forward_unit(splats, opacities, colors, tile_rows, options, sums):
                 first, last = _row_span(v, splats[g, 7], np.float32(y0))
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
-                lean, lowest = -xy / xx, splats[g, 8]
+                lean, lowest = -xy / xx, splats[g, 8]  # the peak of a row moves by lean dy
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue

@@ -106,7 +106,7 @@ def view_visibility(
     with the views. Values and gradients are finite if `clamp` is set whenever `behind` is.
     """
     options = (behind, z_guard, infinite_pixel)
-    with torch.no_grad():
+    with torch.no_grad():  # find the nearest view first, so that only its graph is kept
         views = [cameras[:, view, None] for view in range(cameras.shape[1])]
         excess = torch.stack([_image_excess(points, view, *options) for view in views], 1)
         nearest = excess.argmin(1)
@@ -131,6 +131,7 @@ def _image_excess(
     xy, z = camera_points[..., :2], camera_points[..., 2:]
     if z_guard is not None:
         z = torch.where(z.abs() < z_guard, z_guard, z)
+    # Divide by 1 there and put the value in after: where() alone would pass on NaN gradients.
     at_zero = z.abs() < _TINY_Z
     focal, principal = cameras.intrinsics[..., :2], cameras.intrinsics[..., 2:]
     pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal

@@ -50,7 +50,7 @@ class CpuRenderer(Renderer):
                 "them with .to('cpu') or choose `renderer: {type: qgs/auto}`"
             )
         config = self.config
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast("cpu", enabled=False):  # half precision has no digits for pixels
             gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, config.background, gaussians.means)
             sums = self._sums(gaussians, colors_of(gaussians, cameras), cameras)
@@ -107,6 +107,7 @@ class _Splat(torch.autograd.Function):
             kernels.forward_unit(rows[image], *scene, stripe, blending, out[image])
 
         stripes = _image_units(batch, views, size[0])
+        # First all projections: every stripe of an image sorts all of its splats.
         in_threads(project, _scene_units(batch, count))
         in_threads(blend, stripes)
         ctx.save_for_backward(*tensors, splats, sums)
@@ -125,10 +126,12 @@ class _Splat(torch.autograd.Function):
         stripes, units = _image_units(batch, views, size[0]), _scene_units(batch, count)
         parts = 1 + max((part for *_, part in stripes), default=0)
         chunks = 1 + max((part for *_, part in units), default=0)
+        # Each stripe adds up gradients of its own, in a fixed order whatever the threads.
         grads = saved[0].new_zeros((batch, views, parts, count, kernels.GRADIENTS)).numpy()
         given = slopes[0].contiguous().numpy()
         of_inputs = [torch.empty_like(tensor) for tensor in (*saved[:4], saved[0])]
         of_means, of_scales, of_quats, of_opacities, of_colors = _arrays(*of_inputs)
+        # In float64: thousands of splats of either sign nearly cancel in a camera's gradient.
         of_cameras = torch.zeros((batch, chunks, views, CAMERA_GRADIENTS), dtype=torch.float64)
         camera_parts, wants_cameras = of_cameras.numpy(), any(ctx.needs_input_grad[5:7])
         projection, blending = _limits(ctx.config)

@@ -41,7 +41,7 @@ class GsplatRenderer(Renderer):
         """See `Renderer`; ValueError for tensors not on CUDA, RuntimeError without gsplat."""
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
-        rasterization = import_module("gsplat").rasterization
+        rasterization = import_module("gsplat").rasterization  # imported late: it needs CUDA
 
         config = self.config
         with torch.autocast("cuda", enabled=False):

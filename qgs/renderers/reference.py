@@ -50,12 +50,14 @@ def project(
     position = w2c[..., :3, :3] @ gaussians.means.transpose(-1, -2)[:, None] + w2c[..., :3, 3:]
     x, y, z = position.unbind(-2)  # (B, V, G) each
     in_range = (z >= near) & (z <= far)
+    # Placeholders where nothing is drawn: a NaN there would reach every gradient through 0 * NaN.
     z = torch.where(in_range, z, 1.0)
     x, y = (torch.where(in_range, value, 0.0) / z for value in (x, y))
 
     fx, fy, cx, cy = cameras.intrinsics[..., None, :].unbind(-1)  # (B, V, 1) each
     height, width = cameras.size
     means = torch.stack([torch.addcmul(cx, fx, x), torch.addcmul(cy, fy, y)], -1)
+    # Far off screen the linear Jacobian would blow a Gaussian up over the whole image.
     x, y = _clamped(x, fx, cx, width), _clamped(y, fy, cy, height)
 
     turned = w2c[..., :3, :3] @ factors.permute(0, 2, 1, 3).flatten(2)[:, None]
@@ -71,6 +73,7 @@ def project(
     conics = torch.stack([yy + dilation, -xy, xx + dilation], -1) / determinant[..., None]
     conics = torch.where(usable[..., None], conics, 0.0)
     visible = in_range & usable
+    # Without gradient: they only say how far a splat reaches.
     deviations = torch.stack([xx, yy], -1).detach().add(dilation).sqrt()
     deviations = torch.where(visible[..., None], deviations, 0.0)
     return Splats(means, conics, z, deviations, visible)
@@ -113,7 +116,7 @@ class TorchRenderer(Renderer):
 def resolve(sums: Tensor, background: Tensor, features: Tensor | None = None) -> Rendering:
     """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w, and those of features -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
-    hit = torch.where(alpha > 0, alpha, 1.0)
+    hit = torch.where(alpha > 0, alpha, 1.0)  # depth is 0, not NaN, where nothing was hit
     rgb = rgb + (1 - alpha) * background[:, None, None]
     return Rendering(rgb=rgb, alpha=alpha, depth=depth / hit, features=features)
 
@@ -131,21 +134,24 @@ def _composite(
     colors: (B, G, 3) or (B, V, G, 3).
     """
     height, width = size
-    order = splats.depths[image].argsort(stable=True)
+    order = splats.depths[image].argsort(stable=True)  # front to back; equal depths stay in order
     order = order[splats.visible[image][order]]
     means, conics, depths = (
         field[image][order] for field in (splats.means, splats.conics, splats.depths)
     )
     opacities = gaussians.opacities[image[0]][order]
+    # Pixel centres are at .5: (0, 0) is the corner of the image.
     u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
     v = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
     dx, dy = u - means[:, None, :1], v[:, None] - means[:, 1:, None]  # (G, 1, W), (G, H, 1)
     xx, xy, yy = conics[..., None, None].unbind(1)
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
     alphas = opacities[:, None, None] * power.clamp(max=0).exp()
+    # alpha_min: less changes no 8-bit image. The cap: gradients divide by 1 - alpha.
     alphas = torch.where(alphas >= config.alpha_min, alphas.clamp(max=config.alpha_cap), 0.0)
     after = torch.cumprod(1 - alphas, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(order)]
+    # `after`, not `before`: a Gaussian that would close the pixel is left out, as in gsplat.
     weights = torch.where(after > config.transmittance_min, alphas * before, 0.0)
     colors, z = colors[image[: colors.ndim - 2]][order], depths[:, None]
     summed = [colors, z, torch.ones_like(z)]
