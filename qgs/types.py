@@ -92,11 +92,9 @@ def _described(item: Any) -> str:
         unusual += [str(item.device)] * (item.device.type != "cpu")
         return " ".join([str(tuple(item.shape)), *unusual])
     if isinstance(item, Mapping):  # of containers the name alone: their own lines would be many
-        names = (
-            type(x).__name__ if isinstance(x, TensorContainer) else _described(x)
-            for x in item.values()
-        )
-        return f"{{{', '.join(f'{key}: {name}' for key, name in zip(item, names, strict=True))}}}"
+        named = isinstance(next(iter(item.values()), None), TensorContainer)
+        parts = (f"{k}: {type(x).__name__ if named else _described(x)}" for k, x in item.items())
+        return f"{{{', '.join(parts)}}}"
     return repr(item)
 
 

@@ -2,8 +2,7 @@
 
 from qgs.losses.depth import DepthSurface
 from qgs.losses.lpips import LpipsLoss
-from qgs.losses.means import mean_of_gaussians
-from qgs.losses.opacity import Mask, Opacity
+from qgs.losses.opacity import Mask, Opacity, mean_of_gaussians
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import Visibility, VisibilityOptions, view_visibility
 

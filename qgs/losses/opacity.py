@@ -5,7 +5,6 @@ from torch import Tensor
 
 from qgs.contracts import Loss
 from qgs.geometry.precision import at_least_float32
-from qgs.losses.means import mean_of_gaussians
 from qgs.losses.photometric import mean_squared_error
 from qgs.types import LayerPrediction, Rendering, Views
 
@@ -53,3 +52,12 @@ class Mask(Loss):
                 "choose data with masks, or take the loss out of the recipe"
             )
         return mean_squared_error(rendering.alpha, target.masks)
+
+
+def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
+    """Values (B, G), averaged over the Gaussians of queries that exist, then over scenes; 0-d."""
+    values, mask = at_least_float32(values), prediction.state.mask
+    if mask is None:
+        return values.mean()
+    there = mask.repeat_interleave(values.shape[1] // mask.shape[1], 1)
+    return ((values * there).sum(1) / there.sum(1).clamp_min(1)).mean()

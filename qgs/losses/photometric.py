@@ -80,8 +80,9 @@ class Photometric(Loss):
             yield from too_small(context, WINDOW, "padding", "SSIM of whole windows")
 
     def weights(self) -> tuple[float, float, float]:
-        """Of MSE, L1 and SSIM."""
-        return self.config.mse_weight, self.config.l1_weight, self.config.ssim_weight
+        """Of MSE, L1 and SSIM in the objective."""
+        c = self.config
+        return c.weight * c.mse_weight, c.weight * c.l1_weight, c.weight * c.ssim_weight
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
@@ -91,7 +92,7 @@ class Photometric(Loss):
         if self.config.mse_weight:
             terms["mse"] = self.config.mse_weight * mean_squared_error(rendering.rgb, target.images)
         if self.config.l1_weight:
-            terms["l1"] = self.config.l1_weight * mean_absolute_error(rendering.rgb, target.images)
+            terms["l1"] = self.config.l1_weight * F.l1_loss(rendering.rgb, target.images)
         if self.config.ssim_weight:
             similarity = mean_ssim(rendering.rgb, target.images, self.config.padding)
             terms["ssim"] = self.config.ssim_weight * (1 - similarity) / 2
@@ -110,9 +111,3 @@ def too_small(context: RecipeContext, side: int, option: str, measure: str) -> I
 def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
     """Mean over everything of (images - truth)^2."""
     return F.mse_loss(images, truth)
-
-
-@full_precision
-def mean_absolute_error(images: Tensor, truth: Tensor) -> Tensor:
-    """Mean over everything of |images - truth|."""
-    return F.l1_loss(images, truth)
