@@ -6,7 +6,7 @@ trace.layers[4].cross_attention.weights         # (B, h, Q, M)
 """
 
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -41,10 +41,6 @@ class Trace:
     grid: tuple[int, int, int] | None = None
     layers: dict[int, LayerTrace] = field(default_factory=dict)
 
-    def choose(self, queries: Sequence[int] | None, count: int) -> None:
-        """Record `queries` of `count`, all for None; raises ValueError for ones there are not."""
-        self.queries = torch.tensor(_checked(queries, range(count), "queries"), dtype=torch.long)
-
 
 @contextmanager
 def trace(
@@ -54,28 +50,26 @@ def trace(
 ) -> Iterator[Trace]:
     """Record states and attention weights of `queries` in `layers` (numbers; None: all of them).
 
-    Works through forward hooks that are removed on leaving, errors included, and through the
-    contracts' `explain`; nothing is recorded with gradients.
+    It uses forward hooks, removed at the end, and the contracts' `explain`; without gradients.
     Raises ValueError for layers or queries that do not exist.
     """
     layers = _checked(layers, range(1, model.depth + 1), "layers")
-    record, count = Trace(torch.tensor([], dtype=torch.long)), model.queries.count
-    if count is not None:
-        record.choose(queries, count)
-    with ExitStack() as hooks:
-        for handle in _Recorder(record, layers, queries).hook_into(model):
-            hooks.callback(handle.remove)
+    if model.queries.count is not None:
+        _checked(queries, range(model.queries.count), "queries")
+    record = Trace(torch.tensor([], dtype=torch.long))
+    handles = [*_Recorder(record, layers, queries).hook_into(model)]
+    try:
         yield record
+    finally:
+        for handle in handles:
+            handle.remove()
 
 
 def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list[int]:
     wanted = existing if wanted is None else wanted
-    unknown = [number for number in wanted if number not in existing]
-    if unknown:
-        raise ValueError(
-            f"{what} {unknown} do not exist; this model has {what} "
-            f"{existing.start}..{existing.stop - 1}"
-        )
+    if unknown := [number for number in wanted if number not in existing]:
+        last = existing.stop - 1
+        raise ValueError(f"{what} {unknown} do not exist; there are {existing.start}..{last}")
     return list(wanted)
 
 
@@ -88,7 +82,7 @@ class _Recorder:
         self.record, self.layers, self.queries, self.current = record, layers, queries, 0
 
     def hook_into(self, model: QueryGaussianModel) -> Iterator[RemovableHandle]:
-        """Register the hooks, each when asked for the next one."""
+        """Register the hooks."""
         yield model.register_forward_pre_hook(self._start)
         for number, layer in enumerate(model.decoder, start=1):
             yield layer.register_forward_pre_hook(partial(self._enter, number))
@@ -109,7 +103,8 @@ class _Recorder:
         self.current = number
         self.record.grid = memory.grid
         if number == 1:
-            self.record.choose(self.queries, state.features.shape[1])
+            chosen = _checked(self.queries, range(state.features.shape[1]), "queries")
+            self.record.queries = torch.tensor(chosen, dtype=torch.long)
         if number in self.layers:
             kind = type(module).__name__
             lacking = [part for part in ATTENTIONS if not hasattr(module, part)]
@@ -122,7 +117,7 @@ class _Recorder:
         weights = module.explain(*args, self.record.queries.to(args[0].features.device))
         setattr(layer, part, weights)
         if weights is None:
-            layer.absent[part] = f"{type(module).__name__}.explain tells nothing (returned None)"
+            layer.absent[part] = f"{type(module).__name__}.explain returned None"
 
     def _leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
         if self.current in self.layers:

@@ -226,12 +226,3 @@ def test_a_loaded_model_checks_the_first_views_that_it_reconstructs(loaded, capl
         caplog.clear()
         loaded()(Views(images, Cameras(c2w, own.cameras.intrinsics, own.cameras.size)))
         assert words in caplog.text
-
-
-def test_a_run_folder_is_loaded(tmp_path):
-    (tmp_path / "run").mkdir()
-    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*run/checkpoint\.safetensors"):
-        qgs.load(tmp_path / "run")
-    qgs.save(qgs.compose(RECIPE), tmp_path / "run/checkpoint.safetensors")
-    assert qgs.load(tmp_path / "run").recipe == qgs.compose(RECIPE).recipe
-    assert load_ply is qgs.load_ply

@@ -15,7 +15,6 @@ from PIL import Image
 import qgs
 from qgs.composer import resolve
 from qgs.data.domain import KEY, trained_domain
-from qgs.data.evaluation import EvaluationPlan
 
 FRAMING = "(20% is cut off)"
 NEAREST = "result is worse than the nearest photo, copied: PSNR "
@@ -74,26 +73,6 @@ def test_an_evaluation_says_what_it_judged_and_what_came_of_it(checkpoint: Path)
     assert row["input_frames"].split("; ")[0] == "0 6"
     assert row["input_names"].split("; ")[0] == "images/IMG_1.png, images/IMG_7.png"
     assert row["target_names"].split("; ")[0] == "images/IMG_2.png, images/IMG_5.png"
-
-
-def test_samples_where_none_are_drawn_are_said_to_change_nothing(
-    checkpoint: Path, tmp_path: Path
-) -> None:
-    index = tmp_path / "index.json"
-    index.write_text(json.dumps({only_scene(checkpoint): {"context": [0], "target": [1]}}))
-    more = ("--set", "evaluation.samples=8", "--out", tmp_path / "a")
-    told = "evaluation.samples=8 changed nothing, since no views were drawn: "
-    held_out = f"{told}3 of 3 held-out frames are judged, each once"
-    assert held_out in evaluated(checkpoint, *more).output
-    assert (
-        f"{told}the index names the views" in evaluated(checkpoint, *more, "--index", index).output
-    )
-
-
-def only_scene(checkpoint: Path) -> str:
-    """The name of the only scene."""
-    recipe = qgs.io.checkpoint.CheckpointFile(checkpoint).recipe
-    return EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation).wanted[0]
 
 
 def test_a_reconstruction_says_the_same(checkpoint: Path, photos: Path, tmp_path: Path) -> None:

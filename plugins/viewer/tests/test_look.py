@@ -4,9 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from qgs_viewer.choice import FAINT, Choice, anchor_colors, faded, ink, painted, query_color
+from qgs_viewer.choice import FAINT, Choice, faded, ink, painted, query_color
 from qgs_viewer.look import NEUTRAL, look_inside
-from qgs_viewer.panel import told
 from qgs_viewer.pictures import attention_parts
 from small import KINDS, QUERIES, SIDE, model_of, source_of
 
@@ -139,22 +138,3 @@ def test_what_pales_goes_towards_the_background() -> None:
     ]
     assert ink(look) == INK
     assert min(ink(replace(look, background=(0.1, 0.1, 0.1)))) > 200
-
-
-def test_colours_tell_queries_apart() -> None:
-    assert len({query_color(query) for query in range(1024)}) > 900
-    numbers, _ = anchor_colors(source_of("locus").look((1, 4)), Choice(query=4, others="hidden"))
-    assert numbers.tolist() == [4]
-
-
-def test_words_on_a_query() -> None:
-    ball, ellipsoid = (source_of(k).look((1, 4)) for k in ("locus", "ellipsoid"))
-    assert "radius" in told(ball, 2, 1)
-    assert "moved by" in told(ball, 2, 1)
-    assert "moved by" not in told(ball, 2, 0)
-    support = ellipsoid.support(1)
-    assert support is not None
-    lengths = support.axes[0, 2].norm(dim=0)
-    if lengths.max() > 1.001 * lengths.min():
-        assert "semi-axes" in told(ellipsoid, 2, 1)
-    assert "anchor" not in told(source_of("tokengs").look((1, 4)), 2, 1)

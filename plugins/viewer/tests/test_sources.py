@@ -50,7 +50,7 @@ def finished_by_distance(folder: Path, views: ViewsConfig) -> QueryGaussianModel
 def test_a_finished_reconstruction_has_its_queries(finished: Path) -> None:
     source = open_source(str(finished / "scene"), Wanted())
     assert isinstance(source, ModelSource)
-    assert (list(source.frames), source.notes) == ([0, 1], ())
+    assert (list(source.frames), [*source.notes]) == ([0, 1], [])
     assert list(source.labels) == [f"photos/0{frame}.png" for frame in (1, 4, 2, 3)]
     look, ply = source.look(source.frames), load_ply(finished / "scene/gaussians.ply")
     assert look.support(1) is not None
@@ -71,7 +71,7 @@ def changed_copy(finished: Path, tmp_path: Path, **record: object) -> Path:
 @pytest.mark.parametrize(
     ("record", "said"),
     [
-        ({"model": ""}, "does not tell its model"),
+        ({"model": ""}, "no model"),
         ({"tuning": {"steps": 3}}, "It was tuned on its photos"),
         ({"refinement": {"steps": 3}}, "It was refined"),
         ({"tuning": {"steps": 3}, "refinement": {"steps": 3}}, "It was refined"),
@@ -92,13 +92,13 @@ def test_without_its_model_it_is_shown_as_it_is(
 
 def test_prediction_and_refined_scene_name_each_other(finished: Path, tmp_path: Path) -> None:
     folder = changed_copy(finished, tmp_path)
-    assert open_source(str(folder), Wanted()).notes == ()
+    assert not open_source(str(folder), Wanted()).notes
     changed_copy(finished, folder, refinement={"steps": 3}).rename(folder / "refined")
     predicted = open_source(str(folder), Wanted())
     assert isinstance(predicted, ModelSource)
     assert f"refined on photos: `qgs view {folder / 'refined'}`" in predicted.notes[0]
     refined = open_source(str(folder / "refined"), Wanted())
-    assert refined.notes[0].endswith(f"with its queries: `qgs view {folder}`.")
+    assert f"`qgs view {folder.resolve()}`" in refined.notes[0]
 
 
 def test_a_reconstruction_keeps_its_background(finished: Path, tmp_path: Path) -> None:

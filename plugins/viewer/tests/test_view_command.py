@@ -52,14 +52,6 @@ def test_it_opens_the_browser_unless_told_not_to(ply: Path, opened: list[str]) -
     assert len(opened) == 1
 
 
-def test_other_machines_are_told_the_address(ply: Path, opened: list[str], monkeypatch) -> None:
-    monkeypatch.setattr("qgs_viewer.commands._own_address", lambda: "192.0.2.7")
-    told, error = view(str(ply), "--port", "0", "--host", "0.0.0.0")
-    assert error is None
-    assert opened[0].startswith("http://localhost:")
-    assert f"http://192.0.2.7:{opened[0].rpartition(':')[2]}" in told
-
-
 def test_a_page_shows_the_query_that_was_asked_for(opened: list[str], tmp_path: Path) -> None:
     qgs.save(model_of("locus"), tmp_path / "model.safetensors")
     source = str(tmp_path / "model.safetensors")

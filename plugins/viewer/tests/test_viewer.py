@@ -221,15 +221,6 @@ def test_read_patches_stand_before_their_photos(server, panel) -> None:
     assert server.scene.get_handle_by_name("/patches") is None
 
 
-def test_controls_say_what_was_chosen(server, panel) -> None:
-    panel.colors.value = "by query"
-    assert panel.choice.by_query
-    panel.photos.value = False
-    assert server.scene.get_handle_by_name("/views").visible is False
-    panel.anchors.value = False
-    assert "/anchors" not in nodes(server)
-
-
 def test_a_page_is_small_and_asks_for_nothing() -> None:
     from qgs_viewer.choice import Choice
     from qgs_viewer.page import scene_html

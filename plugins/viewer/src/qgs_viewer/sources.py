@@ -21,6 +21,7 @@ from qgs.io.checkpoint import CheckpointFile
 from qgs.io.gaussians import load_ply
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
+from qgs.wording import listed
 from qgs_viewer.files import CAMERAS, PLY, REFINED, Finished, read_finished
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.placement import Placement
@@ -113,9 +114,6 @@ class Wanted:
     device: str = "cpu"
 
 
-_OPTIONS = {"photos": "PHOTOS", "overrides": "--set"}
-
-
 def open_source(name: str, wanted: Wanted) -> Source:
     """What `name` stands for: a PLY, a reconstruction's folder, a run folder or a model.
 
@@ -126,12 +124,8 @@ def open_source(name: str, wanted: Wanted) -> Source:
     if not finished and path.suffix.lower() != ".ply":
         return _of_model(name, wanted)
     if given := [field for field, value in vars(replace(wanted, device="")).items() if value]:
-        what = "what `qgs reconstruct` wrote" if finished else "a PLY file"
-        options = ", ".join(f"`{_OPTIONS.get(field, f'--{field}')}`" for field in given)
-        does, them = ("does", "it") if len(given) == 1 else ("do", "them")
         raise ValueError(
-            f"{options} {does} not apply to {what}, {name}: leave {them} out, or name the model "
-            "instead"
+            f"{listed(given)}: only for a model, and {name} holds Gaussians; leave that out"
         )
     return _of_finished(path, wanted.device) if finished else _of_ply(path)
 
@@ -147,7 +141,9 @@ def _of_finished(folder: Path, device: str) -> Source:
     views = views_in((torch.eye(4).double(), torch.ones(())), found.scene, tuple(found.inputs))
     labels = [found.scene.label(frame) for frame in found.inputs]
     plain = Look(found.gaussians, views, labels, tuple(found.inputs), background=found.background)
-    beside = _refined_beside(folder)
+    refined = folder / REFINED
+    there = (refined / CAMERAS).is_file()
+    beside = [f"refined on photos: `qgs view {refined}`."] if there else []
     if note := _no_queries(found, folder):
         return FixedSource(plain, title, (note, *beside))
     try:
@@ -160,42 +156,24 @@ def _of_finished(folder: Path, device: str) -> Source:
         note = f"Its model cannot be used, so its queries are not shown: {error}"
         return FixedSource(plain, title, (note, *beside))
     if differs := _difference(means, found.gaussians.means):
-        note = (
-            f"{found.model} makes other Gaussians of these photos today ({differs}), so its "
-            "queries are not shown."
-        )
+        note = f"{found.model} makes other Gaussians today ({differs}): its queries are not shown."
         return FixedSource(plain, title, (note, *beside))
     return source
 
 
 def _no_queries(found: Finished, folder: Path) -> str:
-    """Why queries of a reconstruction are not looked for; "" where they are."""
+    """Why the queries of a reconstruction are not shown; "" where they are."""
     if found.changed == "refined":
-        parent = folder.resolve().parent
-        text = "It was refined: its Gaussians are no longer those of queries."
-        if folder.resolve().name == REFINED and (parent / CAMERAS).is_file():
-            shown = folder.parent if folder.name == REFINED else parent
-            text += f" What the model predicted, with its queries: `qgs view {shown}`."
-        return text
+        beside = folder.resolve().parent if folder.resolve().name == REFINED else None
+        where = f": `qgs view {beside}`" if beside and (beside / CAMERAS).is_file() else ""
+        return f"It was refined; only the prediction of the model has queries{where}."
     if found.changed == "tuned":
-        text = "It was tuned on its photos: its model alone does not make these Gaussians, so its"
-        return f"{text} queries are not shown."
+        return "It was tuned on its photos, so its model alone does not make these Gaussians."
     if not found.model:
-        return "Its cameras.json does not tell its model, so its queries are not known."
-    if "://" in found.model:
-        return (
-            f"Its model is at {found.model}, which is fetched only where you name it, so its "
-            f"queries are not shown: view the model with `qgs view {found.model} PHOTOS`."
-        )
+        return "Its cameras.json names no model, so its queries are not known."
+    if "://" in found.model:  # nothing is fetched because a file says so
+        return f"Its queries are not shown; to fetch the model: `qgs view {found.model} PHOTOS`."
     return ""
-
-
-def _refined_beside(folder: Path) -> tuple[str, ...]:
-    """A note where `qgs reconstruct --refine` left a refined scene in `folder` too."""
-    refined = folder / REFINED
-    if not (refined / CAMERAS).is_file():
-        return ()
-    return (f"This is what the model predicted; refined on photos: `qgs view {refined}`.",)
 
 
 def _finished_views(found: Finished, views: ViewsConfig) -> ViewsConfig:
