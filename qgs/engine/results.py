@@ -27,8 +27,6 @@ TUNING = ("tuning_loss_before", "tuning_loss_after")
 FRAME_COLUMNS = ("scene", "input_frames", "target_frames")
 NAME_COLUMNS = ("input_names", "target_names")
 """Columns of scenes.csv before the values, the second if frames have names; `problem` is last."""
-_MOST_MISSING = 10
-"""How many missing scenes the notes give the reason of."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
@@ -139,14 +137,13 @@ class Evaluation:
         folder = Path(folder)
         write_text(folder / "scenes.csv", self._csv())
         write_text(folder / "summary.json", as_json(self.summary()))
-        tables = [markdown_table(rows) for rows in (self._rows(), self._rows_over_scenes())]
-        write_text(folder / "table.md", "\n\n".join([*tables, bullets(self._notes())]) + "\n")
+        table = f"{markdown_table(self._rows())}\n\n{bullets(self._notes())}\n"
+        write_text(folder / "table.md", table)
         write_text(folder / "protocol.json", self.protocol.canonical)
 
     def show(self, console: Console) -> None:
-        """Print the tables that a person compares by, and what is to be known beside them."""
+        """Print the table and the notes of table.md."""
         print_table(console, str(self.protocol), self._rows())
-        print_table(console, "", self._rows_over_scenes())
         print_lines(console, self._notes())
 
     def _values(self, name: str) -> list[float]:
@@ -164,19 +161,20 @@ class Evaluation:
         return {**settings, "loss_before": before, "loss_after": after}
 
     def _rows(self) -> list[list[str]]:
+        """Means of all methods, then the model's variance and median over scenes."""
+        judged = self._of_wanted(len(self.scores))
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
-            rows.append([method.replace("_", " "), *cells, self._of_wanted(len(self.scores))])
-        return rows
-
-    def _rows_over_scenes(self) -> list[list[str]]:
-        rows = [["over scenes", "mean", "variance", "median", "scenes"]]
-        for name, found in self.summary()["over_scenes"].items():
-            column = self.columns[name]
-            cells = [f"{found[k]:.{column.digits + 1}f}" for k in ("mean", "variance", "median")]
-            unit = f", {column.unit}" if column.unit else ""
-            rows.append([f"{column.heading}{unit}", *cells, self._of_wanted(found["scenes"])])
+            rows.append([method.replace("_", " "), *cells, judged])
+        found = {name: self._values(f"model_{name}") for name in self.columns}
+        for kind in ("variance", "median"):
+            cells = [column.shown(None) for column in self.columns.values()]
+            for place, (name, values) in enumerate(found.items()):
+                if values:
+                    digits = self.columns[name].digits + (kind == "variance")
+                    cells[place] = f"{spread(values)[kind]:.{digits}f}"
+            rows.append([f"model, {kind}", *cells, judged])
         return rows
 
     def _csv(self) -> str:
@@ -211,9 +209,9 @@ class Evaluation:
             f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
             f"{poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         )
-        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:_MOST_MISSING])
-        if len(self.missing) > _MOST_MISSING:
-            yield f"{len(self.missing) - _MOST_MISSING} more missing scenes are in scenes.csv"
+        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
+        if more := self.missing[10:]:
+            yield f"{len(more)} more missing scenes are in scenes.csv"
         if null := self.null:
             yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
         if names := self.unlisted:
@@ -240,8 +238,7 @@ class Evaluation:
         )
         if tuning := self._tuning():
             yield (
-                f"{tuning['what']} tuned on the input views: {tuning['steps']} "
-                "steps of Adam at "
+                f"{tuning['what']} tuned on the input views: {tuning['steps']} steps of Adam at "
                 f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
                 f"{tuning['loss_after']:.4f}"
             )

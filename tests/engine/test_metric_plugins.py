@@ -9,8 +9,6 @@ from typing import ClassVar, TypeAlias
 
 import pytest
 import torch
-from qgs_viewer.contest import Entry, report_of, table_of
-from qgs_viewer.report import Contender
 from rich.console import Console
 from torch import Tensor
 from training_runs import Tiny
@@ -140,19 +138,6 @@ def test_training_records_and_tracks_it(judged: Judged, tmp_path: Path) -> None:
     assert told["evaluation/raw/error"] == record["scores"]["error"]
 
 
-def test_contests_and_their_report_show_it(judged: Judged) -> None:
-    recipe, evaluation = judged
-    scores = evaluation.means()
-    contender = Contender("one", recipe.build_model(), scores, 96, 1000, "recipe: 1")
-    entry = Entry(recipe, contender, evaluation)
-    table = shown(table_of([entry]))
-    assert "MAE ↓" in table
-    assert table.count(f"{scores['error']:.5f}") == 1
-    report = report_of([entry], "lede", {})
-    assert report.columns["error"].heading == "MAE"
-    assert report.contenders[0].scores["error"] == scores["error"]
-
-
 def test_what_a_metric_needs(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = mine("metrics={depth: {type: mine/depth}, mask: {type: mine/masked}}")
     source = recipe.build_data()
@@ -174,16 +159,6 @@ def test_what_a_metric_needs(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> Non
     assert set(evaluation.incomplete) == {"mask_mean"}
     told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
     assert told in shown(evaluation)
-
-
-def test_a_scene_without_what_the_only_metric_needs_still_has_a_row(
-    mine: Tiny, tmp_path: Path
-) -> None:
-    drop = "psnr: null, ssim: null, dispersion: null"
-    recipe = mine(f"metrics={{{drop}, mask: {{type: mine/masked}}}}")
-    evaluation = evaluate(recipe.build_model(), recipe)
-    assert evaluation.statement == "over 2 scenes"
-    assert "masked is empty: it needs masks, not known for 2 of 2 scenes" in shown(evaluation)
 
 
 def test_two_values_of_one_name_are_refused(mine: Tiny) -> None:
