@@ -64,17 +64,20 @@ def study(
     runs: Annotated[
         int | None, typer.Option(min=1, help="Most runs that this call makes; default: all.")
     ] = None,
+    only: Annotated[
+        int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
+    ] = None,
     slurm: Annotated[
         bool,
-        typer.Option("--slurm", help="Write OUT/slurm.sh, an array of workers; train nothing."),
+        typer.Option("--slurm", help="Write OUT/slurm.sh, an array of runs; train nothing."),
     ] = False,
     device: Device = "auto",
 ) -> None:
     """Train every variant with every seed, judge them alike, and answer: better, and how sure?
 
     It is checked as a whole before anything trains. Give the same command
-    again, or on other machines that see OUT, at any time: each run is
-    trained once, whatever was killed goes on, only what is missing runs.
+    again at any time: each run is trained once, a killed one continues,
+    and only missing ones run. --slurm writes an array for a cluster.
     OUT/study.html has the answer, OUT/table.* the numbers.
 
     A variant is `base` with or without changes, or a recipe file of its own.
@@ -121,35 +124,24 @@ def study(
     if slurm:
         from qgs_studies.slurm import write_script
 
-        script = write_script(plan, file, len(missing) - len(plan.ended), threads or 1, device)
+        script = write_script(plan, file, threads or 1, device)
         console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
         return
     stopped, failed = None, 0
     if workers and missing:
-        stopped, failed = _work(plan, workers, threads, device, runs, console)
+        from qgs.threads import usable_cores
+        from qgs_studies.queue import Queue
+
+        threads = threads or max(usable_cores() // workers, 1)
+        chosen = plan.runs if only is None else [plan.runs[only]]
+        queue = Queue(plan, workers, threads, device, console, runs, _gpus(device), chosen)
+        stopped, failed = queue.work(), len(queue.failures)
     _report(plan, console)
     if stopped:
         console.print(f"stopped by {stopped}; the same command goes on", highlight=False)
         raise typer.Exit(128 + signal.Signals[stopped])
     if failed:
         raise typer.Exit(1)
-
-
-def _work(
-    plan: Plan,
-    workers: int,
-    threads: int | None,
-    device: str,
-    most: int | None,
-    console: Console,
-) -> tuple[str | None, int]:
-    """The signal that ended the queue, and how many runs failed."""
-    from qgs.threads import usable_cores
-    from qgs_studies.queue import Queue
-
-    threads = threads or max(usable_cores() // workers, 1)
-    queue = Queue(plan, workers, threads, device, console, most, _gpus(device))
-    return queue.work(), len(queue.failures)
 
 
 def _gpus(device: str) -> list[str]:

@@ -7,51 +7,36 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
-from typing import Literal, TypeAlias
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from qgs.contracts import TrainingConfig
 from qgs.engine.guard import CollapseError
 from qgs.io.files import write_text
-from qgs.wording import listed
-from qgs_studies.claims import owner
 from qgs_studies.plan import Plan, Run
-from qgs_studies.work import FAILED, TAKEN
-
-State: TypeAlias = Literal["done", "running", "elsewhere", "failed", "waiting"]
+from qgs_studies.work import FAILED, TAKEN, is_free
 
 _POLL_SECONDS = 0.3
 _SHOW_SECONDS = 2.0
-_LOOK_SECONDS = 5.0  # between two looks at runs of others
 _TAIL = 4096  # bytes of a history that hold its last record
 DEATHS = 3
-"""Processes of a run that may die one after the other before it counts as failed."""
+"""Killed processes of a run in a row, without a save between, after which the run has failed."""
 
 _PATIENCE = 120.0  # seconds that stopped runs have to save
 
 
 @dataclass
-class Progress:
-    """How far a run is. used: fraction of its budget. seconds: on its clock."""
-
-    state: State
-    used: float = 0.0
-    seconds: float = 0.0
-    step: int = 0
-
-
-@dataclass
 class Queue:
-    """Trains what is missing of `plan`; see `work`.
+    """Trains the missing ones of `runs`, all of the plan by default; see `work`.
 
     threads: of each run. most: runs that are started at most. gpus: one for each worker in turn.
+    failures: runs that failed in this call, and why.
     """
 
     plan: Plan
@@ -61,34 +46,42 @@ class Queue:
     console: Console
     most: int | None = None
     gpus: Sequence[str] = ()
+    runs: Sequence[Run] = ()
+    failures: dict[Run, str] = field(default_factory=dict)
     _processes: dict[Run, tuple[subprocess.Popen[bytes], int]] = field(default_factory=dict)
-    _failed: dict[Run, str] = field(default_factory=dict)
     _deaths: dict[Run, tuple[int, int]] = field(default_factory=dict)
     _started: int = 0
     _stopping: str | None = None
-    _looked: float = 0.0
-    _elsewhere: dict[Run, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.runs = self.runs or self.plan.runs
 
     def work(self) -> str | None:
         """Run until nothing is missing, or `most` runs were made; the signal that ended it, if any.
 
-        Waits for runs that others have, and takes over those of the dead. A run that fails is told
-        and not tried again by this call.
+        Waits for runs that another queue of this machine has, and continues them if it dies. A run
+        that fails is reported, and not tried again by this call.
         """
         before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
-        for run in self.plan.ended:
-            self._say(_not_again(run))
-        shown, told = 0.0, dict.fromkeys(filter(self.plan.done, self.plan.runs), True)
+        for run in self.runs:
+            if run.ended and not self.plan.done(run):
+                self._say(_not_again(run))
+        shown, done = 0.0, set(filter(self.plan.done, self.runs))
         live = Live(console=self.console, auto_refresh=False, transient=True)
+        terminal = self.console.is_terminal
         try:
-            with live if self.console.is_terminal else _Nothing():
-                while self._step():
-                    if self.console.is_terminal and time.monotonic() - shown > _SHOW_SECONDS:
+            with live if terminal else nullcontext():
+                waiting = True
+                while waiting:
+                    waiting = self._step()
+                    for run in self.runs:
+                        if run not in done and self.plan.done(run):
+                            done.add(run)
+                            self._say(f"{run} is done, {self._left()}")
+                    if terminal and time.monotonic() - shown > _SHOW_SECONDS:
                         shown = time.monotonic()
                         live.update(self._table(), refresh=True)
-                    self._tell_done(told)
                     time.sleep(_POLL_SECONDS)
-                self._tell_done(told)
         finally:
             for process, _ in self._processes.values():
                 process.terminate()
@@ -102,13 +95,8 @@ class Queue:
                 signal.signal(number, handler)
         return self._stopping
 
-    @property
-    def failures(self) -> Mapping[Run, str]:
-        """Runs that failed in this call, and why."""
-        return self._failed
-
     def _step(self) -> bool:
-        """Collect what has ended, start what is free; whether there is something to wait for."""
+        """Collect what has ended, start what is missing; True while there is work to wait for."""
         for run, (process, _) in [*self._processes.items()]:
             code = process.poll()
             if code is None:
@@ -120,52 +108,41 @@ class Queue:
                 self._fail(run, code)
         if self._stopping:
             return False
-        over = {*self._failed, *self.plan.ended}
-        missing = [r for r in self.plan.runs if r not in over and not self.plan.done(r)]
-        free = [run for run in missing if run not in self._processes]
-        free.sort(key=lambda run: run.failure.is_file())  # so that one cannot use up all tries
-        if time.monotonic() - self._looked > _LOOK_SECONDS:
-            self._looked = time.monotonic()
-            self._elsewhere = {run: who for run in free if (who := owner(run))}
-        for run in free:
+        over = {*self.failures, *self.plan.ended}
+        missing = [run for run in self.runs if run not in over and not self.plan.done(run)]
+        for run in sorted(missing, key=lambda run: run.failure.is_file()):  # failed ones last
             if len(self._processes) >= self.workers or self._started == self.most:
                 break
-            if run not in self._elsewhere:
+            if run not in self._processes and is_free(run):
                 self._start(run)
-        if self.most is not None:  # others are free to take what is left
-            return bool(self._processes)
-        return bool(missing)
+        return bool(missing if self.most is None else self._processes)
 
     def _start(self, run: Run) -> None:
         used = {slot for _, slot in self._processes.values()}
         slot = next(n for n in range(self.workers) if n not in used)
         threads = str(self.threads)
-        environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
-        environment |= {"MKL_NUM_THREADS": threads}
+        counts = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
+        environment = {**os.environ, **dict.fromkeys(counts, threads)}
         if self.gpus:
             environment["CUDA_VISIBLE_DEVICES"] = self.gpus[slot % len(self.gpus)]
         where = [str(self.plan.folder), run.variant, str(run.seed)]
         options = ["--threads", threads, "--device", self.device, "--parent", str(os.getpid())]
-        judged = ["--evaluations", *self.plan.study.evaluations] * bool(self.plan.study.evaluations)
-        command = [sys.executable, "-m", "qgs_studies.work", *where, *options, *judged]
+        options += ["--evaluations", *self.plan.study.evaluations]
         run.log.parent.mkdir(parents=True, exist_ok=True)
         with run.log.open("ab") as log:
             process = subprocess.Popen(
-                command,
+                [sys.executable, "-m", "qgs_studies.work", *where, *options],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
                 env=environment,
-                process_group=0,  # Ctrl-C is for the queue, which tells its runs once
+                process_group=0,  # a Ctrl-C reaches the queue alone, which stops its runs once
             )
         self._processes[run] = process, slot
         self._started += 1
 
     def _goes_on(self, run: Run, code: int) -> bool:
-        """Whether a run whose process was ended from outside is to be taken up again, and say so.
-
-        It is, unless DEATHS processes in a row died without a step that was saved.
-        """
+        """True to continue a run whose process was killed, unless DEATHS in a row saved nothing."""
         if 0 <= code <= 128:
             return False
         state = run.folder / "state.safetensors"
@@ -174,7 +151,7 @@ class Queue:
         self._deaths[run] = saved, (times + 1 if saved == before else 1)
         if self._deaths[run][1] >= DEATHS:
             return False
-        self._say(f"{run}: its process {_end(code)}; it goes on from where it was saved")
+        self._say(f"{run}: its process {_end(code)}; it continues from its last save")
         self._started -= 1
         return True
 
@@ -184,69 +161,65 @@ class Queue:
             why = run.failed
         elif code < 0 or code > 128:
             why += f" {DEATHS} times without a save between; memory may be short"
-            write_text(run.failure, f"{why}\n")  # which it could not do itself
-        self._failed[run] = why
+            write_text(run.failure, f"{why}\n")  # the killed process could not
+        self.failures[run] = why
         self._say(f"{run} failed: {why} (see {run.log})")
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self._stopping = signal.Signals(number).name
 
-    def _tell_done(self, told: dict[Run, bool]) -> None:
-        for run in self.plan.runs:
-            if run not in told and self.plan.done(run):
-                told[run] = True
-                self._say(f"{run} is done, {self._left()}")
-
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
-    def progress(self, run: Run) -> Progress:
-        """Where `run` stands."""
+    def _progress(self, run: Run) -> tuple[float, float]:
+        """Used part of the budget of `run`, and seconds on its clock."""
         step, seconds = last_record(run.folder / "history.jsonl")
         training = self.plan.recipes[run.variant].training
-        used = used_of(training, step, seconds)
-        if self.plan.done(run):
-            return Progress("done", 1.0, seconds, step)
-        state: State = "running" if run in self._processes else "waiting"
-        state = "elsewhere" if run in self._elsewhere else state
-        over = run in self._failed or run.ended
-        return Progress("failed" if over else state, used, seconds, step)
+        of_seconds = seconds / training.seconds if training.seconds else 0.0
+        return min(max(step / training.steps, of_seconds), 1.0), seconds
 
     def _left(self) -> str:
-        """How many runs are done, and about how long the others take."""
-        found = [self.progress(run) for run in self.plan.runs]
-        done = sum(p.state == "done" for p in found)
-        text = f"{done} of {len(found)} runs"
-        measured = [p for p in found if p.used > 0.02 and p.seconds]
-        active = max(sum(p.state in ("running", "elsewhere") for p in found), 1)
-        open_ = [p for p in found if p.state not in ("done", "failed")]
+        """Number of runs that are done, and about how long the others take."""
+        over = {*self.failures, *self.plan.ended}
+        open_ = [run for run in self.runs if not self.plan.done(run)]
+        text = f"{len(self.runs) - len(open_)} of {len(self.runs)} runs"
+        found = {run: self._progress(run) for run in self.runs}
+        measured = [(used, seconds) for used, seconds in found.values() if used > 0.02 and seconds]
+        open_ = [run for run in open_ if run not in over]
         if not measured or not open_:
             return text
-        whole = sum(p.seconds for p in measured) / sum(p.used for p in measured)
-        seconds = whole * sum(1 - p.used for p in open_) / min(active, len(open_))
+        whole = sum(seconds for _, seconds in measured) / sum(used for used, _ in measured)
+        at_once = min(max(len(self._processes), 1), len(open_))
+        seconds = whole * sum(1 - found[run][0] for run in open_) / at_once
         return f"{text}, about {timedelta(seconds=round(seconds))} left"
 
     def _table(self) -> Table:
-        seeds, variants = self.plan.study.settings.seeds, [*self.plan.recipes]
+        seeds = self.plan.study.settings.seeds
         table = Table(title=f"{self.plan.study.title}: {self._left()}", title_justify="left")
-        table.add_column("variant")
-        for seed in seeds:
-            table.add_column(f"seed {seed}", justify="right")
-        runs = {(run.variant, run.seed): run for run in self.plan.runs}
-        for variant in variants:
-            cells = [_cell(self.progress(runs[variant, seed])) for seed in seeds]
-            table.add_row(variant, *cells)
-        if self._elsewhere:
-            table.caption = f"elsewhere: {listed(sorted(set(self._elsewhere.values())))}"
+        for name in ("variant", *(f"seed {seed}" for seed in seeds)):
+            table.add_column(name)
+        cells = {(run.variant, run.seed): self._cell(run) for run in self.runs}
+        for variant in self.plan.recipes:
+            table.add_row(variant, *(cells.get((variant, seed), "") for seed in seeds))
         return table
+
+    def _cell(self, run: Run) -> str:
+        if self.plan.done(run):
+            return "done"
+        if run in self.failures or run.ended:
+            return "failed"
+        used = f"{self._progress(run)[0]:.0%}"
+        if run in self._processes:
+            return used
+        return f"{used}, {'waiting' if is_free(run) else 'elsewhere'}"
 
 
 def _not_again(run: Run) -> str:
-    """Why a run that ended badly is left as it is, and what would train it again."""
-    told = f"{run} is not trained again, it would end so each time: {run.failed}"
+    """Why a failed training is not repeated, and how to repeat it."""
+    why = f"{run} is not trained again, it would end so each time: {run.failed}"
     if run.failed.startswith(CollapseError.__name__):
-        return f"{told}; to train it from the start, delete {run.failure} and {run.folder}"
-    return f"{told}; when the cause is gone, delete {run.failure}: it goes on from its last save"
+        return f"{why}; to train it from the start, delete {run.failure} and {run.folder}"
+    return f"{why}; when the cause is gone, delete {run.failure}: it continues from its last save"
 
 
 def _end(code: int) -> str:
@@ -256,36 +229,14 @@ def _end(code: int) -> str:
     return f"ended with exit code {code}"
 
 
-class _Nothing:
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-def _cell(progress: Progress) -> str:
-    if progress.state in ("running", "elsewhere"):
-        return f"{progress.used:.0%}{'' if progress.state == 'running' else ' elsewhere'}"
-    resumes = progress.state == "waiting" and progress.used
-    return f"waiting at {progress.used:.0%}" if resumes else progress.state
-
-
-def used_of(training: TrainingConfig, step: int, seconds: float) -> float:
-    """Fraction of the budget that is used, as the trainer counts."""
-    of_seconds = seconds / training.seconds if training.seconds else 0.0
-    return min(max(step / training.steps, of_seconds), 1.0)
-
-
 def last_record(history: Path) -> tuple[int, float]:
-    """Step and seconds of the last whole record of a history; zeros where there is none."""
+    """Step and seconds of the last whole record of a history; zeros without one."""
     if not history.is_file():
         return 0, 0.0
     with history.open("rb") as file:
         file.seek(max(history.stat().st_size - _TAIL, 0))
         lines = file.read().decode(errors="replace").split("\n")[:-1]
-    for line in reversed(lines):
-        try:
-            record = json.loads(line)
-            return int(record["step"]), float(record["seconds"])
-        except (ValueError, TypeError, KeyError):
-            continue
-    return 0, 0.0
+    if not lines:
+        return 0, 0.0
+    record: Mapping[str, float] = json.loads(lines[-1])  # a line is whole once its end is written
+    return int(record["step"]), float(record["seconds"])

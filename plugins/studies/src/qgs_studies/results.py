@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from qgs.contracts import Column
 from qgs.engine.evaluation import SECTIONS
@@ -305,8 +306,7 @@ class Results:
         pairs = self._published()
         if len(pairs) < _RANKED:
             return None
-        ranks = [_ranks(side) for side in zip(*pairs, strict=True)]
-        return float(np.corrcoef(np.stack(ranks))[0, 1])
+        return float(spearmanr(*zip(*pairs, strict=True)).statistic)
 
     def _published(self) -> list[tuple[float, float]]:
         """Published value and ours, of every variant that has both."""
@@ -422,9 +422,3 @@ class Results:
         if metric not in self.columns:
             return f"the runs did not measure `{metric}`"
         return f"no scene has `{metric}` in all its runs"
-
-
-def _ranks(values: Sequence[float]) -> np.ndarray:
-    """Ranks of values, the mean rank where they are equal."""
-    array = np.asarray(values)
-    return np.array([(array < v).sum() + ((array == v).sum() - 1) / 2 for v in array])

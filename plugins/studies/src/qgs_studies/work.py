@@ -1,18 +1,19 @@
-"""One run in a process of its own: claim it, train, judge; started by the queue.
+"""One run in a process of its own: lock it, train, evaluate; started by the queue.
 
 A killed process takes nothing with it but its own run's last steps since they were saved.
 """
 
 import argparse
+import fcntl
 import os
 import signal
 import sys
 import threading
 from pathlib import Path
+from typing import IO
 
 from rich.console import Console
 
-from qgs_studies.claims import take
 from qgs_studies.plan import (
     Run,
     evaluation_file,
@@ -26,6 +27,30 @@ FAILED, TAKEN = 1, 3
 """Exit codes: the reason is in the log and beside the run; another process has the run."""
 
 _WATCH_SECONDS = 1.0
+
+
+def locked(run: Run) -> IO[str] | None:
+    """An open file that holds `run` until it is closed; None if another process has the run.
+
+    The kernel releases the lock of a process that dies, so a killed run is free at once.
+    """
+    lock = run.folder.with_name(f"{run.folder.name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    file = lock.open("a")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        return None
+    return file
+
+
+def is_free(run: Run) -> bool:
+    """Whether no process has `run`."""
+    file = locked(run)
+    if file:
+        file.close()
+    return file is not None
 
 
 def main() -> int:
@@ -42,8 +67,8 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     _end_with(given.parent)
     run = run_of(given.folder, given.variant, given.seed)
-    claim = take(run, lost=_stop)
-    if claim is None:
+    lock = locked(run)
+    if lock is None:
         return TAKEN
     try:
         code = _work(given.folder, run, given.evaluations, given.threads, given.device)
@@ -58,7 +83,7 @@ def main() -> int:
         write_text(run.failure, f"{type(error).__name__}: {error}\n")
         return FAILED
     finally:
-        claim.release()
+        lock.close()
 
 
 def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: str) -> int:
