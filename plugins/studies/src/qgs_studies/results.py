@@ -306,7 +306,8 @@ class Results:
         pairs = self._published()
         if len(pairs) < _RANKED:
             return None
-        return float(spearmanr(*zip(*pairs, strict=True)).statistic)
+        published, ours = zip(*pairs, strict=True)
+        return float(spearmanr(published, ours)[0])
 
     def _published(self) -> list[tuple[float, float]]:
         """Published value and ours, of every variant that has both."""
