@@ -307,7 +307,7 @@ class Results:
         if len(pairs) < _RANKED:
             return None
         published, ours = zip(*pairs, strict=True)
-        return float(spearmanr(published, ours)[0])
+        return float(spearmanr(published, ours)[0])  # type: ignore[arg-type]  # a named tuple
 
     def _published(self) -> list[tuple[float, float]]:
         """Published value and ours, of every variant that has both."""
