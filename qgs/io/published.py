@@ -122,17 +122,15 @@ def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
 
 
 def without_prefix(file: WeightFile) -> WeightFile:
-    """`file` without what all its names begin with, where published names remain; with a note.
+    """`file` without the prefix of all its names, where published names remain; with a note.
 
-    Training frameworks put the name of the attribute that holds the model before each (`model.`).
+    Training frameworks prepend the attribute that holds the model (`model.`, `module.`).
     """
     modules = next(iter(file.tensors)).split(".")[:-1]
     for depth in range(1, len(modules) + 1):
         prefix = ".".join(modules[:depth]) + "."
-        if not all(name.startswith(prefix) for name in file.tensors):
-            break
         tensors = {name.removeprefix(prefix): tensor for name, tensor in file.tensors.items()}
-        if recognise(shapes_of(tensors))[0]:
+        if all(name.startswith(prefix) for name in file.tensors) and recognise(tensors)[0]:
             note = f"took {prefix!r} off all {len(tensors)} names"
             return WeightFile(file.path, tensors, (*file.notes, note))
     return file
@@ -159,19 +157,6 @@ def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str,
             f"{origin} looks like {layout.name}, but no recipe fits its shapes: {error}"
         ) from error
     return layout, tree
-
-
-def recipe_text(
-    tree: Mapping[str, Any], layout: WeightLayout, origin: str, overrides: Sequence[str] = ()
-) -> str:
-    """The recipe of `fitting_recipe`, or what `overrides` made of it, as a file."""
-    lines = [
-        f"# Read off the names and shapes of {origin}, weights of {layout.name} ({layout.source}).",
-        "# Shapes leave open, and this recipe takes from the published model:",
-        *(f"#   {choice}" for choice in layout.undecided),
-        *(f"# Given beside: {override}" for override in overrides),
-    ]
-    return "\n".join(lines) + "\n" + dump(dict(tree))
 
 
 @dataclass(frozen=True)
@@ -220,15 +205,22 @@ def import_weights(
     if recipe is None:
         layout, tree = fitting_recipe(shapes, str(weights))
         recipe = resolve(tree, overrides)
-        text = recipe_text(recipe.tree if overrides else tree, layout, file.path.name, overrides)
+        origin = f"{file.path.name}, weights of {layout.name} ({layout.source})"
+        lines = [
+            f"# Derived from the names and shapes of {origin}.",
+            "# Shapes do not determine the following, which is as published:",
+            *(f"#   {choice}" for choice in layout.undecided),
+            *(f"# Overridden: {override}" for override in overrides),
+        ]
+        text = "\n".join(lines) + "\n" + dump(dict(recipe.tree if overrides else tree))
     try:
         names = names_of(recipe)
     except PublishedError as error:
         raise PublishedError(f"{file.path} does not fit the recipe: {error}") from error
     tensors, converted = _as_float32(file, names, to_float32)
-    origin = {"imported": f"{names.layout.name} weights {file.path.name}"}
     settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
-    write_checkpoint(out, tensors, recipe.tree, origin)
+    imported = f"{names.layout.name} weights {file.path.name}"
+    write_checkpoint(out, tensors, recipe.tree, {"imported": imported})
     if recipe_file:
         try:
             write_text(recipe_file, text)
@@ -257,13 +249,10 @@ def _as_float32(
             f"{file.path} holds weights that are no real numbers: {listed(strange)} ({report})"
         )
     if others and not allowed:
-        fix = "--to-float32 rounds them to the float32 that models here compute in"
-        if any(dtype.itemsize < torch.float32.itemsize for dtype in others.values()):
-            fix = (
-                "half precision has lost digits that no conversion brings back. Take the float32 "
-                "file, or convert with --to-float32"
-            )
-        raise PublishedError(f"{file.path} holds weights that are not float32 ({report}); {fix}")
+        raise PublishedError(
+            f"{file.path} holds weights that are not float32 ({report}); take the float32 file, or "
+            "convert with --to-float32"
+        )
     tensors: dict[str, Tensor] = {}
     stored: set[int] = set()
     for name, tensor in given.items():

@@ -61,8 +61,8 @@ class TensorFile:
         except Exception as error:
             if kind := pickle_kind(self.path):
                 raise CheckpointError(
-                    f"{self.path} is {kind}, which can run code when it is read, so qgs never "
-                    "opens it: use the safetensors file of the run"
+                    f"{self.path} is {kind}, which can run code when it is read; use the "
+                    "safetensors file of the run, or name published weights .pt"
                 ) from error
             raise CheckpointError(
                 f"{self.path} is not a whole safetensors file ({name_shown(str(error))}); it may "

@@ -261,7 +261,7 @@ def test_options_that_no_weight_shows_are_listed(
     assert import_weights(weights, resolve(fitting), tmp_path / "p.safetensors").settings == {}
 
 
-@pytest.mark.parametrize("prefix", ["model.", "ema_model.module.", "net._orig_mod."])
+@pytest.mark.parametrize("prefix", ["model.", "module.", "ema_model.module.", "net._orig_mod."])
 def test_one_prefix_of_all_names_is_removed(tmp_path: Path, prefix: str) -> None:
     weights = {prefix + name: tensor for name, tensor in LOCUS.items()}
     save_file(weights, tmp_path / "w.safetensors")
