@@ -76,14 +76,9 @@ class CheckpointFile(TensorFile):
         try:
             return self.stored_recipe(_RECIPE)
         except RecipeError as error:
-            names = {"qgs": "query-gaussians"}
-            if _DISTRIBUTIONS in self.metadata:
-                names = self.mapping(_DISTRIBUTIONS) | names
-            versions = self.mapping(_PLUGINS) if _PLUGINS in self.metadata else {}
-            releases = {
-                plugin: f"{names.get(plugin) or f'the plugin `{plugin}`'} {version}"
-                for plugin, version in versions.items()
-            }
+            names = {**self.mapping(_DISTRIBUTIONS), "qgs": "query-gaussians"}
+            versions = self.mapping(_PLUGINS).items()
+            releases = {plugin: f"{names.get(plugin, plugin)} {v}" for plugin, v in versions}
             available = {"qgs", *available_plugins()}
             absent = [release for plugin, release in releases.items() if plugin not in available]
             raise CheckpointError(

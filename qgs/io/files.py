@@ -98,24 +98,6 @@ def replacing_entries(folder: str | os.PathLike[str]) -> Iterator[Path]:
             entry.rename(place)
 
 
-@contextmanager
-def new_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` when the block ends well.
-
-    Makes missing parent folders. Raises FileExistsError if there is anything at `folder`, also
-    when it appeared while the block ran. When the block raises, there is no `folder`.
-    """
-    target = Path(folder)
-    refuse_existing(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
-        fresh = Path(temporary, target.name)
-        fresh.mkdir()
-        yield fresh
-        refuse_existing(target)
-        fresh.rename(target)
-
-
 def refuse_existing(target: Path) -> None:
     """Raise FileExistsError for a path at which something lies already."""
     if target.exists() or target.is_symlink():

@@ -116,22 +116,16 @@ def old_locus(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("forgotten", "release"),
-    [(None, "query-gaussians-locus 0.0.7"), ("qgs.distributions", "the plugin `locus` 0.0.7")],
-)
 def test_a_missing_plugin_is_named_with_its_distribution(
-    old_locus: Path, monkeypatch: pytest.MonkeyPatch, forgotten: str | None, release: str
+    old_locus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in ("qgs.composer.registry", "qgs.io.checkpoint"):
         monkeypatch.setattr(f"{module}.available_plugins", dict)
-    if forgotten:
-        rewrite(old_locus, **{forgotten: None})
     with pytest.raises(CheckpointError) as caught:
         qgs.load(old_locus)
     first = str(caught.value).splitlines()[0]
     assert str(old_locus) in first
-    assert first.endswith(f"install {release}:")
+    assert first.endswith("install query-gaussians-locus 0.0.7:")
 
 
 def test_only_plugins_that_are_used_are_needed(
@@ -148,13 +142,6 @@ def test_only_plugins_that_are_used_are_needed(
         qgs.compose(RECIPES / "photos.yaml", SMALL)
 
 
-def test_extra_metadata_comes_back(model: QueryGaussianModel, tmp_path: Path) -> None:
-    save(model, tmp_path / "a.safetensors", extra={"step": "7", "note": "ä = b"})
-    with CheckpointFile(tmp_path / "a.safetensors") as file:
-        assert file.extra == {"step": "7", "note": "ä = b"}
-        assert file.step == 7
-
-
 def test_a_model_without_a_step_is_saved_without_one(tmp_path: Path) -> None:
     """As an imported one: what follows the training is at its end, in every copy."""
     ramp = "model.renderer.dilation={schedule: linear, values: [10, 0.5], at: [1, 9]}"
@@ -165,8 +152,9 @@ def test_a_model_without_a_step_is_saved_without_one(tmp_path: Path) -> None:
     save(qgs.load(first), second)
     assert CheckpointFile(second).step is None
     assert qgs.load(second).renderer.config.model_dump()["dilation"] == 0.5
-    save(recipe.build_model(), first)
+    save(recipe.build_model(), first, extra={"note": "ä = b"})
     assert CheckpointFile(first).step == 0
+    assert CheckpointFile(first).extra == {"step": "0", "note": "ä = b"}
 
 
 def test_shared_tensors_are_stored_once_and_stay_shared() -> None:
@@ -206,12 +194,6 @@ def test_every_difference_is_listed_at_once(saved: Path) -> None:
         "shape of head.linear.weight: (2, 2)",
         "type of queries.features: torch.int32",
     ]
-
-
-def test_half_precision_is_widened(saved: Path) -> None:
-    tensors = {name: tensor.half() for name, tensor in load_file(saved).items()}
-    rewrite(saved, tensors, **{"qgs.digest": None})
-    assert {tensor.dtype for tensor in qgs.load(saved).parameters()} == {torch.float32}
 
 
 @pytest.mark.parametrize("position", [-100, -5])

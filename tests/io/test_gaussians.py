@@ -85,11 +85,6 @@ def test_certain_opacities_stay_finite(tmp_path: Path) -> None:
     torch.testing.assert_close(opacities, torch.tensor([OPACITY_EPS, 1 - OPACITY_EPS]))
 
 
-def test_no_gaussians_at_all(tmp_path: Path) -> None:
-    save_ply(random_gaussians(1, 0), tmp_path / "empty.ply")
-    assert load_ply(tmp_path / "empty.ply").count == 0
-
-
 def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path: Path) -> None:
     broken, (harmonic, sh) = random_gaussians(4), with_harmonics(random_gaussians(4), 3)
     broken.means[2, 0] = torch.nan

@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 from commands import run_qgs
-from qgs_plugintools.new_command import check_name, rendered
+from qgs_plugintools.new_command import check_name, new_folder, rendered
 
 from qgs.composer.errors import Problems
 from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import ModelDims
-from qgs.io.files import new_folder
 from qgs.types import ImageMemory, QueryState
 
 

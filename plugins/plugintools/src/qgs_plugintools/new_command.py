@@ -1,12 +1,13 @@
 """`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
 
 import keyword
+import os
 import re
 import shlex
 import sys
 import unicodedata
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from importlib.metadata import (
     PackageNotFoundError,
     distribution,
@@ -14,6 +15,7 @@ from importlib.metadata import (
     packages_distributions,
 )
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -23,7 +25,7 @@ import qgs
 from qgs.composer.errors import Problems
 from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import CONTRACT_VERSION
-from qgs.io.files import new_folder, write_text
+from qgs.io.files import refuse_existing, write_text
 
 app = typer.Typer(add_completion=False)
 
@@ -88,6 +90,24 @@ def _refusals(name: str) -> Iterator[tuple[object, str]]:
         there = distribution(distribution_of(name))
         replaced = f"{there.name} {there.version} is installed, which it would replace"
         yield True, f"would be the distribution {distribution_of(name)}; {replaced}; {other}"
+
+
+@contextmanager
+def new_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary folder that becomes `folder` when the block ends well.
+
+    Makes missing parent folders. Raises FileExistsError if there is anything at `folder`, also
+    when it appeared while the block ran. When the block raises, there is no `folder`.
+    """
+    target = Path(folder)
+    refuse_existing(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
+        fresh = Path(temporary, target.name)
+        fresh.mkdir()
+        yield fresh
+        refuse_existing(target)
+        fresh.rename(target)
 
 
 def write_plugin(name: str, folder: Path) -> None:
