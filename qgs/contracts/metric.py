@@ -43,7 +43,7 @@ class MetricInput(TensorContainer):
     images: (1, T, 3, H, W) as rendered, not clipped. targets: the true Views (1, T).
     gaussians: (1, G), `gaussians_per_query` of each query in turn; None for a baseline.
     depth: as `Rendering.depth` (1, T, 1, H, W); None for a baseline. true_depth: the same of the
-    data, in the model's units; None where the data has none, or no metric needs it.
+    data, in the model's units, 0 where unknown; None without maps, or where no metric needs it.
     """
 
     images: Tensor

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -85,8 +86,6 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
     "told",
     [
         "{}",
-        "[]",
-        "null",
         '{"samples": 1',
         '{"samples": 1, "ranges": {"fov": ["a", "b"]}}',
         '{"samples": 1, "ranges": {"fov": 50}}',
@@ -107,14 +106,12 @@ def test_the_sentence() -> None:
     near, far = [[-0.1, 0, 0], [0.1, 0, 0]], [[-0.2, 0, 0], [0.2, 0, 0]]
     trained = domain(around([0, 0, 1], near), around([0, 0, 2], far))
     within = domain(around([0, 0, 1.5], [[-0.15, 0, 0], [0.15, 0, 0]]))
-    assert verdict(trained, within).startswith("the cameras lie within what this model was trained")
+    assert not trained.differences(within)
     wide = domain(around([0, 0, 1.5], [[-1.5, 0, 0], [1.5, 0, 0], [0, 0, 0]], focal=4.0))
-    assert verdict(trained, wide).startswith(
-        "the views lie outside what this model was trained on: there are 3 input views "
-        "(trained: 2), the input cameras stand 3 apart (trained: 0.2 to 0.4), their axes differ by "
-        "90 degrees (trained: 11.4), their field of view is 152 degrees wide (trained: 90). Expect"
-    )
-    assert "is not known: its checkpoint does not tell" in verdict(Domain(), within)
+    outside = trained.differences(wide)
+    assert [float(re.search(r"[\d.]+", text)[0]) for text in outside] == [3, 3, 90, 152]
+    assert all(text in verdict(trained, wide) for text in outside)
+    assert "not known" in verdict(Domain(), within)
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:

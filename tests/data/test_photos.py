@@ -66,16 +66,6 @@ def test_held_out_frames(tmp_path):
     assert opened(tmp_path, holdout=0).scenes("test")[0].held_out == ()
 
 
-def test_seventeen_missing_images_are_no_line_of_seventeen_paths(tmp_path, caplog):
-    path = folder(tmp_path, count=20)
-    for index in range(3, 20):
-        (path / "images" / f"{index}.png").unlink()
-    opened(path)
-    assert "17 of 20 images of " in caplog.text
-    assert "/images/5.png and 14 more" in caplog.text
-    assert "6.png" not in caplog.text
-
-
 def test_missing_images_are_counted_and_named(tmp_path, caplog):
     folder(tmp_path)
     (tmp_path / "images" / "3.png").unlink()
