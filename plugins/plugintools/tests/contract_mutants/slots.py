@@ -1,4 +1,4 @@
-"""Heads, queries, supervisions, losses, data, encoders and attention that break their contracts."""
+"""Encoders, heads, queries, losses, data, objectives ... that break the contract of their slot."""
 
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from qgs.components import (
     LayerSupervision,
     MultiViewViT,
     OneCycleAdamW,
+    OnePass,
 )
 from qgs.components.blocks import CrossAttentionCore, split_heads
 from qgs.contracts import (
@@ -22,15 +23,12 @@ from qgs.contracts import (
     Column,
     CrossAttention,
     Loss,
+    Outcome,
     Scene,
     SceneSource,
 )
 from qgs.metrics.images import Psnr
 from qgs.types import Cameras, ImageMemory, Views
-
-
-class OneTerm(Loss):
-    """A loss of one term, which mutants define."""
 
 
 class ChangedEncoder(MultiViewViT):
@@ -105,7 +103,7 @@ class HoldsOutTooMuch(DrawsItsImages):
 
 
 @mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
-class SumsOverScenes(OneTerm):
+class SumsOverScenes(Loss):
     renderings = "each"
 
     def term(self, prediction, rendering, target, inputs):
@@ -113,7 +111,7 @@ class SumsOverScenes(OneTerm):
 
 
 @mutant("renderings_as_declared", "against the mean over views")
-class TakesTheWorstView(OneTerm):
+class TakesTheWorstView(Loss):
     renderings = "each"
 
     def term(self, prediction, rendering, target, inputs):
@@ -224,7 +222,7 @@ class IgnoresTheMask(ContentSelfAttention):
 
 
 @mutant("masked_queries_are_not_judged", "when masked queries and their Gaussians change")
-class JudgesWhatIsMasked(OneTerm):
+class JudgesWhatIsMasked(Loss):
     renderings = "none"
 
     def term(self, prediction, rendering, target, inputs):
@@ -240,3 +238,36 @@ class GivesFeaturesUntold(GaussianHead):
 @mutant("unread_cameras_make_no_difference", "has no attribute 'cameras'")
 class ReadsCamerasUntold(MultiViewViT):
     reads_cameras = False
+
+
+class Changed(OnePass):
+    """A sound objective, whose outcome mutants change."""
+
+    def result(self, outcome: Outcome) -> Outcome:
+        return outcome
+
+    def forward(self, inputs, targets, passes):
+        return self.result(super().forward(inputs, targets, passes))
+
+
+@mutant("objective_gives_an_outcome", "has no gradient in the model's parameters")
+class DetachesTheTotal(Changed):
+    def result(self, outcome):
+        return replace(outcome, total=outcome.total.detach())
+
+
+@mutant("objective_gives_an_outcome", "against the sum of the terms")
+class HidesATerm(Changed):
+    def result(self, outcome):
+        return replace(outcome, total=2 * outcome.total)
+
+
+@mutant("objective_repeats", "the second time")
+class CountsItsJudgements(Changed):
+    calls = 0
+
+    def result(self, outcome):
+        self.calls += 1
+        factor = 1 + 1 / self.calls
+        terms = {name: factor * x for name, x in outcome.terms.items()}
+        return replace(outcome, total=factor * outcome.total, terms=terms)

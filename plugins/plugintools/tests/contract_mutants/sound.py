@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from contract_mutants.fields import PlacesByALayer
 from contract_mutants.mutant import named
 from contract_mutants.renderers import RefusesWhatItDeclares
+from contract_mutants.spatial import PlacesByALayer
 from torch import nn
 
 from qgs.components import (
