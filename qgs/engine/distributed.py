@@ -117,6 +117,7 @@ def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> s
         )
     if wanted != "auto":
         return wanted
+    # The renderer `qgs/auto` has only gsplat for tensors on a GPU.
     if available and find_spec("gsplat") is None:
         say(
             "Computing on the CPU although a CUDA device is there: its renderer, gsplat, is not "
@@ -156,6 +157,7 @@ def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
         if not quiet:  # print is not reentrant, and a handler may interrupt it
             os.write(2, f"\n{message}\n".encode())
 
+    # Restored afterwards: a notebook goes on with handlers of its own.
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield request

@@ -52,6 +52,7 @@ def evaluate(
     measures = Measures(recipe)
     scorer = _Scorer(model, recipe, source, measures)
     training = model.training
+    # Components draw random numbers in training mode only.
     model.eval()
     try:
         scores, missing = _by_scene(plan.wanted, scorer.scores(plan.samples(), batch), observe)
@@ -131,6 +132,7 @@ class Measures:
                     raise ValueError(
                         f"gives values for {[*found]}, but has columns for {[*metric.columns()]}"
                     )
+                # float64, so that the mean adds no rounding of its own.
                 means = {key: float(value.double().mean()) for key, value in found.items()}
             values |= {f"{method}_{_name(label, key)}": mean for key, mean in means.items()}
         return values
@@ -188,6 +190,7 @@ class _Scorer:
                 yield sample
                 continue
             shapes = {s.inputs.images.shape for s in (*waiting, sample)}
+            # Scenes with other numbers of views cannot be stacked.
             if len(waiting) == batch or len(shapes) > 1:
                 yield from self._together(waiting)
                 waiting = []
@@ -218,6 +221,7 @@ class _Scorer:
             values = {**self._values(sample, inputs, found), **values}
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
+        # One NaN would spoil every mean over scenes.
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         if broken:
             return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
@@ -267,6 +271,7 @@ def _by_scene(
     scores = []
     for name in (name for name in wanted if name in samples and name not in failures):
         found = [sample.values for sample in samples[name]]
+        # A value that one sample lacks would be a mean over other samples.
         common = [key for key in found[0] if all(key in values for values in found)]
         means = {key: sum(values[key] for values in found) / len(found) for key in common}
         views = [frames for sample in samples[name] for frames in sample.views]

@@ -110,6 +110,7 @@ class RunFolder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         if self._lock is None:
+            # The lock is on the folder itself, so no lock file can be left behind.
             self._lock = os.open(self.path, os.O_RDONLY)
             try:  # the system takes the lock off a dead process
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -129,6 +130,7 @@ class RunFolder:
         with naming_full_disk(self._history_file):
             if self._history is None:
                 self._history = self._history_file.open("a", encoding="utf-8")
+            # Buffered: a line a step is written, but flushed only for readers and saves.
             self._history.write(json.dumps(record) + "\n")
 
     def flush(self, to_disk: bool = False) -> None:
@@ -153,7 +155,7 @@ class RunFolder:
     def close(self) -> None:
         """Close the history and leave the folder to others."""
         if self._history is not None:
-            with suppress(OSError):  # a full disk, of which its last flush has told
+            with suppress(OSError):  # a full disk: the last flush raised already
                 self._history.close()
         if self._lock is not None:
             os.close(self._lock)
@@ -329,6 +331,7 @@ def refuse_other_data(saved: State, now: State, folder: RunFolder) -> None:
 
     saved, now: "step_size", samples of a step over all processes; "scenes", `scenes_fingerprint`.
     """
+    # Sample k depends on its number alone, so equal step sizes give the same batches.
     if saved["step_size"] != now["step_size"]:
         raise OtherRunError(
             f"the optimiser steps of the run in {folder.path} see {saved['step_size']} samples, "

@@ -122,6 +122,7 @@ class Guard:
         if self._skips and self.skipped <= MAX_SKIPPED:
             _log.warning("step %d is skipped: %s", step + 1, found)
             return
+        # A model that was dying gave this NaN: going on from here would not help.
         if self.detector.dead_steps or broken_tensors(self._saver.model):
             self._collapse(step + 1, found, NONFINITE_CAUSES)
         self._saver.save(step)
@@ -140,12 +141,12 @@ class Guard:
     def look_into(self, step: int, batches: Sequence[Batch], symptom: str) -> tuple[str, bool]:
         """Repeat a step to find its first bad tensor; save what it takes to see it again.
 
-        Returns what was found, in words, and whether it came with the images and cameras of a
-        batch, and so from nothing that the model did.
+        Returns a description of what was found, and whether it came with the data of a batch.
         """
         self.incidents += 1
         self.skipped += 1
         accelerator, place = self._accelerator, self._saver.folder.path / "incidents"
+        # All processes repeat the step: its collective operations need everyone.
         first = first_bad_tensor(self._objective, lambda: self._repeat(batches))
         reports = gathered(accelerator, Report.of(accelerator.process_index, first, batches))
         found = [report for report in reports if report.first] or reports[:1]
@@ -187,6 +188,7 @@ class Guard:
         """Save the run as one that may go on; a dead model's checkpoint is the last good one."""
         if self.detector.dead_after(step):
             self._saver.save_checkpoint(self.good.step, self.good.tensors)
+            # The state keeps the dead weights: a resumed run must equal an uninterrupted one.
             self._saver.save(step, state_only=True)
         else:
             self.save(step)
@@ -241,6 +243,7 @@ class CollapseDetector:
         elif self._has_drawn and numbers["deviation"] < FLAT:
             self.symptom = "the renderings equal the background"
         self.dead_steps = self.dead_steps + 1 if self.symptom else 0
+        # Well above FLAT, so that noise around the threshold is no image.
         self._has_drawn |= numbers["deviation"] > 8 * FLAT
 
     def dead_after(self, steps: int) -> bool:
@@ -275,18 +278,21 @@ class GoodWeights:
     def observe(self, numbers: Mapping[str, float]) -> None:
         """Take note of a step's "psnr", in dB."""
         now = numbers["psnr"]
+        # PSNR of one batch depends on its scenes: compare running means.
         self._psnr = now if self._psnr is None else self._psnr + (now - self._psnr) / 10
 
     def due(self, step: int, window: int) -> bool:
         """Whether to copy the weights after `step` steps; the same in all processes."""
-        apart = max(window // 5, min(window, step // 10))
-        if step - self._copies[-1][0] < apart or self._psnr is None:
+        # Rarer in long runs: each copy moves the whole model to the host.
+        interval = max(window // 5, min(window, step // 10))
+        if step - self._copies[-1][0] < interval or self._psnr is None:
             return False
         self._best = max(self._psnr, self._psnr if self._best is None else self._best)
         return self._psnr >= self._best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
         """Copy the present weights, which `step` optimiser steps made."""
+        # Host memory: the device's is needed for the training.
         present = unique_tensors(self._model) if self._keep else {}
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
         self._copies = [*self._copies, (step, copy)][-2:]

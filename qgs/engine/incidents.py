@@ -114,10 +114,12 @@ class _Watch:
             self._see(name, views)
 
     def _see_output(self, name: str, module: nn.Module, arguments: Any, output: Any) -> None:
+        # Shared modules run several times a step; the number tells which call it was.
         self._calls[name] += 1
         call = f" (call {self._calls[name]})" if self._calls[name] > 1 else ""
         self._see(f"output{call} of {name}", output)
         for path, tensor in named_tensors(output, f"gradient of the output{call} of {name}"):
+            # Gradients arrive in reverse order: the first bad one is nearest to the loss.
             if tensor.requires_grad:
                 tensor.register_hook(partial(self._see, path))
 
@@ -139,6 +141,7 @@ def save_incident(
     save(model, place / "weights.safetensors", extra={"step": str(step - 1)})
     found = [report.as_json() for report in reports]
     text = json.dumps({"step": step, "symptom": symptom, "found": found}, indent=2)
+    # Last: its presence says that the incident is complete.
     write_text(place / "report.json", text + "\n")
 
 

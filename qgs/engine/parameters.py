@@ -16,6 +16,7 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """Torch's optimiser; a `Recipe.rate_factors` of 0 freezes, ValueError if all are 0."""
     for name, parameter in module.named_parameters():
+        # Frozen, not only a rate of 0: no gradient, no moments, no weight decay.
         if factors[name] == 0:
             parameter.requires_grad_(False)
     groups = parameter_groups(module, factors)
@@ -36,6 +37,7 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
         if not parameter.requires_grad:
             continue
         owners = [prefix for prefix in components if name.startswith(f"{prefix}.") or not prefix]
+        # Biases and gains of norms are 1-d; decay would pull them from where they work.
         factor, decays = factors[name], parameter.ndim != 1
         if owners:
             innermost = max(owners, key=len)
@@ -44,6 +46,7 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
         key = (not decays, factor)
         empty = ParameterGroup(params=[], decays=decays, factor=factor)
         groups.setdefault(key, empty)["params"].append(parameter)
+    # Sorted: the same groups in every process and after a resume.
     return [groups[key] for key in sorted(groups)]
 
 

@@ -75,6 +75,7 @@ class PeriodicEvaluation:
         """
         self.latest = step
         self._stop = StopRequest() if stop is None else stop
+        # An evaluation must not change what the training draws afterwards.
         states = self._random.state()
         try:
             if self._accelerator.is_main_process:
@@ -85,6 +86,7 @@ class PeriodicEvaluation:
             kind = type(error).__name__
             _log.warning("the evaluation at step %d failed: %s: %s", step, kind, error)
             _log.debug("where it failed", exc_info=True)
+        # The others wait here, see TIMEOUT in `distributed`.
         self._accelerator.wait_for_everyone()
         self._random.load_state(states)
 

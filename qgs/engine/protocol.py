@@ -68,6 +68,7 @@ def protocol_of(
     config, source = part.config, part.component
     assert isinstance(config, SceneSourceConfig)
     assert issubclass(source, SceneSource)
+    # The size is there at the top level, for all kinds of data.
     left_out = {"image_size", *source.not_in_protocol}
     if index is None:
         data = {"type": recipe.tree["data"]["type"]}
@@ -96,6 +97,7 @@ def protocol_of(
         if issubclass(metric, Metric):
             options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
             metrics[path[-1]] = {"type": chosen.type, "definition": metric.definition, **options}
+    # Options without effect are left out: they must not part equal protocols.
     factor = () if recipe.views.scale == "auto" else ("scale_factor",)
     noise = {"noise": [recipe.views.pose_noise, evaluation.seed]} if recipe.views.pose_noise else {}
     content = {

@@ -186,6 +186,7 @@ class Evaluation:
         fields = [*FRAME_COLUMNS, *named, *columns, "problem"]
         writer = csv.DictWriter(text, fields, lineterminator="\n")
         writer.writeheader()
+        # Every wanted scene has a row, so that a missing one shows in the file.
         for name in self.wanted:
             row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
             if score := judged.get(name):

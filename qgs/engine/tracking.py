@@ -32,7 +32,7 @@ _LOG_SECONDS = 15.0
 
 
 class Tracker(ABC):
-    """Where the numbers and pictures of one run go, besides its folder."""
+    """Where the numbers and pictures of one run go in addition to its folder."""
 
     package: ClassVar[str] = ""
     """The package that it needs, an extra of query-gaussians."""
@@ -131,6 +131,7 @@ class Trackers:
 
     def open(self, run: Path, recipe: Recipe, step: int = 0) -> None:
         """Track into the folder `run` from step `step` + 1 on; log the options of `recipe`."""
+        # Trackers take plain values only; lists and nulls become text.
         options = flat(recipe.tree).items()
         plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in options}
         self._open = [kind(run, plain, step) for kind in self._kinds]
@@ -184,6 +185,7 @@ class TrainingProgress:
         images, seconds: of the whole run so far; what is shown is of this session. used: fraction
         of the budget.
         """
+        # Speed is of this session: a resumed run may be on another machine.
         if self._start is None:
             self._start = images, seconds, used
         now = time.monotonic()

@@ -102,6 +102,7 @@ def train(
         RunFolder(run).refuse_other(resume)  # before the data is opened, which may take minutes
     terminal = console or Console(stderr=True)
     chosen = choose_device(device, terminal.print)
+    # Before the model is built: its initial weights are part of the recipe.
     set_seed(recipe.seed)
     with closing(Trainer(recipe, run, chosen, resume)) as trainer:
         if not trainer.accelerator.is_main_process:
@@ -207,7 +208,7 @@ class Trainer:
         self.evaluations = PeriodicEvaluation(
             accelerator, self.recipe, self.model, self.average, self.folder.path, self.trackers
         )
-        self.saver.parts |= {  # besides the weights
+        self.saver.parts |= {
             "guard": self.guard,
             "good": self.guard.good,
             "counters": self,
@@ -239,6 +240,7 @@ class Trainer:
         while self.used < 1 and not stopped_by:
             stopped_by = self._one_step(progress, stop)
         stopped_by = stopped_by or self._stopped_by(stop)
+        # Saved before the last evaluation, which may take long or fail.
         self.guard.finish(self.step, stopped=stopped_by is not None)
         if self.average and not stopped_by and self.evaluations.latest != self.step:
             self._evaluate(stop)
@@ -265,6 +267,7 @@ class Trainer:
         self.step += 1
         self.samples += self._batch_samples * len(batches)
         self._follow_schedules()
+        # Only now, so that a start that fails in its first step leaves no folder.
         self._open_folder()
         record = {"step": self.step, "seconds": self.seconds, "lr": rate, **numbers}
         self._report(record | ({"skipped": True} if symptom else {}), batches, progress)
@@ -276,6 +279,7 @@ class Trainer:
     def _set_learning_rate(self) -> float:
         rate = self.optimizer.learning_rate(self.step, self.seconds)
         for group in self.torch_optimizer.param_groups:
+            # Torch's own schedulers know no time budget and no factors of parts.
             group["lr"] = rate * group["factor"]
         self.torch_optimizer.zero_grad(set_to_none=True)
         return rate
@@ -313,7 +317,7 @@ class Trainer:
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
-            # Saving, too, takes memory; the files of the last save are whole in any case. With
+            # Saving takes memory too; the files of the last save are whole in any case. With
             # several processes the others would wait for this one in vain.
             if saves and self.step and self.accelerator.num_processes == 1:
                 with suppress(Exception):
@@ -389,6 +393,7 @@ class Trainer:
                 _log.warning("a sample is left out: %s", bad)
             self.left_out[bad] += 1
         if self.accelerator.is_main_process:
+            # JSON has no NaN: a skipped step leaves only its finite numbers.
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)
             self.trackers.log(finite, self.step)
@@ -406,6 +411,7 @@ class Trainer:
         """Evaluate, with the clock stopped."""
         started = time.perf_counter()
         self.evaluations.run(self.step, stop)
+        # Shifted, not reset: the time since the last step still counts.
         if self._last_tick is not None:
             self._last_tick += time.perf_counter() - started
 
@@ -447,6 +453,7 @@ def compute_gradients(
         found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
         for name, value in found.items():
             sums[name] = sums.get(name, 0) + value / len(batches)
+    # After the exchange, so that all processes clip by the same norm.
     norm = accelerator.clip_grad_norm_(objective.parameters(), config.clip)
     sums["gradient"] = torch.as_tensor(norm, device=device)
     return sums

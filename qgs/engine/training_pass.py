@@ -102,7 +102,7 @@ class TrainingPass(nn.Module):
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
         """See `Passes`: layers are weighted by the supervision; `signs` are of the last layer.
 
-        Raises ValueError when two losses name a term alike.
+        Raises ValueError when two losses have a term of one name.
         """
         self._judged += 1
         judgement = f" in judgement {self._judged}" if self._judged > 1 else ""
@@ -128,6 +128,7 @@ class TrainingPass(nn.Module):
                 found = self._terms(self._of_gaussians, layer.prediction, *seen, number)
                 layer.add(found, weight)
             self.hook(f"gradient of layer {number}{judgement}", layer.gradients)
+            # Layers meet here: one backward pass through the network serves them all.
             total = total + layer.total()
             _add(layer.terms, terms)
         mean = {
@@ -148,6 +149,7 @@ class TrainingPass(nn.Module):
         if cameras.shape[1] <= (self.render_views or cameras.shape[1]):
             return self.model.render(gaussians, cameras)
         parts = [
+            # Rendered again in the backward pass: memory for one part instead of all.
             checkpoint(self.model.render, gaussians, cameras[:, views], use_reentrant=False)
             for views in _slices(cameras, self.render_views)
         ]
@@ -217,6 +219,7 @@ class DetachedLayer:
 
     def total(self) -> Tensor:
         """The sum of the terms, 0-d, with `gradients` with respect to what was cut off."""
+        # The graph of the losses is gone by now; only its gradients remain.
         sources = [self._sources[name] for name in self.gradients]
         return _KnownGradients.apply(_sum(self.terms), tuple(self.gradients.values()), *sources)
 

@@ -57,6 +57,7 @@ def tune(
             f"there are no latents to tune: the encoder, {type(model.encoder).__name__}, makes no "
             "memory of other features; tune the queries instead (--tune queries)"
         )
+    # Encoded once: weights and photos stay, so the memory does too.
     with torch.no_grad():
         memory = model.encoder(views)
         start = model.queries(memory, views)
@@ -80,6 +81,7 @@ def tune(
     with torch.enable_grad():
         for _ in range(steps):
             _, value = predicted()
+            # Not backward(): that would leave gradients in the model's weights.
             gradients = torch.autograd.grad(value, leaves, allow_unused=True)
             for leaf, gradient in zip(leaves, gradients, strict=True):
                 leaf.grad = gradient
