@@ -132,7 +132,9 @@ class MergingHead(Head):
         config = self.config
         low, high = math.log(config.scale_min) - 1, math.log(config.scale_max) + 2
         log_scale = (log_scale + config.scale_bias).clamp(low, high)
+        # Zeros would be no rotation; this starts every candidate at the identity.
         rotation = rotation + rotation.new_tensor([1, 0, 0, 0, 1, 0])
+        # Logs of transmittance add up where Gaussians overlap; opacities do not.
         clear = -F.softplus(opacity + config.opacity_bias)
         return torch.cat([place, log_scale, rotation, clear], -1)
 

@@ -78,6 +78,7 @@ class Transformer(PatchEncoder):
         plucker_BV6HW = plucker_rays(views.cameras)
         pixels_BV9HW = torch.cat([2 * views.images - 1, plucker_BV6HW], 2)
         x_BMC = rearrange(pixels_BV9HW, "b v c (h p) (w q) -> b (v h w) (p q c)", p=patch, q=patch)
+        # Rays stand beside the colours of each pixel, so that positions need no embedding.
         x_BMD = self.norm(self.embedding(x_BMC))
         for block in self.blocks:
             x_BMD = block(x_BMD)

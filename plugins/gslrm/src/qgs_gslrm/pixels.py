@@ -84,6 +84,7 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
     square as K allows: through those of its pixels where K is their number.
     """
     origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
+    # The divisor next to the square root: K cells as nearly square as K allows.
     rows = next(n for n in range(math.isqrt(count), 0, -1) if count % n == 0)
     columns = count // rows
     u_c = (torch.arange(columns).to(patch_BN43) + 0.5) / columns
@@ -133,6 +134,7 @@ def _placed(
 ) -> Tensor:
     if config.measure == "distance":
         directions = F.normalize(directions, dim=-1)
+    # A sigmoid keeps every Gaussian between near and far, so that none starts behind its camera.
     w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
     return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions
 
@@ -179,6 +181,7 @@ class PixelHead(Head):
         position, rgb, scale, rotation, opacity = raw_BNKC.split(self.channels, -1)
         scale = scale + self.config.scale_bias
         if self.config.scale_limit is not None:
+            # Without a bound one Gaussian can cover an image and stop the others from learning.
             scale = scale.clamp_max(self.config.scale_limit)
         return GaussianAttributes(
             offsets=position.expand(*position.shape[:-1], 3),
