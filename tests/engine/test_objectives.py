@@ -117,7 +117,7 @@ def test_views_are_joined_in_order_and_only_with_their_like() -> None:
     assert isinstance(both.masks, Tensor)
     assert torch.equal(both.select([2, 3, 4]).masks, other.masks)
     for unlike in (views(2), views(2, masks=True, width=4)):
-        with pytest.raises(ValueError, match="cannot be joined"):
+        with pytest.raises(ValueError, match=r"masks|sizes"):
             one.joined(unlike)
 
 

@@ -300,6 +300,7 @@ def test_every_shipped_loss_says_which_renderings_it_needs() -> None:
         "anchor_visibility": "none",
         "opacity": "none",
         "lpips": "each",
+        "depth_surface": "none",
     }
 
 
