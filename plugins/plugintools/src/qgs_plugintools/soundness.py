@@ -9,7 +9,15 @@ from typing import Any
 from torch.nn import Module
 
 from qgs.composer.slots import SLOTS
-from qgs.contracts import Component, ComponentConfig, Metric, Objective, Optimizer, Renderer
+from qgs.contracts import (
+    Component,
+    ComponentConfig,
+    Metric,
+    Objective,
+    Optimizer,
+    Renderer,
+    ViewSampler,
+)
 from qgs.contracts.schedule import number_kinds
 
 DEVICES = ("cpu", "cuda", "mps")
@@ -47,7 +55,7 @@ def component_fault(component: object) -> str:
     known = {n for n, option in fields.items() if number_kinds(option.annotation)}
     if not (isinstance(scheduled, frozenset) and scheduled <= known):
         return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
-    if scheduled and not issubclass(component, Module | Objective | Optimizer):
+    if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
         return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
     return _schema_fault(config)
 
