@@ -40,9 +40,9 @@ class Bounded(ViewSampler):
     """Inputs at both ends of a gap that widens over `warm_up_steps`, targets between them.
 
     pixelSplat's sampler of this name for two inputs; further inputs are drawn between the ends.
-    The published code limits the largest gap by the least one on paths that do not close, by
-    mistake; here, as in later releases, by the number of frames. Targets may repeat. `views.gap` is
-    not read, except by windows around held-out frames.
+    The published code limits the largest gap by the least one on paths that do not close; here the
+    number of frames limits it. Targets may repeat. `views.gap` is read for windows around held-out
+    frames alone.
     """
 
     name = "bounded"
