@@ -141,11 +141,3 @@ def test_every_recipe_has_its_place_in_the_documents() -> None:
     )
     assert [file for file in FILES if file not in named | tiny] == []
     assert sorted(named - set(FILES)) == []
-
-
-def test_commands_of_the_experiments_are_of_recipes_that_exist() -> None:
-    text = document("docs/experiments.md")
-    lines = re.findall(r"^\s*qgs (?:train|bench|compose) .*", text, re.MULTILINE)
-    assert lines
-    named = [path for line in lines for path in re.findall(r"recipes/[\w/*.-]+", line)]
-    assert [path for path in named if not list(ROOT.glob(path))] == []

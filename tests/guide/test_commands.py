@@ -59,12 +59,6 @@ def test_a_command_that_is_shown_is_one(page: str, shown: str) -> None:
             raise
 
 
-def test_what_is_no_command_is_told() -> None:
-    for wrong in ("evaluate runs/locus --fast", "check-plugin locus --all", "eval runs/x --fast"):
-        with pytest.raises(UsageError):
-            parsed(wrong.split())
-
-
 def test_commands_are_found_on_every_page_that_has_some() -> None:
     assert {page for page, _ in SHOWN} >= {"README", "index.md", "ideas.md", "plugin.md"}
     assert ("index.md", "eval runs/locus") in SHOWN

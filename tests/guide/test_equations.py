@@ -10,7 +10,6 @@ import pytest
 import yaml
 from guide_pages import DOCS, text_of
 
-from qgs.composer import resolve
 from qgs.composer.decode import RecipeSettings
 from qgs.composer.registry import load_registry
 from qgs.composer.slots import SLOTS
@@ -21,30 +20,6 @@ ROOT = DOCS.parent
 EQUATIONS, _, REST = text_of("equations.md").partition("## Where paper and release differ")
 DIFFERENCES, _, RELEASES = REST.partition("## Defaults that are not TokenGS's")
 
-ROWS = """
-Rays and frames (both papers): Plücker ray of a pixel | ray of a patch | as used for distances |
-    world frame | scale of the world | scale of the world, automatic | mirroring
-Encoder (TokenGS): images | tokens | block | keys and values |
-    several blocks | latents
-Decoder layer (TokenGS): queries | cross-attention | self-attention | MLP | residual |
-    a time | self-attention, dynamic
-Anchors (LocusGS): anchor | support radius | distance to a ray | bias | cross-attention |
-    self-attention | PE | refinement | means | means, ablation
-Ellipsoidal anchors (in neither paper): anchor | metric | bias |
-    the same, in coordinates of the ball | refinement | means | Gaussians in the anchor's frame
-Joint attention (C3G): joint layer | Gaussian of a query | mean of it | image tokens
-GS-LRM: token of a patch | block of GS-LRM | ray of a Gaussian | distance | means of pixels |
-    attributes of pixels
-GlobalSplat (its paper; what is ours is in the README of the plugin): token of a patch | streams |
-    round | candidates | merging | Gaussians of a token | rotation from 6D |
-    soft frustum | regularisers | two passes
-Gaussians (both papers): position | free means | colour, scale, opacity, rotation
-    | colour along a direction d | rendering
-Objective (both papers): photometric | L1, LPIPS | dynamic | visibility | visibility of anchors |
-    over layers | weight decay | schedule | token tuning | refinement |
-    depth of a pixel | splitting a Gaussian | growing queries
-Evaluation: PSNR | SSIM | LPIPS | token dispersion
-"""
 
 CONSTANTS = [
     ("support radius", "radius_min", "softplus(ρ), {:g})"),
@@ -138,13 +113,6 @@ def owners(option: str, where: str) -> list[type[ComponentConfig]]:
     ]
 
 
-def test_no_row_is_lost() -> None:
-    lines = ROWS.strip().replace("\n    ", " ").splitlines()
-    wanted = {h: names.split(" | ") for h, _, names in (line.partition(": ") for line in lines)}
-    found = {heading: [row[0] for row in rows] for heading, rows in tables(EQUATIONS, 4).items()}
-    assert found == wanted
-
-
 @pytest.mark.parametrize("row", EVERY_ROW, ids=lambda row: row[0])
 def test_a_row_leads_to_code_that_has_its_options(row: list[str]) -> None:
     name, formula, where, cell = row
@@ -165,49 +133,6 @@ def test_constants_are_the_defaults(name: str, option: str, wording: str) -> Non
             default = config.model_fields[option].get_default()
             shown = wording.format(-default if "- {" in wording else default)
             assert shown in formula
-
-
-def test_powers_of_ten_are_the_defaults() -> None:
-    by_name = {row[0]: row[1] for row in EVERY_ROW}
-    attention, head = components()["locus/anchor_aware"][0], components()["qgs/gaussian_head"][0]
-    assert attention.Config().divisor_eps == 1e-6  # type: ignore[attr-defined]
-    assert "T<sup>2k/128</sup> + 10<sup>-6</sup>" in by_name["PE"]
-    assert head.Config().quat_eps == 1e-4  # type: ignore[attr-defined]
-    assert "max(its length, 10<sup>-4</sup>)" in by_name["colour, scale, opacity, rotation"]
-
-
-PAPERS = ("qgs/", "locus/")
-"""Plugins whose components are those of the papers."""
-
-
-def test_options_that_are_a_papers_form_are_written_as_in_a_recipe() -> None:
-    (rows,) = tables(DIFFERENCES, 4).values()
-    (other,) = [row for row in rows if row[3].startswith("the component ")]
-    assert other[0] == "free means, in LocusGS's ablation"
-    centers = yaml.safe_load(other[3].split("`")[1])
-    assert resolve({"recipe": 1, "model": {"centers": centers}}).tree["model"]["centers"] == centers
-    assert [row[0] for row in rows if row != other] == [
-        "lower bound of r",
-        "input of PE",
-        "step of a centre",
-        "offset δ",
-    ]
-    for name, paper, release, cell in rows:
-        assert paper != release, name
-        if name == other[0]:
-            continue
-        option, *kinds = re.findall(r"`([^`]+)`", cell)
-        ((key, value),) = yaml.safe_load(f"{{{option}}}").items()
-        for kind in kinds:
-            (component,) = components()[kind]
-            chosen = getattr(component.Config(**{key: value}), key)
-            assert chosen != component.Config.model_fields[key].get_default(), kind
-        having = {
-            kind
-            for kind, (c, *_) in components().items()
-            if kind.startswith(PAPERS) and key in c.Config.model_fields
-        }
-        assert set(kinds) == having, f"{name}: all components with the option"
 
 
 def test_defaults_that_are_not_tokengss_are_those_of_its_recipe_taken_back() -> None:

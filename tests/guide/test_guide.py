@@ -101,10 +101,3 @@ def test_reference_explains_every_option(name: str) -> None:
 
 def yaml_cell(row: str, index: int) -> str:
     return re.split(r"(?<!\\)\|", row)[1 + index].strip().strip("`")
-
-
-def test_reference_has_every_slot_and_component() -> None:
-    page = guide_reference.reference()
-    for slot in SLOTS:
-        for name in load_registry(guide_reference.PLUGINS).components(slot):
-            assert f"### `{name}` {{ #{slot}-{name.replace('/', '-')} }}" in page
