@@ -30,7 +30,7 @@ from qgs.contracts.loss import Loss, Supervision
 from qgs.contracts.metric import Column, Metric, MetricInput
 from qgs.contracts.objective import Objective, Outcome, Passes
 from qgs.contracts.optimizer import Optimizer, OptimizerConfig, ParameterGroup
-from qgs.contracts.plugin import CONTRACT_VERSION, Expected, ExpectedError, Plugin
+from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
 from qgs.contracts.queries import LearnedQueries, Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
@@ -49,8 +49,6 @@ __all__ = [
     "DecoderLayer",
     "Encoder",
     "EvaluationConfig",
-    "Expected",
-    "ExpectedError",
     "FeedForward",
     "FieldSpec",
     "Fields",

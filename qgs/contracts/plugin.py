@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
 
 from qgs.contracts.component import Component, ComponentConfig
 from qgs.contracts.weights import WeightLayout
@@ -12,21 +11,6 @@ CONTRACT_VERSION = 1
 
 ENTRY_POINT_GROUP = "qgs.plugins"
 """Where a distribution lists its `Plugin` object, under the plugin's name."""
-
-
-@dataclass(frozen=True)
-class ExpectedError:
-    """A check of the contract suite that is expected to raise, for example for want of a kernel.
-
-    error: the class of the error, or several; the check fails on any other. reason: why.
-    """
-
-    error: type[Exception] | tuple[type[Exception], ...]
-    reason: str
-
-
-Expected: TypeAlias = str | ExpectedError
-"""Why a component is known to fail a check: a reason, or an error with its reason."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +35,6 @@ class Plugin:
     layouts: Sequence[WeightLayout] = ()
     examples: Sequence[ComponentConfig] = ()
     models: Mapping[str, str] = field(default_factory=dict)
-    exemptions: Mapping[type[Component] | ComponentConfig, Mapping[str, Expected]] = field(
+    exemptions: Mapping[type[Component] | ComponentConfig, Mapping[str, str]] = field(
         default_factory=dict
     )

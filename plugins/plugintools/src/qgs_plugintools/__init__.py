@@ -10,7 +10,6 @@
 """
 
 import qgs_plugintools.checks  # noqa: F401  (registers the checks)
-from qgs.contracts import ExpectedError
 from qgs_plugintools.case import CannotCheck, Case, ContractError
 from qgs_plugintools.plugins import cases_of, check_plugin
 from qgs_plugintools.registry import CHECKS, checks_for
@@ -23,7 +22,6 @@ __all__ = [
     "CaseRun",
     "CheckResult",
     "ContractError",
-    "ExpectedError",
     "cases_of",
     "check_plugin",
     "checks_for",

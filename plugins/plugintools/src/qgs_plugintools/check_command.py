@@ -9,11 +9,7 @@ import typer
 from rich.console import Console
 
 from qgs.composer.registry import load_plugin
-from qgs.contracts import Component
 from qgs.io.checkpoint import load
-from qgs.wording import listed
-from qgs_plugintools.case import Case
-from qgs_plugintools.exercise import idle_options
 from qgs_plugintools.plugins import check_plugin as results_of
 from qgs_plugintools.plugins import without_case
 from qgs_plugintools.registry import TIERS
@@ -40,25 +36,11 @@ def check_plugin(
         f"{installed.plugin.contract_version}"
     )
     results: list[CheckResult] = []
-    sound: dict[type[Component], list[Case]] = {}
     made = results_of(name, ("core",) if core else TIERS)
     for _, group in groupby(made, key=lambda result: id(result.case)):
         of_case = list(group)
         _summarise(console, of_case)
-        if all(result.ok and not result.leaves_unchecked for result in of_case):
-            sound.setdefault(of_case[0].case.component, []).append(of_case[0].case)
         results += of_case
-    for component, cases in sound.items():
-        idle = idle_options(cases)
-        if untried := [option for option, tried in idle.items() if not tried]:
-            label = f"{component.slot}/{component.name}"
-            console.print(f"note: {label}: no other values were tried of {listed(untried)}")
-        for option, tried in ((option, tried) for option, tried in idle.items() if tried):
-            console.print(
-                f"note: {component.slot}/{component.name}: no value of `{option}` that was tried "
-                f"({listed(tried)}) changed anything, so no check exercised it; give an example "
-                "in which it matters for a few queries and tokens"
-            )
     unchecked = without_case(installed)
     for component, why in unchecked.items():
         label = f"{component.slot}/{component.name}"
@@ -102,8 +84,7 @@ def _summarise(console: Console, results: list[CheckResult]) -> None:
     for reason in dict.fromkeys(result.message for result in skipped):
         alike = [result for result in skipped if result.message == reason]
         names = ", ".join(result.check.name for result in alike)
-        many = alike[0].cause or any(result.leaves_unchecked for result in alike)
-        console.print(f"  skipped: {f'{len(alike)} checks' if many else names}: {reason}")
+        console.print(f"  skipped: {names if len(alike) < 4 else f'{len(alike)} checks'}: {reason}")
 
 
 def _total(results: list[CheckResult]) -> str:

@@ -1,21 +1,15 @@
 """`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
 
 import keyword
-import os
 import re
 import shlex
 import sys
-import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from importlib.metadata import (
-    PackageNotFoundError,
-    distribution,
     entry_points,
     packages_distributions,
 )
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -30,10 +24,6 @@ from qgs.io.files import refuse_existing, write_text
 app = typer.Typer(add_completion=False)
 
 NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
-LONGEST_NAME = 40
-WINDOWS_DEVICES = {"con", "prn", "aux", "nul"} | {
-    f"{d}{i}" for d in ("com", "lpt") for i in "123456789"
-}
 
 
 @app.command()
@@ -59,75 +49,32 @@ def distribution_of(name: str) -> str:
 
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
-    for refused, reason in _refusals(name):
-        if refused:
-            raise ValueError(f"`{name}` {reason}")
-
-
-def _refusals(name: str) -> Iterator[tuple[object, str]]:
-    """Whether something speaks against `name`, and what; each asked where nothing before does."""
-    letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-    near = re.sub(r"[^a-z0-9]+", "-", letters.lower()).lstrip("-0123456789").rstrip("-")
-    meant = f"; did you mean `{near}`?" if NAME.fullmatch(near) else ""
-    form = "lower-case letters and digits, a letter first, words joined by single hyphens or _"
-    yield not NAME.fullmatch(name), f"is no name of a plugin: {form}{meant}"
-    yield len(name) > LONGEST_NAME, f"has {len(name)} characters; {LONGEST_NAME} are the most"
-    own = "begins like the framework's own name; its distribution is qgs-NAME, leave `qgs` out"
-    yield re.match(r"qgs([-_]|$)", name), own
+    module = name.replace("-", "_")
+    if not NAME.fullmatch(name) or keyword.iskeyword(module):
+        raise ValueError(
+            f"`{name}` is no name of a plugin: lower-case letters and digits, a letter first, "
+            "words joined by single hyphens or _, and no word of Python's own"
+        )
+    if re.match(r"qgs([-_]|$)", name):
+        raise ValueError(f"`{name}`: the distribution is called qgs-NAME; leave `qgs` out")
     other = f"choose another, such as `{name}-things`"
-    yield name in WINDOWS_DEVICES, f"is the name of a device on Windows, and no file's; {other}"
-    module, packages = name.replace("-", "_"), packages_distributions()
-    yield keyword.iskeyword(module), f"is a word of Python's own, and no module's; {other}"
-    of = ", ".join(dict.fromkeys(packages.get(module, ["Python itself"])))
-    taken = module in sys.stdlib_module_names or module in packages
-    yield taken, f"is the name of a package that is installed here ({of}); {other}"
-    (value,) = load_mapping(f"name: {name}", name, Problems()).values()
-    yield value != name, f"would be read as {value!r} in a recipe's `plugins: [{name}]`; {other}"
+    if module in sys.stdlib_module_names or module in packages_distributions():
+        raise ValueError(f"`{name}` is the name of an installed package; {other}")
     for entry in entry_points(group="qgs.plugins", name=name):
         owner = entry.dist.name if entry.dist else "a plugin"
-        yield True, f"is taken by {owner}, and of two plugins qgs would use neither; {other}"
-    with suppress(PackageNotFoundError):
-        there = distribution(distribution_of(name))
-        replaced = f"{there.name} {there.version} is installed, which it would replace"
-        yield True, f"would be the distribution {distribution_of(name)}; {replaced}; {other}"
-
-
-@contextmanager
-def new_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` when the block ends well.
-
-    Makes missing parent folders. Raises FileExistsError if there is anything at `folder`, also
-    when it appeared while the block ran. When the block raises, there is no `folder`.
-    """
-    target = Path(folder)
-    refuse_existing(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
-        fresh = Path(temporary, target.name)
-        fresh.mkdir()
-        yield fresh
-        refuse_existing(target)
-        fresh.rename(target)
+        raise ValueError(f"`{name}` is taken by {owner}; {other}")
+    if load_mapping(f"name: {name}", name, Problems())["name"] != name:
+        raise ValueError(f"`{name}` is a value in YAML, no text; {other}")
 
 
 def write_plugin(name: str, folder: Path) -> None:
-    """Write the distribution of the plugin `name` into the new `folder`, whole or not at all.
+    """Write the distribution of the plugin `name` into the new `folder`.
 
-    Raises FileExistsError if there is anything at `folder`, OSError if none can be made there.
+    Raises FileExistsError if there is anything at `folder`.
     """
-    if folder.exists() or folder.is_symlink():
-        raise FileExistsError(
-            f"{folder} exists and is never overwritten; choose another folder with `--out FOLDER`"
-        )
-    try:
-        with new_folder(folder) as fresh:
-            for path, text in rendered(name):
-                write_text(fresh / path, text)
-    except OSError as error:
-        raise OSError(
-            f"cannot write {folder}: {error.strerror or error}; choose another folder with "
-            "`--out FOLDER`"
-        ) from error
+    refuse_existing(folder)
+    for path, text in rendered(name):
+        write_text(folder / path, text)
 
 
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:

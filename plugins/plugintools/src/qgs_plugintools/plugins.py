@@ -9,7 +9,7 @@ from qgs.composer.registry import (
     default_config,
     load_plugin,
 )
-from qgs.contracts import Component, ComponentConfig, Expected, ModelDims
+from qgs.contracts import Component, ComponentConfig, ModelDims
 from qgs_plugintools.case import Case
 from qgs_plugintools.places import file_of
 from qgs_plugintools.registry import TIERS, Tier, checked_tiers, checks_for
@@ -42,7 +42,7 @@ def without_case(installed: InstalledPlugin) -> dict[type[Component], str]:
     return {c: _why_no_default(c) for c in installed.plugin.components if c not in checked}
 
 
-def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping[str, Expected]]:
+def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping[str, str]]:
     """The known failures of each of the `cases`: those of its class and those of its options.
 
     Raises PluginError for exemptions that no check of the cases can have.

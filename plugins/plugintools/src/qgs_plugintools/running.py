@@ -1,15 +1,10 @@
 """Run the checks of a case and report how they went, alone or as pytest tests."""
 
-import traceback
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
-import torch
-
 from qgs.composer.errors import did_you_mean
-from qgs.contracts import Expected, ExpectedError
 from qgs.contracts.component import MissingExtraError
 from qgs_plugintools.case import CannotCheck, Case, ContractError
 from qgs_plugintools.places import file_of, package_of, place_in
@@ -25,27 +20,18 @@ from qgs_plugintools.registry import (
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
 
-ExpectedFailures: TypeAlias = Mapping[str, Expected] | Callable[[Case], Mapping[str, Expected]]
+ExpectedFailures: TypeAlias = Mapping[str, str] | Callable[[Case], Mapping[str, str]]
 """Check -> why it fails, for all cases, or as a function of the case."""
-
-NOT_THE_AUTHORS = (Path(__file__).parent, Path(torch.__file__).parent)
-"""Code that an error passes through but that a component's author cannot mend."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """How a check of a case went.
-
-    message: why it did not simply pass. cause: name of the failed check that explains why this one
-    was skipped, else "". crashed: whether it ended with an error of the component's own code.
-    """
+    """How a check of a case went. message: why it did not simply pass."""
 
     case: Case
     check: Check
     verdict: Verdict
     message: str = ""
-    cause: str = ""
-    crashed: bool = False
 
     @property
     def ok(self) -> bool:
@@ -55,54 +41,51 @@ class CheckResult:
     @property
     def leaves_unchecked(self) -> bool:
         """Whether the component could not be built or called here."""
-        return self.verdict == "skipped" and self.check.name in BASICS and not self.cause
+        return self.verdict == "skipped" and self.check.name in BASICS
 
 
 class CaseRun:
-    """The checks of one case, run one after the other, so that one cause is reported once.
+    """The checks of one case, one after the other. After `builds` or `runs` the rest is skipped."""
 
-    After `builds` or `runs` failed, checks that end with an error are skipped and refer to it.
-    """
-
-    def __init__(self, case: Case, expected: Mapping[str, Expected] | None = None) -> None:
+    def __init__(self, case: Case, expected: Mapping[str, str] | None = None) -> None:
         self.case = case
         self.expected = expected or {}
         self.cause = ""
 
     def make(self, check: Check) -> CheckResult:
         """Run the next check."""
-        result = run_check(check, self.case, self.expected.get(check.name))
-        if result.verdict != "failed":
-            self.cause = "" if check.name == self.cause else self.cause
-            return result
-        if self.cause and result.crashed and check.name != self.cause:
-            why = f"ends with an error as `{self.cause}` does: see that check"
-            return replace(result, verdict="skipped", message=why, cause=self.cause)
+        if self.cause not in ("", check.name):
+            return CheckResult(self.case, check, "skipped", f"`{self.cause}` fails: see that check")
+        result = run_check(check, self.case, self.expected.get(check.name, ""))
         if check.name in BASICS:
-            self.cause = check.name
+            self.cause = "" if result.ok else check.name
         return result
 
 
-def run_check(check: Check, case: Case, expected: Expected | None = None) -> CheckResult:
+def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
     """Run `check` on `case`. expected: why it is known to fail; then passing is a fault.
 
-    Raises ValueError for a check of other slots, and for an expected failure that cannot be.
+    Raises ValueError for a check of other slots.
     """
     if case.slot not in check.slots:
         raise ValueError(f"the check `{check.name}` is not for {case.label}; see checks_for(case)")
-    if expected is not None:
-        refuse_unexpectable({check.name: expected}, [case])
+    title = f"{case.label}: {check.name}"
     try:
         check.function(case)
     except (CannotCheck, MissingExtraError) as error:
         return CheckResult(case, check, "skipped", str(error))
+    # SystemExit: a component that ends the process would end the suite.
     except (Exception, SystemExit) as error:
-        return _failed(check, case, error, expected)
-    if expected is None:
+        seen = with_place(error, file_of(case.component))
+        if expected:
+            return CheckResult(case, check, "expected failure", f"{expected} (seen: {seen})")
+        message = f"{title}\n  seen: {seen}\n  contract: {check.contract}"
+        return CheckResult(case, check, "failed", message)
+    if not expected:
         return CheckResult(case, check, "passed")
-    why = f"{case.label}: {check.name} passes, although it is expected to fail: "
     fix = "drop the expected failure, or restrict it to the options with which it fails"
-    return CheckResult(case, check, "unexpected pass", f"{why}{_reason(expected)}\n  fix: {fix}")
+    why = f"{title} passes, although it is expected to fail: {expected}\n  fix: {fix}"
+    return CheckResult(case, check, "unexpected pass", why)
 
 
 def refuse_unexpectable(expected: Mapping[str, Any], cases: Iterable[Case]) -> None:
@@ -115,63 +98,23 @@ def refuse_unexpectable(expected: Mapping[str, Any], cases: Iterable[Case]) -> N
         if name not in CHECKS:
             fix = did_you_mean(str(name), CHECKS, "checks")
             raise ValueError(f"there is no check `{name}`; {fix}")
-        if not slots & set(CHECKS[name].slots):
+        if not slots & set(CHECKS[name].slots) or name in BASICS:
             others = ", ".join(sorted(CHECKS[name].slots))
-            raise ValueError(f"the check `{name}` applies to none of the cases, but to {others}")
-        if name in BASICS:
-            raise ValueError(f"`{name}` cannot fail as expected: no other check would mean a thing")
-        reason = _reason(why)
-        if not (isinstance(reason, str) and reason.strip()):
+            raise ValueError(f"`{name}` cannot be expected to fail here; it is for {others}")
+        if not (isinstance(why, str) and why.strip()):
             raise ValueError(f"the expected failure of `{name}` needs a reason, as a text")
-        kinds = why.error if isinstance(why, ExpectedError) else OSError
-        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
-        if not kinds or any(issubclass(ContractError, kind) for kind in kinds):
-            raise ValueError(
-                f"the expected error of `{name}` is {kinds!r}; name a class that neither every "
-                "error nor a broken contract (ContractError) is"
-            )
-
-
-def _reason(expected: Expected) -> str:
-    return expected.reason if isinstance(expected, ExpectedError) else expected
-
-
-def _failed(
-    check: Check, case: Case, error: BaseException, expected: Expected | None
-) -> CheckResult:
-    crashed = not isinstance(error, ContractError)
-    seen = with_place(error, file_of(case.component))
-    awaited = expected.error if isinstance(expected, ExpectedError) else ContractError
-    if expected is not None and isinstance(error, awaited):
-        why = f"{_reason(expected)} (seen: {seen})"
-        return CheckResult(case, check, "expected failure", why, crashed=crashed)
-    message = f"{case.label}: {check.name}\n  seen: {seen}\n  contract: {check.contract}"
-    if isinstance(expected, ExpectedError):
-        message += f"\n  expected: {expected.error!r}: {expected.reason}"
-    elif expected is not None:
-        fix = f"ExpectedError({type(error).__name__}, ...) if the error is meant"
-        message += f"\n  expected: a broken contract: {expected}\n  fix: mend the error, or {fix}"
-    return CheckResult(case, check, "failed", message, crashed=crashed)
 
 
 def with_place(error: BaseException, file: str | None) -> str:
     """Type and message of `error`, and the place in the component's package that raised it.
 
-    file: the one that defines the component, None if there is none. An error that never passed
-    its package is placed in the first frame outside of this suite and of torch. What breaks the
-    contract has no place.
+    file: the one that defines the component, None if there is none. A broken contract has no place.
     """
     if isinstance(error, ContractError):
         return str(error)
-    place = place_in(error, [package_of(file)]) if file else ""
-    if not place:
-        frames = traceback.extract_tb(error.__traceback__)
-        files = [(frame, Path(frame.filename).resolve()) for frame in frames]
-        others = [f for f, file in files if not any(map(file.is_relative_to, NOT_THE_AUTHORS))]
-        frame = (others or frames[-1:])[0]
-        place = f"{frame.filename}:{frame.lineno}"
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    return f"{what} (raised under {place})"
+    place = place_in(error, [package_of(file)]) if file else ""
+    return f"{what} (raised under {place})" if place else what
 
 
 @dataclass(frozen=True)
@@ -207,38 +150,23 @@ def parametrize_with_checks(
             check()
 
     expected_failures: check -> why the cases fail it, or a function that gives that for a case.
-        A check that passes nevertheless is a failure. A reason is for a check that sees the
-        contract broken; for one that ends with an error, write `ExpectedError(ItsClass, reason)`.
+        A check that passes nevertheless is a failure.
     tiers: "core", "extended".
     Raises TypeError if `cases` is not a list of cases, at least one; ValueError for unknown tiers
-    and expected failures that no check can have; MissingExtraError without pytest.
+    and expected failures that no check can have.
     """
-    try:
-        import pytest
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            "parametrize_with_checks needs pytest, which is not installed: run `pip install "
-            "pytest`, or run the checks with `qgs check-plugin` or qgs_plugintools.run_check"
-        ) from error
+    import pytest
+
     chosen, wanted = list(cases), checked_tiers(tiers)
     if not chosen or not all(isinstance(case, Case) for case in chosen):
         raise TypeError(f"{cases!r} is no list of cases; give [Case(MyComponent.Config())]")
     parameters = []
-    for case, expected in zip(chosen, _expected_of(expected_failures, chosen), strict=True):
+    for case in chosen:
+        expected = expected_failures(case) if callable(expected_failures) else expected_failures
+        refuse_unexpectable(expected or {}, [case] if callable(expected_failures) else chosen)
         run = CaseRun(case, expected)
         parameters += [
             pytest.param(BoundCheck(check, run), id=f"{case.label}-{check.name}")
             for check in checks_for(case, wanted)
         ]
     return pytest.mark.parametrize("check", parameters)
-
-
-def _expected_of(given: ExpectedFailures | None, cases: list[Case]) -> list[Mapping[str, Expected]]:
-    """The known failures of each case."""
-    if callable(given):
-        found = [given(case) for case in cases]
-        for case, expected in zip(cases, found, strict=True):
-            refuse_unexpectable(expected, [case])
-        return found
-    refuse_unexpectable(given or {}, cases)
-    return [given or {}] * len(cases)
