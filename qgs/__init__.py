@@ -31,7 +31,10 @@ __version__ = "0.1.0"
 DISTRIBUTIONS = {
     "qgs.plugins": {
         name: f"query-gaussians-{name}"
-        for name in ("locus", "ellipsoid", "rooms", "c3g", "gslrm", "globalsplat", "tokengs2026")
+        for name in (
+            *("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "tokengs2026"),
+            *("rooms", "datasets"),
+        )
     },
     "qgs.commands": {
         "data": "query-gaussians-datatools",

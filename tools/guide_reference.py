@@ -15,7 +15,7 @@ from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
-PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "tokengs2026", "rooms")
+PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "tokengs2026", "rooms", "datasets")
 
 SECTIONS: Mapping[str, type[ComponentConfig]] = {
     "Top level": RecipeSettings,

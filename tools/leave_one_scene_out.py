@@ -19,9 +19,9 @@ from typing import Any
 
 import torch
 import yaml
+from qgs_datasets.chunk_files import list_scenes, load_chunk
 from upath import UPath
 
-from qgs.data.chunk_files import list_scenes, load_chunk
 from qgs.engine.results import markdown_table
 from qgs.io.files import write_text
 

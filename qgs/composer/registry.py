@@ -36,8 +36,6 @@ BUILTIN = Plugin(
     layouts=(qgs.components.TOKENGS,),
     examples=(
         qgs.components.LayerSupervision.Config(layers=(1, 2)),
-        qgs.data.ChunksSource.Config(path="chunks"),  # type: ignore[call-arg]
-        qgs.data.Dl3dvSource.Config(path="dl3dv"),  # type: ignore[call-arg]
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
     ),
 )

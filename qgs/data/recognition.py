@@ -1,7 +1,6 @@
 """Which source opens a path, and opening it for a trained model."""
 
 from collections.abc import Mapping
-from itertools import islice
 
 from upath import UPath
 
@@ -14,23 +13,21 @@ from qgs.data.scenes import warn_once
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
     """PLUGIN/NAME of the first of `sources` that recognises `path`, else qgs/photos.
 
-    Those of plugins are asked before those of qgs, which know less of a special layout; where
-    several recognise it, a warning names them. Photos say best what a folder lacks. Raises
-    FileNotFoundError when `path` does not exist.
+    A warning names all if several do. Raises FileNotFoundError when `path` does not exist.
     """
     if not path.exists():
         raise FileNotFoundError(
             f"{path} (from {UPath.cwd()}) does not exist: give the folder of a data set"
         )
-    own = [kind for kind in sources if kind.startswith("qgs/")]
-    found = [kind for kind in sources if kind not in own and _recognises(kind, sources[kind], path)]
-    found += islice((kind for kind in own if _recognises(kind, sources[kind], path)), 1)
+    # plugins first: photos lie in many a layout that only a plugin reads in full
+    asked = sorted(sources, key=lambda kind: kind.startswith("qgs/"))
+    found = [kind for kind in asked if _recognises(kind, sources[kind], path)]
     if len(found) > 1:
         warn_once(
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
             "choose another, name it as `data.type` of a recipe, or as --format of `qgs data check`"
         )
-    return found[0] if found else "qgs/photos"
+    return found[0] if found else "qgs/photos"  # whose errors say best what a folder lacks
 
 
 def _recognises(kind: str, source: type[Component], path: UPath) -> bool:

@@ -23,7 +23,7 @@ SIZE = (16, 16)
 
 def recipe(**data):
     data = {"data": {"image_size": [*SIZE], **data}} if data else {}
-    return resolve({"recipe": 1, "plugins": ["rooms"], "model": MODEL, **data})
+    return resolve({"recipe": 1, "plugins": ["rooms", "datasets"], "model": MODEL, **data})
 
 
 def chosen(trained, path, size=None, name=None):
@@ -66,9 +66,9 @@ def test_one_scene_of_chunks(folders, tmp_path):
     source = PhotosSource(PhotosSource.Config(path=str(folders), image_size=SIZE, holdout=4))
     chunks = tmp_path / "chunks"
     packing.pack(source, packing.own_splits(source), UPath(chunks), {})
-    scene, seen = chosen(recipe(type="qgs/chunks", path=str(tmp_path)), chunks, name="b")
+    scene, seen = chosen(recipe(type="datasets/chunks", path=str(tmp_path)), chunks, name="b")
     assert (scene.name, len(scene), list(seen)) == ("b", 4, [])
-    scene, seen = chosen(recipe(type="qgs/chunks", path=str(chunks)), chunks, (8, 12), "a")
+    scene, seen = chosen(recipe(type="datasets/chunks", path=str(chunks)), chunks, (8, 12), "a")
     assert list(seen) == [0, 1, 3]
     assert tuple(scene.images([1]).shape[-2:]) == (8, 12)
 

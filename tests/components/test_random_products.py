@@ -17,7 +17,7 @@ from qgs.composer.yaml_text import inline
 from qgs.contracts import Component
 from qgs.engine.training_pass import TrainingPass
 
-PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "tokengs2026"]
+PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "tokengs2026", "datasets"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")
 DRAWN = ("encoder", "queries", *LAYER, "head", "centers", "objective", "losses")
 DRAWS, LEAST = 300, 60
@@ -110,7 +110,7 @@ def _drawn(random: random.Random) -> dict[str, Any]:
     decoder = {slot: parts[slot] for slot in LAYER if slot in parts and depth}
     losses = [{"type": "qgs/photometric"}, *([parts["losses"]] if "losses" in parts else [])]
     model = {slot: parts[slot] for slot in ("encoder", "queries", "head", "centers")}
-    data = {"type": random.choice(["qgs/photos", "qgs/chunks"]), "path": "nowhere"}
+    data = {"type": random.choice(["qgs/photos", "datasets/chunks"]), "path": "nowhere"}
     return {
         "recipe": 1,
         "plugins": PLUGINS,

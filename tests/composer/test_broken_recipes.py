@@ -60,7 +60,7 @@ BROKEN = (
      "model:\n  decoder:\n    layers:\n      12: {feed_forward: {ratio: 2}}\n"),
     ("missing recipe version", 1, "recipe", "missing", "seed: 1\n"),
     ("newer recipe version", 1, "recipe", "1", "recipe: 2\n"),
-    ("data without a type", 2, "data.type", "qgs/chunks", "data: {image_size: [64, 64]}\n"),
+    ("data without a type", 2, "data.type", "qgs/photos", "data: {image_size: [64, 64]}\n"),
     ("loss without a type", 3, "losses.mine.type", "type", "losses:\n  mine: {weight: 0.1}\n"),
     ("too few items", 2, "views.gap", "2 items", "views: {gap: [5]}\n"),
     ("gap in the wrong order", 3, "views.gap", "[4, 9]", "views:\n  gap: [9, 4]\n"),

@@ -179,7 +179,7 @@ def test_settings_that_contradict_each_other(changed: Any, sound: Any) -> None:
 
 @pytest.mark.parametrize("loss", [{"type": "qgs/lpips"}, {"padding": "valid"}])
 def test_images_that_are_too_small_for_a_loss(loss: Any) -> None:
-    data = {"type": "qgs/chunks", "path": "x", "image_size": [8, 16]}
+    data = {"type": "qgs/photos", "path": "x", "image_size": [8, 16]}
     losses = {"mine": {"type": "qgs/photometric", **loss}}
     ((option, _),) = problems_of({"losses": losses, "data": data})
     assert option.startswith("losses.mine")

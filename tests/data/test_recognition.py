@@ -1,6 +1,7 @@
 """Which source opens a path: those of qgs and of plugins alike."""
 
 import pytest
+from qgs_datasets import plugin as datasets
 from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
 
@@ -11,24 +12,25 @@ from qgs.data.recognition import open_for, recognised
 
 HASH = "0a" * 32
 HOLDINGS = {
-    "train/index.json": "qgs/chunks",
-    "test/000000.torch": "qgs/chunks",
-    "000000.torch": "qgs/chunks",
+    "train/index.json": "datasets/chunks",
+    "test/000000.torch": "datasets/chunks",
+    "000000.torch": "datasets/chunks",
     "transforms.json": "qgs/photos",
     "transforms_train.json": "qgs/photos",
     "poses_bounds.npy": "qgs/photos",
     "scene/transforms.json": "qgs/photos",
     "train/scene/transforms.json": "qgs/photos",
-    f"{HASH}.zip": "qgs/dl3dv",
-    f"1K/{HASH}.zip": "qgs/dl3dv",
-    f"{HASH}/transforms.json": "qgs/dl3dv",
-    f"{HASH}/gaussian_splat/transforms.json": "qgs/dl3dv",
-    "garden/nerfstudio/transforms.json": "qgs/dl3dv",
-    "2K/garden/gaussian_splat/transforms.json": "qgs/dl3dv",
+    f"{HASH}.zip": "datasets/dl3dv",
+    f"1K/{HASH}.zip": "datasets/dl3dv",
+    f"{HASH}/transforms.json": "datasets/dl3dv",
+    f"{HASH}/gaussian_splat/transforms.json": "datasets/dl3dv",
+    "garden/nerfstudio/transforms.json": "datasets/dl3dv",
+    "2K/garden/gaussian_splat/transforms.json": "datasets/dl3dv",
     "garden.tape": "tapes/tape",
     "readme.txt": "qgs/photos",
 }
-SOURCES = Registry({"qgs": builtin(), "tapes": InstalledPlugin(plugin)}).components("data")
+PLUGINS = {"datasets": InstalledPlugin(datasets), "tapes": InstalledPlugin(plugin)}
+SOURCES = Registry({"qgs": builtin(), **PLUGINS}).components("data")
 
 
 @pytest.mark.parametrize("held", HOLDINGS)
@@ -43,7 +45,7 @@ def test_by_content(tmp_path, held, url):
 
 def test_files_and_nothing(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"")
-    assert recognised(UPath(tmp_path / "a.zip"), SOURCES) == "qgs/dl3dv"
+    assert recognised(UPath(tmp_path / "a.zip"), SOURCES) == "datasets/dl3dv"
     with pytest.raises(FileNotFoundError, match="does not exist"):
         recognised(UPath(tmp_path / "b"), SOURCES)
 

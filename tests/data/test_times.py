@@ -14,13 +14,14 @@ import torch
 from commands import run_qgs
 from line_scenes import Line, Lines
 from PIL import Image
+from qgs_datasets.chunks import ChunksSource
 from qgs_datatools.packing import own_splits, pack
 from training_runs import run
 from upath import UPath
 
 from qgs.composer import RecipeError, resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data import ChunksSource, PhotosSource
+from qgs.data import PhotosSource
 from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.sampling import collate, draw_frames, make_sample
 

@@ -125,8 +125,8 @@ def test_drawn_scenes_are_named_and_a_long_index_is_not(tiny: Tiny, file: Path) 
     [
         ("qgs/photos", "data.holdout=4"),
         ("qgs/photos", "data.max_frames=9"),
-        ("qgs/chunks", "data.holdout=4"),
-        ("qgs/dl3dv", "data.holdout=4"),
+        ("datasets/chunks", "data.holdout=4"),
+        ("datasets/dl3dv", "data.holdout=4"),
     ],
 )
 def test_splits_count_only_where_no_index_names_the_frames(
@@ -134,7 +134,7 @@ def test_splits_count_only_where_no_index_names_the_frames(
 ) -> None:
     def recipe(*more: str) -> Recipe:
         tree = yaml.safe_load((RECIPES / "tokengs.yaml").read_text())
-        return resolve({**tree, "data": {"type": kind, "path": "x"}}, more)
+        return resolve({**tree, "plugins": ["datasets"], "data": {"type": kind, "path": "x"}}, more)
 
     plain, split = recipe(), recipe(override)
     index = read_index(str(file))

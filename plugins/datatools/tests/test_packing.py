@@ -12,11 +12,12 @@ import pytest
 import torch
 from commands import run_qgs
 from PIL import Image
+from qgs_datasets.chunks import ChunksSource
+from qgs_datasets.dl3dv import Dl3dvSource
 from qgs_datatools import packing
 from upath import UPath
 
 from qgs.composer import resolve
-from qgs.data import ChunksSource, Dl3dvSource
 from qgs.data.paths import opened_path
 
 SIZE = (24, 32)

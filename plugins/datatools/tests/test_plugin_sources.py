@@ -9,10 +9,9 @@ import pytest
 import tape_source
 import torch
 from commands import run_qgs
+from qgs_datasets.chunks import ChunksSource
 from qgs_datatools import sources
 from tape_source import Tape
-
-from qgs.data import ChunksSource
 
 run = partial(run_qgs, "data")
 

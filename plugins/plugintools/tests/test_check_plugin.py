@@ -13,7 +13,7 @@ from qgs.components import (
 )
 from qgs.composer.registry import InstalledPlugin, PluginError
 from qgs.contracts import CONTRACT_VERSION, MissingExtraError, Plugin, ViewsConfig
-from qgs.data import ChunksSource
+from qgs.data import PhotosSource
 from qgs.renderers import TorchRenderer
 
 UNBOUNDED = FreeCenters.Config(output_limit=None)
@@ -132,7 +132,7 @@ def test_a_component_that_ends_the_process_fails(monkeypatch) -> None:
     ("component", "why"),
     [
         (CannotDefault, "its default options are refused: RuntimeError: no defaults today"),
-        (ChunksSource, "there is no default for `path`"),
+        (PhotosSource, "there is no default for `path`"),
     ],
 )
 def test_what_has_no_default_options_is_named(monkeypatch, component, why) -> None:

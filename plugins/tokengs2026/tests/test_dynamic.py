@@ -164,7 +164,7 @@ def test_dynamic_queries_do_without_cameras() -> None:
 
 def test_what_reads_times_is_refused_beside_data_that_tell_none() -> None:
     assert resolve(RECIPE)
-    assert resolve({**RECIPE, "data": {"type": "qgs/chunks", "path": "x"}})
+    assert resolve({**RECIPE, "data": {"type": "qgs/photos", "path": "x"}})
     with pytest.raises(RecipeError) as caught:
         resolve(
             {**RECIPE, "plugins": ["rooms", "tokengs2026"], "data": {"type": "rooms/procedural"}}

@@ -237,10 +237,10 @@ class PhotosSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """A listing of cameras in the folder, in one inside, or in one inside train or test."""
-        places = [place for place in (path, path / "train", path / "test") if place.is_dir()]
-        inside = (item for place in places for item in place.iterdir() if item.is_dir())
-        return bool(formats_of(path)) or any(map(formats_of, inside))
+        """A listing of cameras in the folder. Any other folder is opened as photos for want of a
+        source that recognises it, folders of scenes included.
+        """
+        return bool(formats_of(path))
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:

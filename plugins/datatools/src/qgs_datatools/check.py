@@ -22,7 +22,7 @@ from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
 from qgs_datatools.indices import Held, found_indices, index_findings
-from qgs_datatools.sources import kind_of, left_out, source_scenes, sources
+from qgs_datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def check(
         *readers(),
         "dl3dv",
         "chunks",
-        *(kind for kind in sources() if not kind.startswith("qgs/")),
+        *(kind for kind in sources() if kind.partition("/")[0] not in OF_FILES),
     )
     if options.format not in formats:
         told = "; ".join([", ".join(formats), *left_out()])

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from upath import UPath
-
-from qgs.data.chunk_files import (
+from qgs_datasets.chunk_files import (
     INDEX,
     SUFFIX,
     Record,
@@ -24,6 +22,8 @@ from qgs.data.chunk_files import (
     read_mask,
     unit_problems,
 )
+from upath import UPath
+
 from qgs.data.lenses import Size
 from qgs.data.photos.reader import PhotoFrame
 from qgs.wording import listed

@@ -192,7 +192,8 @@ def _opened(
 
 
 def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None) -> Splits:
-    from qgs.data.dl3dv import read_scene_list
+    from qgs_datasets.dl3dv import read_scene_list
+
     from qgs.data.paths import opened_path
     from qgs_datatools.packing import own_splits, splits_by_list, splits_by_number
 

@@ -90,7 +90,7 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
 def chunk_entry(
     key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None = None
 ) -> ChunkEntry:
-    """The entry of a scene; see `qgs.data.chunk_files` for its keys."""
+    """The entry of a scene; see `qgs_datasets.chunk_files` for its keys."""
     names = [frame.name for frame in frames]
     entry = {
         "key": key,

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from functools import partial
 
+from qgs_datasets.dl3dv import find_scenes, scene_folder
 from upath import UPath
 
-from qgs.data.dl3dv import find_scenes, scene_folder
 from qgs.data.paths import read_file
 from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.reader import existing

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import IO, Any, TypeAlias, get_args
 
 import torch
+from qgs_datasets.chunk_files import INDEX, SUFFIX
 from upath import UPath
 
 from qgs.contracts import SceneSource, Split
-from qgs.data.chunk_files import INDEX, SUFFIX
 from qgs.data.paths import is_local
 from qgs.io.files import replacing
 from qgs.wording import listed

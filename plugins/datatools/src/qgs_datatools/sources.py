@@ -15,6 +15,9 @@ from qgs_datatools.candidates import Candidate, Photo
 from qgs_datatools.conventions import OPENCV
 from qgs_datatools.entries import Encoding
 
+OF_FILES = ("qgs", "datasets")
+"""Plugins whose sources are checked by their files, not by what they deliver."""
+
 _SIZE = (256, 256)  # of the images that a source is asked for
 
 
@@ -35,8 +38,10 @@ def left_out() -> list[str]:
 
 
 def kind_of(path: UPath) -> str:
-    """PLUGIN/NAME of the source that reads `path`, less `qgs/`. Raises as `recognised`."""
-    return recognised(path, sources()).removeprefix("qgs/")
+    """PLUGIN/NAME of the source that reads `path`, or NAME for those whose files are checked."""
+    kind = recognised(path, sources())
+    plugin, _, name = kind.partition("/")
+    return name if plugin in OF_FILES else kind
 
 
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:

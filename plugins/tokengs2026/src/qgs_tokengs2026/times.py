@@ -26,7 +26,7 @@ def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
             "time_channels",
             f"the data of this recipe have no times: `time_channels: {channels}` reads them",
             "set time_channels to 0, or take qgs/photos (each frame of a transforms file with its "
-            "'time') or qgs/chunks packed from them",
+            "'time') or datasets/chunks packed from them",
         )
 
 

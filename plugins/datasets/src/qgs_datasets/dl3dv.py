@@ -1,4 +1,4 @@
-"""`qgs/dl3dv`: DL3DV's scenes, from archives or folders."""
+"""`datasets/dl3dv`: DL3DV's scenes, from archives or folders."""
 
 import re
 import zipfile
@@ -23,7 +23,7 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 
 
 class Dl3dvConfig(SceneSource.Config):
-    """Options of `qgs/dl3dv`."""
+    """Options of `datasets/dl3dv`."""
 
     path: str
     """Folder or fsspec URL of the data set, of a subset or of one scene, relative to the working

@@ -9,9 +9,8 @@ import photo_formats
 import pytest
 import torch
 from photo_formats import row_of_frames
+from qgs_datasets.dl3dv import Dl3dvSource, read_scene_list
 from upath import UPath
-
-from qgs.data.dl3dv import Dl3dvSource, read_scene_list
 
 LENS = {"camera_model": "OPENCV", "k1": -0.5, "k2": 0.01, "p1": 1e-3, "p2": -2e-3}
 

@@ -11,10 +11,9 @@ import photo_formats
 import pytest
 import torch
 from PIL import Image
+from qgs_datasets.chunk_files import camera_problems, load_chunk, parse_record
+from qgs_datasets.chunks import ChunksSource
 from upath import UPath
-
-from qgs.data.chunk_files import camera_problems, load_chunk, parse_record
-from qgs.data.chunks import ChunksSource
 
 
 def encoded(color, size=(64, 36)) -> torch.Tensor:

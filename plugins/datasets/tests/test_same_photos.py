@@ -9,11 +9,13 @@ import pytest
 import torch
 from photo_formats import PHOTOS, opened
 from PIL import Image
+from qgs_datasets.chunks import ChunksSource
+from qgs_datasets.dl3dv import Dl3dvSource
 from qgs_datatools import packing
 from upath import UPath
 
 from qgs.contracts import Scene
-from qgs.data import ChunksSource, Dl3dvSource, PhotosSource
+from qgs.data import PhotosSource
 from qgs.data.images import to_tensor
 from qgs.data.scenes import EncodedScene
 

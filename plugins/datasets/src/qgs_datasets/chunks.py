@@ -1,4 +1,4 @@
-"""`qgs/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
+"""`datasets/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
 
 import io
 from collections.abc import Callable, Sequence
@@ -13,15 +13,6 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import SceneSource, Split
-from qgs.data.chunk_files import (
-    SUFFIX,
-    Chunk,
-    Record,
-    has_chunks,
-    list_scenes,
-    read_mask,
-    require_usable,
-)
 from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.lenses import Size
 from qgs.data.paths import opened_path
@@ -35,13 +26,22 @@ from qgs.data.scenes import (
 )
 from qgs.types import Cameras
 from qgs.wording import listed
+from qgs_datasets.chunk_files import (
+    SUFFIX,
+    Chunk,
+    Record,
+    has_chunks,
+    list_scenes,
+    read_mask,
+    require_usable,
+)
 
 _OPEN = 4  # chunks kept open
 _SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
 
 
 class ChunksConfig(SceneSource.Config):
-    """Options of `qgs/chunks`."""
+    """Options of `datasets/chunks`."""
 
     path: str
     """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
