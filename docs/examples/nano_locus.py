@@ -4,7 +4,7 @@
 
 trains a tiny model on scenes of random blobs. The weights are one dictionary `p`, named as in the
 framework: the tensors of a checkpoint of recipes/tiny/locus.yaml fit as they are, and a test holds
-every output against the framework's. A heading names the place of each part in the framework.
+Gaussians, image, loss and gradients against the framework's. Comments name each part's file there.
 
 Axes: B scenes, V views, M image tokens (the patches of all views), N queries, K Gaussians a query,
 D width, h heads. World: the frame of the first input camera. Cameras: c2w (B, V, 4, 4) in OpenCV
@@ -19,12 +19,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# The sizes of recipes/tiny/locus.yaml; those of the paper: 768, 12, 8, 3, 1024, 12, 64.
+# The sizes of recipes/tiny/locus.yaml; published: 1024, 16, 8, 3, 1024, 12, 64.
 WIDTH, HEADS, PATCH, ENCODER_DEPTH, QUERIES, DEPTH, PER_QUERY = 128, 4, 8, 1, 256, 4, 8
 SCALE_CAP = 0.15  # largest standard deviation of a Gaussian, world units
-OPACITY_BIAS = -1.0
 LAYER_WEIGHTS = {2: 1 / 3, 4: 2 / 3}  # decoder layers that the loss sees, and how much
-NEAR, FAR, BACKGROUND = 0.025, 125.0, 0.5
+OPACITY_BIAS, NEAR, FAR, BACKGROUND = -1.0, 0.025, 125.0, 0.5
 Gaussians = dict[str, Tensor]
 
 
@@ -33,7 +32,7 @@ class Weights(dict[str, Tensor]):
     """Parameters by name. One that is missing is made where it is first used."""
 
     def need(self, name: str, shape: tuple[int, ...], low: float, high: float) -> Tensor:
-        if name not in self:  # uniform from low to high, as torch's own layers start
+        if name not in self:  # uniform from low to high
             self[name] = torch.empty(shape).uniform_(low, high).requires_grad_()
         return self[name]
 
@@ -93,41 +92,38 @@ def patches(p: Weights, name: str, images: Tensor) -> Tensor:  # (B*V, C, H, W) 
 
 
 def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Sequence[Tensor]:
-    """A ViT over the patches of all views together; its keys and values serve all decoder layers.
-
-    images (B, V, 3, H, W) in [0, 1] -> keys and values (B, h, M, D/h), patch rays (B, M, 6).
-    """
+    """A ViT over all views; its keys, values (B, h, M, D/h) and patch rays serve all layers."""
     plucker = plucker_map(c2w, intrinsics, *images.shape[-2:]).flatten(0, 1)
     mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])[..., None, None]
     x = patches(p, "encoder.rgb_embedding", ((images - mean) / std).flatten(0, 1))
     x = x + patches(p, "encoder.ray_embedding", plucker)
     x = x.reshape(len(images), -1, WIDTH)
     for i in range(ENCODER_DEPTH):
-        at = f"encoder.blocks.{i}"
-        update = self_attention(p, f"{at}.attention", norm(p, f"{at}.norm1", x))
-        x = x + scaled(p, f"{at}.scale1", update)
-        update = mlp(p, f"{at}.mlp", norm(p, f"{at}.norm2", x), 4 * WIDTH, WIDTH)
-        x = x + scaled(p, f"{at}.scale2", update)
+        layer = f"encoder.blocks.{i}"
+        update = self_attention(p, f"{layer}.attention", norm(p, f"{layer}.norm1", x))
+        x = x + scaled(p, f"{layer}.scale1", update)
+        update = mlp(p, f"{layer}.mlp", norm(p, f"{layer}.norm2", x), 4 * WIDTH, WIDTH)
+        x = x + scaled(p, f"{layer}.scale2", update)
     k, v = linear(p, "encoder.kv_proj", norm(p, "encoder.norm", x), 2 * WIDTH).chunk(2, -1)
     rays = F.avg_pool2d(plucker, PATCH).flatten(2).transpose(1, 2)
     return norm(p, "encoder.k_norm", split(k)), split(v), rays.reshape(len(images), -1, 6)
 
 
-# ---- Decoder layer: qgs/components/decoder.py, and of qgs_locus the files of the same names ----
+# ---- Decoder layer: qgs/components/decoder.py; qgs_locus/{ray_bias,cross_attention,...}.py ----
 def support_radius(rho: Tensor) -> Tensor:
-    # The floor keeps all Gaussians of an anchor from falling on one point, where none has a slope.
+    # At r = 0 all Gaussians of an anchor would lie on one point and their offsets get no gradient.
     return F.softplus(rho).clamp_min(1e-3)
 
 
 def ray_bias(mu: Tensor, rho: Tensor, rays: Tensor) -> Tensor:
     """b (B, N, M) = -1/2 (D / sigma)^2, D the distance of the centre to the ray of a patch."""
-    m, d = rays.split(3, -1)
-    length = d.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # a mean of unit directions is shorter
-    m, d = (m / length)[:, None], (d / length)[:, None]
-    distance = (torch.linalg.cross(mu[:, :, None], d, dim=-1) - m).norm(dim=-1)
-    sigma = (0.1 * support_radius(rho)).clamp_min(math.sqrt(1e-3))
-    # The lower bound leaves every token in reach: softmax weights below exp(-20 gamma) would be 0,
-    # and an anchor that starts in the wrong place could not see where it belongs.
+    moment, direction = rays.split(3, -1)
+    length = direction.norm(dim=-1, keepdim=True)  # below 1: a mean of unit vectors
+    moment, direction = (x[:, None] / length[:, None] for x in (moment, direction))
+    distance = (torch.linalg.cross(mu[:, :, None], direction, dim=-1) - moment).norm(dim=-1)
+    # sigma is at least .032: the anchors of this recipe start there, and a radius above .316 widens
+    # it. b is at least -20: an anchor far from all rays still attends, by content.
+    sigma = (0.1 * support_radius(rho)).square().clamp_min(1e-3).sqrt()
     return (-0.5 * (distance / sigma).square()).clamp_min(-20)
 
 
@@ -140,7 +136,7 @@ def cross_attention(p: Weights, name: str, x: Tensor, b: Tensor, k: Tensor, v: T
 
 
 def anchor_aware(p: Weights, name: str, x: Tensor, mu: Tensor) -> Tensor:
-    """Self-attention over x + MLP(PE(mu)); the residual stream does not keep the sum."""
+    """Self-attention over x + MLP(PE(mu)); the position is added for this attention only."""
     divisor = 10_000 ** (2 * torch.arange(64) / 128) + 1e-6
     angle = ((torch.tanh(mu) + 1) * math.pi)[..., None] / divisor  # tanh: centres have no bounds
     sines = torch.stack([angle.sin(), angle.cos()], -1).flatten(2)
@@ -149,7 +145,7 @@ def anchor_aware(p: Weights, name: str, x: Tensor, mu: Tensor) -> Tensor:
 
 
 def posact(t: Tensor) -> Tensor:
-    """sign(t) (exp|t| - 1), at most 1000: fine steps near 0, and everything in reach."""
+    """sign(t) (exp|t| - 1), at most 1000: linear near 0, exponential far out, for positions."""
     t = t.clamp(-math.log1p(1000), math.log1p(1000))  # before exp, which would overflow
     return torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
 
@@ -176,19 +172,19 @@ def forward(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> dict
         z = 0.3 * (2.5 / 0.3) ** torch.rand(QUERIES, 1)
         p["queries.center"] = torch.cat([(2 * torch.rand(QUERIES, 2) - 1) * 0.6 * z, z], -1)
         p["queries.center"].requires_grad_()
-    radius = p.need("queries.raw_radius", (QUERIES, 1), -1.05, -1.05)  # softplus: 0.3
-    x, mu, rho = (y.expand(len(images), -1, -1) for y in (features, p["queries.center"], radius))
+    raw = p.need("queries.raw_radius", (QUERIES, 1), -1.05, -1.05)  # softplus: 0.3
+    x, mu, rho = (y.expand(len(images), -1, -1) for y in (features, p["queries.center"], raw))
     layers = {}
     for i in range(DEPTH):
-        at = f"decoder.{i}"
+        layer = f"decoder.{i}"
         bias = ray_bias(mu, rho, rays)
-        update = cross_attention(p, f"{at}.cross_attention", x, bias, k, v)
-        x = x + scaled(p, f"{at}.cross_scale", update)
-        x = x + scaled(p, f"{at}.self_scale", anchor_aware(p, f"{at}.self_attention", x, mu))
-        normed = norm(p, f"{at}.feed_forward.norm", x)
-        update = mlp(p, f"{at}.feed_forward.mlp", normed, 4 * WIDTH, WIDTH)
-        x = x + scaled(p, f"{at}.feed_forward_scale", update)
-        mu = mu + posact(mlp(p, "refinements.0.center_mlp", x, WIDTH, 3))  # of all layers
+        update = cross_attention(p, f"{layer}.cross_attention", x, bias, k, v)
+        x = x + scaled(p, f"{layer}.cross_scale", update)
+        x = x + scaled(p, f"{layer}.self_scale", anchor_aware(p, f"{layer}.self_attention", x, mu))
+        normed = norm(p, f"{layer}.feed_forward.norm", x)
+        update = mlp(p, f"{layer}.feed_forward.mlp", normed, 4 * WIDTH, WIDTH)
+        x = x + scaled(p, f"{layer}.feed_forward_scale", update)
+        mu = mu + posact(mlp(p, "refinements.0.center_mlp", x, WIDTH, 3))  # one for all layers
         rho = rho + mlp(p, "refinements.0.radius_mlp", x, WIDTH, 1)
         layers[i + 1] = {"mu": mu, "rho": rho, **decode(p, x, mu, rho)}
     return layers
@@ -203,22 +199,23 @@ def rotation(quats: Tensor) -> Tensor:  # (..., 4) w x y z -> (..., 3, 3)
 
 def render(g: Gaussians, b: int, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
     """RGB (3, H, W) of the Gaussians of scene b from one camera: EWA splatting, front to back."""
-    turn, (fx, fy, cx, cy), (height, width) = c2w[:3, :3].T, intrinsics, size
-    at = (g["means"][b] - c2w[:3, 3]) @ turn.T
-    seen = ((at[:, 2] >= NEAR) & (at[:, 2] <= FAR)).nonzero()[:, 0]
-    i = seen[at[seen, 2].argsort(stable=True)]
-    x, y, z = at[i].unbind(-1)
+    (fx, fy, cx, cy), (height, width) = intrinsics, size
+    w2c = c2w[:3, :3].T
+    in_camera = (g["means"][b] - c2w[:3, 3]) @ w2c.T
+    seen = ((in_camera[:, 2] >= NEAR) & (in_camera[:, 2] <= FAR)).nonzero()[:, 0]
+    i = seen[in_camera[seen, 2].argsort(stable=True)]  # front to back
+    x, y, z = in_camera[i].unbind(-1)
     u, v = fx * x / z + cx, fy * y / z + cy
-    # Outside the image the projection's slope is held: there it would grow without bound.
-    x = (x / z).clamp((-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
-    y = (y / z).clamp((-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
-    jacobian = torch.stack([fx / z, 0 * z, -fx / z * x, 0 * z, fy / z, -fy / z * y], -1)
-    spread = jacobian.unflatten(-1, (2, 3)) @ turn @ rotation(g["quats"][b, i])
+    # The Jacobian of the projection, at most 15 % outside the image: it grows without bound there.
+    slope_x = (x / z).clamp((-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
+    slope_y = (y / z).clamp((-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
+    rows = [fx / z, 0 * z, -fx / z * slope_x, 0 * z, fy / z, -fy / z * slope_y]
+    spread = torch.stack(rows, -1).unflatten(-1, (2, 3)) @ w2c @ rotation(g["quats"][b, i])
     spread = spread * g["scales"][b, i, None]
-    inverse = (spread @ spread.mT + 0.3 * torch.eye(2)).inverse()  # 0.3 pixel^2: no aliasing
+    inverse = (spread @ spread.mT + 0.3 * torch.eye(2)).inverse()  # low-pass of 3DGS, pixel^2
     du = (torch.arange(width) + 0.5 - u[:, None])[:, None]  # (G, 1, W)
     dv = (torch.arange(height) + 0.5 - v[:, None])[..., None]  # (G, H, 1)
-    (xx, xy), (_, yy) = (row.unbind(1) for row in inverse[..., None, None].unbind(1))
+    xx, xy, yy = (inverse[:, r, c, None, None] for r, c in ((0, 0), (0, 1), (1, 1)))
     power = -0.5 * (xx * du * du + yy * dv * dv) - xy * du * dv
     alpha = g["opacities"][b, i, None, None] * power.clamp_max(0).exp()
     alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.999), 0.0)
@@ -241,13 +238,13 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
     return (alike / ((energy + 0.01**2) * (xx + yy - energy + 0.03**2))).mean()
 
 
-def visibility(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
-    """Mean distance of points (B, P, 3) to the image of the nearest view, in halves of a side."""
-    at = (points[:, None] - c2w[..., None, :3, 3]) @ c2w[..., :3, :3]  # (B, V, P, 3)
-    z = torch.where(at[..., 2:].abs() < 1e-3, 1e-3, at[..., 2:])
-    pixel = intrinsics[..., None, :2] * at[..., :2] / z + intrinsics[..., None, 2:]
+def out_of_view(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """Mean of |u| - 1 and |v| - 1 beyond the nearest image, u and v from -1 to 1, at most 1."""
+    local = (points[:, None] - c2w[..., None, :3, 3]) @ c2w[..., :3, :3]  # (B, V, P, 3)
+    z = torch.where(local[..., 2:].abs() < 1e-3, 1e-3, local[..., 2:])  # finite gradients
+    pixel = intrinsics[..., None, :2] * local[..., :2] / z + intrinsics[..., None, 2:]
     outside = (2 * pixel / torch.tensor([size[1], size[0]]) - 1).abs().sub(1).relu().sum(-1)
-    outside = torch.where(at[..., 2] <= NEAR, torch.inf, outside)  # behind: not seen
+    outside = torch.where(local[..., 2] <= NEAR, torch.inf, outside)  # behind: not seen
     return outside.amin(1).clamp_max(1).mean()
 
 
@@ -263,7 +260,7 @@ def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Ten
         y = truth.flatten(0, 1)
         term = F.mse_loss(rgb, y) + 0.2 * (1 - ssim(rgb, y)) / 2
         for name, factor in (("means", 0.1), ("mu", 0.01)):
-            term = term + factor * visibility(g[name], c2w, intrinsics, size)
+            term = term + factor * out_of_view(g[name], c2w, intrinsics, size)
         total = total + weight * term
     return total
 
@@ -287,8 +284,10 @@ def main(steps: int) -> None:
     for step in range(steps):
         scene = blobs(views=4)
         value = loss(p, [x[:, :2] for x in scene], [x[:, 2:] for x in scene])
-        if optimizer is None:  # now all weights exist
-            optimizer = torch.optim.AdamW(p.values(), lr=1e-3, betas=(0.9, 0.95), weight_decay=0.05)
+        if optimizer is None:  # now all weights exist; biases and norms do not decay
+            groups = [{"params": [x for x in p.values() if x.ndim != 1], "weight_decay": 0.05}]
+            groups += [{"params": [x for x in p.values() if x.ndim == 1], "weight_decay": 0.0}]
+            optimizer = torch.optim.AdamW(groups, lr=1e-3, betas=(0.9, 0.95))
         optimizer.zero_grad()
         value.backward()
         torch.nn.utils.clip_grad_norm_(p.values(), 1.0)
