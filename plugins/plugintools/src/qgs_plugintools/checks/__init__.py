@@ -1,9 +1,12 @@
 """The checks, by subject. Importing this package registers them all."""
 
 from qgs_plugintools.checks import (  # noqa: F401
+    attention,
     basics,
+    encoders,
     fields,
     gradients,
+    judging,
     objective,
     options,
     parameters,
