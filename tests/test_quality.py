@@ -13,6 +13,7 @@ SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
 MAX_CORE_LINES, MAX_CORE_FILES = 23_300, 200
+MAX_PYTHON_LINES, MAX_LINES_OF_TESTS = 70_400, 28_100
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
@@ -45,8 +46,8 @@ def test_types() -> None:
     check(sys.executable, "-m", "basedpyright", "--pythonpath", sys.executable)
 
 
-def test_files_are_short_and_the_core_is_small() -> None:
-    """What is to grow beyond these bars says in docs/design.md what it is worth."""
+def test_files_are_short_and_sizes_only_fall() -> None:
+    """The limits are the sizes that were reached; they are lowered, never raised."""
     lengths = {
         str(path.relative_to(ROOT)): len(path.read_text(encoding="utf-8").splitlines())
         for path in files(SOURCES, {".py"})
@@ -55,6 +56,9 @@ def test_files_are_short_and_the_core_is_small() -> None:
     core = [lines for name, lines in lengths.items() if name.startswith("qgs/")]
     assert 0 < len(core) <= MAX_CORE_FILES
     assert sum(core) <= MAX_CORE_LINES
+    assert sum(lengths.values()) <= MAX_PYTHON_LINES
+    tests = [lines for name, lines in lengths.items() if "tests" in Path(name).parts]
+    assert sum(tests) <= MAX_LINES_OF_TESTS
 
 
 def lines_with(pattern: re.Pattern[str]) -> list[str]:
