@@ -1,7 +1,6 @@
 """Paired comparisons of results, and their intervals."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,6 +60,9 @@ def test_the_first_is_compared_with_each_of_the_others() -> None:
     pairs = compare([results(name, a=value, b=value) for name, value in values.items()]).pairs
     found = [(p.first.name, p.second.name, p.differences[0].difference) for p in pairs]
     assert found == [("x", "y", 1.0), ("x", "z", -2.0)]
+    seeds = [training(name, "A", s, a=1.0 + s, b=2.0) for s, name in enumerate("xy")]
+    (alone,) = compare(seeds).pairs
+    assert (alone.first.name, alone.second.name) == ("x", "y"), "seeds of one recipe alone"
 
 
 def test_what_cannot_be_compared_is_refused() -> None:
@@ -85,9 +87,8 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed() -> None:
     assert (psnr.trainings, psnr.scenes, psnr.difference) == (2, 2, pytest.approx(0.75))
     assert (pair.first.name, pair.second.name) == ("r/a", "r/b")
     text = compare([*ours, *theirs]).markdown()
-    assert re.search(r"\| metric +\| +a \| +b \| +difference", text)
-    for words in ("r/a: seed 2 left out", "unequal training: 1.90 times"):
-        assert words in text
+    assert "r/a: seed 2 left out" in text
+    assert "1.90 times" in text
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -95,12 +96,6 @@ def test_an_interval_over_scenes_says_nothing_of_training(count: int) -> None:
     ours = [training(f"r/a/{s}", "A", s, a=10.0 + s, b=12.0 - s) for s in range(count)]
     text = compare([*ours, training("r/b", "B", 0, a=9.0, b=11.0)]).markdown()
     assert "says nothing of training" in text
-
-
-def test_seeds_of_one_recipe_alone_are_compared_with_each_other() -> None:
-    pair = [training(name, "A", s, a=1.0 + s, b=2.0) for s, name in enumerate("xy")]
-    (found,) = compare(pair).pairs
-    assert (found.first.name, found.second.name) == ("x", "y")
 
 
 def test_folders_without_results_are_refused(tmp_path: Path) -> None:
@@ -112,12 +107,12 @@ def test_folders_without_results_are_refused(tmp_path: Path) -> None:
 
 
 def test_two_runs_compare_scene_by_scene(tmp_path: Path) -> None:
-    few = (*SMALL, "data.image_size=[32, 32]", "views.targets=2", "evaluation.scenes=3")
-    for name in ("locus", "tokengs"):
-        model = qgs.compose(RECIPES / f"{name}.yaml", overrides=few)
-        qgs.save(model, tmp_path / name / "checkpoint.safetensors")
-        assert run_qgs("eval", tmp_path / name).exit_code == 0
+    few = (*SMALL, "data.image_size=[16, 16]", "views.targets=1", "evaluation.scenes=2")
     runs = tmp_path / "locus", tmp_path / "tokengs"
+    for run in runs:
+        model = qgs.compose(RECIPES / f"{run.name}.yaml", overrides=few)
+        qgs.save(model, run / "checkpoint.safetensors")
+        assert run_qgs("eval", run).exit_code == 0
     result = run_qgs("compare", *runs, "--out", tmp_path)
     assert result.exit_code == 0, result.output
     psnr = json.loads((tmp_path / "comparison.json").read_text())["pairs"][0]["differences"][0]
@@ -125,7 +120,7 @@ def test_two_runs_compare_scene_by_scene(tmp_path: Path) -> None:
     means = [summary["model"]["psnr"] for summary in summaries]
     assert psnr["difference"] == pytest.approx(means[0] - means[1])
     assert psnr["low"] <= psnr["difference"] <= psnr["high"]
-    assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 3
+    assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 2
 
 
 VARIANCES = {"scenes": (0.1, 1.0, 0.1), "trainings": (1.0, 0.1, 0.1), "noise": (0.0, 0.0, 1.0)}

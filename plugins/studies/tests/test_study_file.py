@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -76,74 +77,32 @@ def test_a_study_extends_another_and_replaces_variants_by_name(tmp_path: Path) -
     assert all(r.training.batch_size == 1 and r.seed == 7 for r in recipes.values())
 
 
+VARIANT = "{model: {decoder: {cross_attention: {type: qgs/content}}}}"
 WRONG = {
-    "reference: full": (
-        "reference: ful",
-        ":7: reference",
-        "there is no variant `ful`",
-        "did you mean `full`?",
-    ),
-    "budget: {steps: 200}": (
-        "budget: {steps: 200, seconds: 3}",
-        ":8: budget",
-        "one of steps, seconds and images, got 2",
-        "write `budget:",
-    ),
-    "[flat < full]": (
-        "[flat < fulll]",
-        ":10: hypotheses.0",
-        "there is no variant `fulll`",
-        "did you mean `full`?",
-    ),
-    "study: 1\n": ("study: 1\nsead: [0]\n", ":2: sead", "there is no key `sead`", "`seeds`"),
-    "{cross_attention: {type: qgs/content}}": (
-        "{cross_attention: {type: qgs/contents}}",
+    "reference: full": ("reference: ful", ":7: reference", "`full`"),
+    "budget: {steps: 200}": ("budget: {steps: 200, seconds: 3}", ":8: budget", "got 2"),
+    "[flat < full]": ("[flat < fulll]", ":10: hypotheses.0", "`full`"),
+    "study: 1\n": ("study: 1\nsead: [0]\n", ":2: sead", "`seeds`"),
+    "{type: qgs/content}": (
+        "{type: qgs/contents}",
         ":5: variants.flat: model.decoder.cross_attention.type",
-        "qgs/contents",
-        "did you mean `qgs/content`?",
+        "`qgs/content`",
     ),
-    "  full:\n": ("  full: 3\n", ":4: variants.full", "this is the number 3", "mapping"),
-    "  tokengs:": ("  ../up:", ":6: variants.../up", "the name of a folder", "use letters"),
-    "tiny/tokengs.yaml\n": (
-        "tiny/tokens.yaml\n",
-        ":6: variants.tokengs",
-        "there is no recipe ",
-        "did you mean `tiny/tokengs.yaml`?",
-    ),
-    f"base: {RECIPES}/tiny/locus.yaml": (
-        "base: tiny/locuss.yaml",
-        ":2: base",
-        "there is no recipe ",
-        "did you mean `tiny/locus.yaml`?",
-    ),
-    "flat: {model: {decoder: {cross_attention: {type: qgs/content}}}}": (
-        "flat: tiny/locus.yaml",
-        ":5: variants.flat",
-        "`flat` is the same model as `full`",
-        "change an option",
-    ),
-    "{model: {decoder: {cross_attention: {type: qgs/content}}}}": (
-        "{views: {inputs: 3}}",
-        ":5: variants.flat",
-        "`views.inputs` is 3 in `flat` and 2 in the reference `full`",
-        "or add `differs: [views.inputs]`",
-    ),
-    "differs: [": (
-        "differs: [views.inputs, ",
-        "differs",
-        "`views.inputs` differs in no variant",
-        "remove it",
-    ),
+    "  full:\n": ("  full: 3\n", ":4: variants.full", "number 3"),
+    "  tokengs:": ("  ../up:", ":6: variants.../up", "letters"),
+    "tiny/tokengs.yaml\n": ("tiny/tokens.yaml\n", ":6: variants.tokengs", "tokens.yaml"),
+    f"base: {RECIPES}/tiny/locus.yaml": ("base: tiny/locuss.yaml", ":2: base", "locuss.yaml"),
+    f"flat: {VARIANT}": ("flat: tiny/locus.yaml", ":5: variants.flat", "`full`"),
+    VARIANT: ("{views: {inputs: 3}}", ":5: variants.flat", "`differs: [views.inputs]`"),
+    "differs: [": ("differs: [views.inputs, ", "differs", "`views.inputs`"),
     "differs: [losses.anchor_visibility]": (
         "",
         ":6: variants.tokengs",
-        "`losses.anchor_visibility.type` is None in `tokengs`",
-        "or add `differs: [losses.anchor_visibility]`",
+        "`differs: [losses.anchor_visibility]`",
     ),
     "budget:": (
         "evaluations: {more: {model: {width: 8}}}\nbudget:",
         ":8: evaluations.more.model",
-        "would change the trained model",
         "can only set",
     ),
 }
@@ -153,15 +112,14 @@ WRONG = {
 def test_what_is_wrong_is_told_with_its_line_before_anything_trains(
     tmp_path: Path, written: str
 ) -> None:
-    instead, place, reason, fix = WRONG[written]
+    instead, place, word = WRONG[written]
     assert SOUND.count(written) == 1
     with pytest.raises(RecipeError) as caught:
         composed(read(tmp_path, SOUND.replace(written, instead)))
     text = str(caught.value)
     assert text.startswith("1 problem in the study"), text
     assert place in text
-    assert reason in text
-    assert fix in text
+    assert word in text
 
 
 INDICES = """overlay: {evaluation: {index: 2views.json}}
@@ -197,36 +155,29 @@ def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path:
         index = json.loads(text)
         index.pop(next(iter(index)))
         (new / file).write_text(json.dumps(index))
-        with pytest.raises(
-            ValueError, match=f"judged on other scenes or frames .*{file}.*{remedy}"
-        ):
+        with pytest.raises(ValueError, match=f"{file}.*{remedy}"):
             planned(study, out)
         (new / file).write_text(text)
     planned(study, out)
 
 
-def test_variants_judged_by_the_same_index_under_two_names_are_alike(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["2views.json", "3views.json"])
+def test_variants_judged_by_the_same_index_under_two_names_are_alike(
+    tmp_path: Path, name: str
+) -> None:
     shutil.copy(RECIPES / "studies/rooms/2views.json", tmp_path / "again.json")
-    whole = "{type: qgs/content}}}}"
-    for name, alike in (("2views.json", True), ("3views.json", False)):
-        ours = f"evaluation: {{index: {RECIPES}/studies/rooms/{name}}}"
-        text = SOUND.replace(whole, whole[:-1] + f", {ours}}}")
-        text = text.replace(
-            "  full:\n", f"  full: {{evaluation: {{index: {tmp_path}/again.json}}}}\n"
-        )
-        text = text.replace("[flat < full]", "[flat < full]\ndiffers: []")
-        text = re.sub(r"differs: \[loss.*\n|  tokengs:.*\n", "", text)
-        if alike:
-            composed(read(tmp_path, text))
-        else:
-            with pytest.raises(RecipeError, match=r"`evaluation.index` is"):
-                composed(read(tmp_path, text))
+    ours = f"evaluation: {{index: {RECIPES}/studies/rooms/{name}}}"
+    text = SOUND.replace(VARIANT, VARIANT[:-1] + f", {ours}}}")
+    text = text.replace("  full:\n", f"  full: {{evaluation: {{index: {tmp_path}/again.json}}}}\n")
+    text = re.sub(r"differs: \[loss.*\n|  tokengs:.*\n", "", text)
+    with nullcontext() if name[0] == "2" else pytest.raises(RecipeError, match="index"):
+        composed(read(tmp_path, text))
 
 
 def test_a_budget_that_the_optimiser_cannot_use_names_the_variant(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"warmup is 100") as caught:
+    with pytest.raises(ValueError, match="warmup") as caught:
         composed(read(tmp_path, SOUND.replace("200", "50")))
-    assert caught.value.__notes__ == [f"in the variant `full`, {tmp_path / 'study.yaml'}:4"]
+    assert "`full`" in caught.value.__notes__[0]
 
 
 @pytest.mark.parametrize(
@@ -248,7 +199,7 @@ def test_losses_and_the_start_are_alike_unless_the_study_says_otherwise(
 
 def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_path: Path) -> None:
     text = SOUND + "metric: lpips\noverlay: {metrics: {lpips: {type: qgs/lpips}}}\n"
-    with pytest.raises(OptionError, match="`lpips` cannot be measured here: "):
+    with pytest.raises(OptionError, match="lpips"):
         planned(read(tmp_path, text), tmp_path / "out")
 
 
@@ -256,16 +207,8 @@ def test_hypotheses_are_sums_that_weigh_alike() -> None:
     contrast = parsed("a@noisy - a > b@noisy - b", "ab", ["noisy"])
     assert contrast.sign == 1
     assert contrast.terms == {("a", "noisy"): 1, ("a", ""): -1, ("b", "noisy"): -1, ("b", ""): 1}
-    for text, reason in (
-        ("a", "not one `<`"),
-        ("a < b < c", "not one `<`"),
-        ("a - b < c", "weigh unlike"),
-        ("a < a", "are the same"),
-        ("a b < c", "is no sum"),
-        ("a@x < b", "no evaluation `x`"),
-        ("< b", "is no sum"),
-    ):
-        with pytest.raises(OptionError, match=reason):
+    for text in ("a", "a < b < c", "a - b < c", "a < a", "a b < c", "a@x < b", "< b"):
+        with pytest.raises(OptionError):
             parsed(text, "abc", ["noisy"])
 
 

@@ -1,19 +1,14 @@
 """`qgs study` and `qgs compare`."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Device
-
-if TYPE_CHECKING:
-    from qgs_studies.plan import Plan
 
 app = typer.Typer(help="Train variants of a model by seeds, and tell what differs.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
@@ -77,11 +72,8 @@ def study(
 
     It is checked as a whole before anything trains. Give the same command
     again at any time: each run is trained once, a killed one continues,
-    and only missing ones run. --slurm writes an array for a cluster.
-    OUT/study.html has the answer, OUT/table.* the numbers.
-
-    A variant is `base` with or without changes, or a recipe file of its own.
-    One of yours against LocusGS, as mine_study.yaml:
+    and only missing ones run. OUT/study.html has the answer, OUT/table.*
+    the numbers.
 
     \b
         study: 1
@@ -98,15 +90,14 @@ def study(
     \b
         qgs study mine_study.yaml --out studies/mine --workers 2
 
-    That is six runs of about five minutes on a core each; --runs 1 makes one.
-    In place of the changes, `mine: mine/tiny/locus.yaml` names a recipe: begin
-    one with `qgs recipes tiny/locus.yaml --out mine`. `qgs compose RECIPE` has
-    all options as they are, `qgs list NAME` those of a component. Other keys of
-    a study are told in docs/studies.md (differs, evaluations, published ...).
-    Studies that come with qgs: studies/tiny/structural.yaml and others.
+    A variant is `base` with or without changes, or the name of a recipe file.
+    docs/studies.md has all keys of a study (differs, evaluations, published
+    ...). Studies that come with qgs: studies/tiny/structural.yaml and others.
     """
     from qgs.wording import counted
-    from qgs_studies.plan import leftover_runs, planned, write_plan
+    from qgs_studies.output import show, write_all
+    from qgs_studies.plan import planned, write_plan
+    from qgs_studies.results import Results
     from qgs_studies.study import read_study
 
     console = Console()
@@ -117,10 +108,8 @@ def study(
         for warning in recipe.warnings:
             console.print(f"warning: {name}: {warning}", highlight=False, soft_wrap=True)
     missing = [run for run in plan.runs if not plan.done(run)]
-    told = f"{plan.size}: {counted(len(plan.runs), 'run')}, {len(missing)} of them missing"
-    console.print(told, highlight=False)
-    if left := leftover_runs(plan):
-        console.print(f"{len(left)} runs in {out} are not in this study: kept, not shown")
+    count = f"{counted(len(plan.runs), 'run')}, {len(missing)} of them missing"
+    console.print(f"{plan.size}: {count}", highlight=False)
     if slurm:
         from qgs_studies.slurm import write_script
 
@@ -136,7 +125,13 @@ def study(
         chosen = plan.runs if only is None else [plan.runs[only]]
         queue = Queue(plan, workers, threads, device, console, runs, _gpus(device), chosen)
         stopped, failed = queue.work(), len(queue.failures)
-    _report(plan, console)
+    results = Results(plan)
+    if results.columns:
+        page = write_all(results)
+        show(results, console)
+        console.print(f"written to {page}", soft_wrap=True, highlight=False)
+    else:
+        console.print("no run is finished: there is nothing to report yet")
     if stopped:
         console.print(f"stopped by {stopped}; the same command goes on", highlight=False)
         raise typer.Exit(128 + signal.Signals[stopped])
@@ -154,17 +149,3 @@ def _gpus(device: str) -> list[str]:
     import torch
 
     return [str(number) for number in range(torch.cuda.device_count())]
-
-
-def _report(plan: Plan, console: Console) -> None:
-    """Write what there is of results, and show the table."""
-    from qgs_studies.output import show, write_all
-    from qgs_studies.results import Results
-
-    results = Results(plan)
-    if not results.columns:
-        console.print("no run is finished: there is nothing to report yet")
-        return
-    page = write_all(results)
-    show(results, console)
-    console.print(f"written to {page}", soft_wrap=True, highlight=False)

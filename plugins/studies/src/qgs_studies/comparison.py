@@ -10,22 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
 from rich.console import Console
 
 from qgs.contracts import Column
 from qgs.engine.results import as_json, bullets, markdown_table, print_lines, print_table
 from qgs.io.files import write_text
-from qgs.wording import listed, short_names
-from qgs_studies.intervals import (
-    CONFIDENCE,
-    CROSSED,
-    RESAMPLES,
-    SEED,
-    crossed_interval,
-    paired_interval,
-)
-from qgs_studies.stored import StoredResults
+from qgs.wording import counted, listed, short_names
+from qgs_studies.intervals import CONFIDENCE, CROSSED, RESAMPLES, SEED, interval
+from qgs_studies.stored import COMPACT, StoredResults
 
 
 @dataclass(frozen=True)
@@ -60,15 +52,20 @@ class Comparison:
     moved: Sequence[str]
     differences: Sequence[Difference]
 
+    @property
+    def title(self) -> str:
+        """Who is compared, over how many scenes."""
+        wanted, count = max(self.first.wanted, self.second.wanted), len(self.shared)
+        scenes = counted(count, "scene") if count >= wanted else f"{count} of {wanted} scenes"
+        return f"{self.first.name} against {self.second.name}, {scenes}"
+
     def record(self) -> dict[str, Any]:
-        """Plain values for JSON. empty: headings of metrics that have no scene in both."""
+        """Plain values for JSON."""
         first, second = self.first, self.second
-        compared = {difference.metric for difference in self.differences}
-        columns = {**first.columns, **second.columns}
         return {
             "first": first.name,
             "second": second.name,
-            "steps": [[run.step for run in side.runs or [side]] for side in (first, second)],
+            "steps": [[run.step for run in side.trainings] for side in (first, second)],
             "same_protocol": first.protocol.sha256 == second.protocol.sha256,
             "other_frames": list(self.moved),
             "differences": [asdict(difference) for difference in self.differences],
@@ -78,39 +75,7 @@ class Comparison:
             "null": list(dict.fromkeys([*first.null, *second.null])),
             "only_first": [name for name in first.scenes if name not in self.shared],
             "only_second": [name for name in second.scenes if name not in self.shared],
-            "empty": [column.heading for name, column in columns.items() if name not in compared],
         }
-
-    @property
-    def title(self) -> str:
-        """Who is compared, over how many scenes."""
-        first, second, count = self.first, self.second, len(self.shared)
-        scenes = f"{count} scene{'s' if count > 1 else ''}"
-        if count < (wanted := max(first.wanted, second.wanted)):
-            missing = list(dict.fromkeys([*first.missing, *second.missing]))
-            names = f" (missing: {listed(missing)})" if missing else ""
-            scenes = f"{count} of {wanted} scenes{names}"
-        return f"{first.name} against {second.name}, {scenes}"
-
-    @property
-    def _covers(self) -> str:
-        if (pairs := len(_trainings(self.first, self.second))) > 1:
-            return f"{pairs} trainings a side and scenes, both random ({CROSSED})"
-        first, second = (len(side.runs) or 1 for side in (self.first, self.second))
-        trainings = "one training a side"
-        if first + second > 2:
-            trainings = f"{first} against {second} trainings"
-        resampled = f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples)"
-        return f"{resampled}; {trainings}: says nothing of training"
-
-    def _unpaired(self) -> Iterator[str]:
-        """Trainings that no mean has, because the other side has none to pair them with."""
-        pairs = _trainings(self.first, self.second)
-        for number, side in enumerate((self.first, self.second)):
-            used = [id(pair[number]) for pair in pairs]
-            left = [run.seed for run in side.runs if id(run) not in used]
-            if len(pairs) > 1 and left:
-                yield f"{side.name}: seed {listed(left)} left out, nothing to pair with"
 
     def rows(self) -> list[list[str]]:
         """The table, headers first; one digit finer than an evaluation's."""
@@ -127,14 +92,26 @@ class Comparison:
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
         first, second, facts = self.first, self.second, self.record()
-        covered = f"mean over scenes; interval: {self._covers}"
-        yield f"difference: {first.name} minus {second.name}, {covered}"
-        steps = [np.mean([r.step for r in s.runs or [s] if r.step] or [0]) for s in (first, second)]
-        for side, mean in zip((first, second), steps, strict=True):
-            seeds = listed(run.seed for run in side.runs or [side] if run.seed is not None)
+        pairs, steps = _trainings(first, second), list[float]()
+        covered = f"{len(pairs)} trainings a side and scenes, both random ({CROSSED})"
+        if len(pairs) == 1:
+            counts = len(first.trainings), len(second.trainings)
+            sides = "{} against {} trainings".format(*counts)
+            covered = (
+                f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples); "
+                f"{'one training a side' if sum(counts) == 2 else sides}: says nothing of training"
+            )
+        yield f"difference: {first.name} minus {second.name}, mean over scenes; interval: {covered}"
+        for side in (first, second):
+            steps.append(float(np.mean([run.step for run in side.trainings if run.step] or [0])))
+            seeds = listed(run.seed for run in side.trainings if run.seed is not None)
             of = f" of a budget of {side.budget}, seed {seeds}" if side.budget else ""
-            yield f"{side.name}: {f'{mean:,.0f} steps' if mean else 'steps not known'}{of}"
-        yield from self._unpaired()
+            known = f"{steps[-1]:,.0f} steps" if steps[-1] else "steps not known"
+            yield f"{side.name}: {known}{of}"
+        for side, paired in zip((first, second), zip(*pairs, strict=True), strict=True):
+            left = [run.seed for run in side.runs if all(run is not other for other in paired)]
+            if len(pairs) > 1 and left:
+                yield f"{side.name}: seed {listed(left)} left out, nothing to pair with"
         if min(steps) and max(steps) > 1.02 * min(steps):
             yield f"unequal training: {max(steps) / min(steps):.2f} times the steps of the other"
         if len(self.shared) == 1:
@@ -149,10 +126,8 @@ class Comparison:
         for d in self.differences:
             if d.scenes < len(self.shared):
                 yield f"{d.column.heading}: over the {d.scenes} scenes that have it in both"
-            if d.column.heading != (other := second.columns[d.metric].heading):
-                yield f"{d.column.heading} in {first.name} is {other} in {second.name}"
-        if facts["empty"]:
-            yield f"not in both, left out: {', '.join(facts['empty'])}"
+        if alone := first.columns.keys() ^ second.columns.keys():
+            yield f"not in both, left out: {listed(sorted(alone))}"
         if not facts["same_protocol"]:
             yield "the protocols differ: the scores do not measure the same"
         if self.moved:
@@ -168,9 +143,8 @@ class Comparisons:
 
     def show(self, console: Console) -> None:
         """Print a table for each pair."""
-        compact = {"box": box.SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
         for pair in self.pairs:
-            print_table(console, pair.title, pair.rows(), **compact)
+            print_table(console, pair.title, pair.rows(), **COMPACT)
             print_lines(console, pair.notes())
         print_lines(console, self._protocol_lines())
 
@@ -221,7 +195,7 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         shared = [name for name in first.scenes if name in other.scenes]
         if not shared:
             raise ValueError(f"{first.name} and {other.name} have no scene in common")
-        every = [*(first.runs or [first]), *(other.runs or [other])]
+        every = [*first.trainings, *other.trainings]
         moved = [name for name in shared if len({run.frames[name] for run in every}) > 1]
         if moved and not across_protocols:
             raise ValueError(
@@ -247,13 +221,14 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
         groups.setdefault(key, []).append(result)
     if len(groups) < 2:
         return results
-    several = [len({run.seed for run in runs}) == len(runs) > 1 for runs in groups.values()]
-    found = zip(groups.values(), several, strict=True)
-    sides = [side for runs, one in found for side in ([_mean(runs)] if one else runs)]
+    sides = list[StoredResults]()
+    for runs in groups.values():
+        several = len({run.seed for run in runs}) == len(runs) > 1
+        sides += [_mean(runs)] if several else runs
     names = [side.name for side in sides]  # of several in one folder, all of their runs
     return [
-        replace(side, name=", ".join(run.name for run in side.runs))
-        if side.runs and names.count(side.name) > 1
+        replace(side, name=", ".join(run.name for run in side.trainings))
+        if names.count(side.name) > 1
         else side
         for side in sides
     ]
@@ -261,14 +236,14 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
 
 def _mean(runs: Sequence[StoredResults]) -> StoredResults:
     first, names = runs[0], [run.name for run in runs]
-    shared = [scene for scene in first.scenes if all(scene in run.scenes for run in runs)]
     scenes = {
         scene: {
             key: float(np.mean([run.scenes[scene][key] for run in runs]))
-            for key in first.scenes[scene]
+            for key in values
             if all(key in run.scenes[scene] for run in runs)
         }
-        for scene in shared
+        for scene, values in first.scenes.items()
+        if all(scene in run.scenes for run in runs)
     }
     folder = os.path.commonpath(names) if len({*map(os.path.isabs, names)}) == 1 else ""
     return replace(first, name=folder or ", ".join(names), scenes=scenes, runs=tuple(runs))
@@ -289,7 +264,7 @@ def _difference(
     )
     apart = values[:, 0] - values[:, 1]
     better = apart.mean(0) if column.better == "higher" else -apart.mean(0)
-    low, high = crossed_interval(apart) or paired_interval(apart[0]) or (None, None)
+    low, high = interval(apart)
     return Difference(
         metric=metric,
         column=column,

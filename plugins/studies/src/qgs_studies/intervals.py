@@ -26,6 +26,14 @@ def crossed_interval(
     return float(values.mean() - half), float(values.mean() + half)
 
 
+def interval(values: np.ndarray) -> tuple[float, float] | tuple[None, None]:
+    """95 % interval of the mean of differences (S, C) of S trainings on C scenes.
+
+    Of one training it covers scenes alone; without an interval (None, None), as of one scene.
+    """
+    return crossed_interval(values) or paired_interval(values[0]) or (None, None)
+
+
 def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Standard error of the means of `values` (..., S, C), and its degrees of freedom, both (...).
 

@@ -6,53 +6,46 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Console
 
 from qgs.engine.results import as_json, bullets, markdown_table, print_lines, print_table
 from qgs.io.files import write_text
 from qgs_studies.hypotheses import MAIN
 from qgs_studies.queue import last_record
-from qgs_studies.results import Estimate, Judgement, Results, Row
+from qgs_studies.results import Estimate, Results, Row
+from qgs_studies.stored import COMPACT
 
 _MARKS = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$"}
 
 
 def table_rows(results: Results, evaluation: str = MAIN) -> list[list[str]]:
     """One table, headers first: the study's metric in full, means of the others."""
-    metric, published = results.metric, results.plan.study.settings.published
-    others = [name for name in results.columns if name != metric]
-    titles = [results.columns[name].title for name in others]
+    metric, settings = results.metric, results.plan.study.settings
+    others, ranked = [name for name in results.columns if name != metric], bool(settings.published)
+
+    def mean(row: Row, name: str) -> str:
+        score = row.scores.get(name)
+        return results.shown(score.mean if score else None, name, sign=False)
+
     head = ["variant", results.column.title, "sd", "difference", "95 % interval", "better in"]
-    rows = [[*head, *["published"] * bool(published), *titles, "seeds", "steps"]]
+    titles = [results.columns[name].title for name in others]
+    rows = [[*head, *["published"] * ranked, *titles, "seeds", "steps"]]
     for row in results.rows(evaluation):
         score, apart = row.scores.get(metric), row.differences.get(metric)
-        means = [row.scores.get(name) for name in others]
-        paper = [results.shown(published.get(row.variant), sign=False)]
-        rows.append(
-            [
-                row.variant,
-                results.shown(score.mean if score else None, sign=False),
-                results.shown(score.deviation if score else None, sign=False),
-                "reference"
-                if row.variant == results.plan.study.settings.reference
-                else results.shown(apart.mean if apart else None),
-                results.interval(apart),
-                _ahead(results, apart),
-                *paper * bool(published),
-                *(
-                    results.shown(e.mean if e else None, name, sign=False)
-                    for name, e in zip(others, means, strict=True)
-                ),
-                str(len(row.seeds)),
-                steps_shown(row.steps),
-            ]
-        )
+        deviation = results.shown(score.deviation if score else None, sign=False)
+        difference = results.shown(apart.mean if apart else None)
+        if row.variant == settings.reference:
+            difference = "reference"
+        ahead = apart.ahead(results.sign) if apart else "–"
+        cells = [mean(row, metric), deviation, difference, results.interval(apart), ahead]
+        paper = [results.shown(settings.published.get(row.variant), sign=False)] * ranked
+        means = [mean(row, name) for name in others]
+        end = [str(len(row.seeds)), steps_shown(row.steps)]
+        rows.append([row.variant, *cells, *paper, *means, *end])
     for name, values in results.baselines(evaluation).items() if len(rows) > 1 else ():
-        shown = {m: results.shown(values.get(m), m, sign=False) for m in (metric, *others)}
-        dashes = ["–"] * (4 + bool(published))
-        shown_others = [shown[name] for name in others]
-        rows.append([name.replace("_", " "), shown[metric], *dashes, *shown_others, "–", "–"])
+        first, *rest = [results.shown(values.get(m), m, sign=False) for m in (metric, *others)]
+        dashes = ["–"] * (4 + ranked)
+        rows.append([name.replace("_", " "), first, *dashes, *rest, "–", "–"])
     return rows
 
 
@@ -62,13 +55,16 @@ def hypothesis_rows(results: Results) -> list[list[str]]:
     head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of"]
     rows = [[*head, *["note"] * notes]]
     for j in results.judgements():
-        mean = results.shown(j.estimate.mean, j.metric) if j.estimate else "–"
-        column = results.columns.get(j.metric)
-        interval = results.interval(j.estimate, j.metric) if j.estimate else "–"
-        covers = j.estimate.covers if j.estimate else "–"
+        column, cells = results.columns.get(j.metric), ["–", "–"]
+        if j.estimate:
+            cells = [
+                results.shown(j.estimate.mean, j.metric),
+                results.interval(j.estimate, j.metric),
+            ]
         verdict = f"{j.verdict} ({j.reason})" if j.reason else j.verdict
+        covers, note = j.estimate.covers if j.estimate else "–", [j.hypothesis.note] * notes
         claim = [j.hypothesis.claim, column.heading if column else j.metric]
-        rows.append([*claim, mean, interval, verdict, covers, *[j.hypothesis.note] * notes])
+        rows.append([*claim, *cells, verdict, covers, *note])
     return rows
 
 
@@ -80,13 +76,12 @@ def steps_shown(steps: Sequence[int]) -> str:
 def show(results: Results, console: Console) -> None:
     """Print the answer, the table of the study's metric, the verdicts."""
     console.print(results.answer(), highlight=False, soft_wrap=True, markup=False)
-    compact: dict[str, Any] = {"box": box.SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
     for name in results.plan.evaluations:
         rows = [row[:6] for row in table_rows(results, name)]
         if len(rows) > 1:
-            print_table(console, name, rows, **compact)
+            print_table(console, name, rows, **COMPACT)
     if len(rows := hypothesis_rows(results)) > 1:
-        print_table(console, "", [[*row[:1], *row[2:5]] for row in rows], **compact)
+        print_table(console, "", [[*row[:1], *row[2:5]] for row in rows], **COMPACT)
     print_lines(console, results.notes())
 
 
@@ -116,7 +111,17 @@ def record(results: Results) -> dict[str, Any]:
         "budget": settings.budget.model_dump(exclude_none=True),
         "metric": results.metric,
         "table": _table_records(results),
-        "hypotheses": [_judgement(j) for j in results.judgements()],
+        "hypotheses": [
+            {
+                "claim": j.hypothesis.claim,
+                "metric": j.metric,
+                "verdict": j.verdict,
+                "reason": j.reason,
+                **_estimate(j.estimate),
+                "note": j.hypothesis.note,
+            }
+            for j in results.judgements()
+        ],
         "rank_correlation": results.rank_correlation(),
         "notes": results.notes(),
     }
@@ -157,51 +162,43 @@ def _latex_row(cells: Iterable[str]) -> str:
     return " & ".join(map(cell, cells)) + r" \\"
 
 
-def _ahead(results: Results, apart: Estimate | None) -> str:
-    if apart is None:
-        return "–"
-    sign = 1 if results.column.better == "higher" else -1
-    ahead = sum(sign * value > 0 for value in apart.by_seed.values())
-    return f"{ahead} of {len(apart.by_seed)}"
-
-
 def _estimate(estimate: Estimate | None) -> dict[str, Any]:
     if estimate is None:
         return dict.fromkeys(("mean", "sd", "low", "high", "seeds", "scenes"))
-    found = {"mean": estimate.mean, "sd": estimate.deviation}
-    found |= {"low": estimate.low, "high": estimate.high}
-    return {**found, "seeds": len(estimate.by_seed), "scenes": estimate.scenes}
-
-
-def _judgement(j: Judgement) -> dict[str, Any]:
-    told = {"claim": j.hypothesis.claim, "metric": j.metric, "verdict": j.verdict}
-    return {**told, "reason": j.reason, **_estimate(j.estimate), "note": j.hypothesis.note}
+    return {
+        "mean": estimate.mean,
+        "sd": estimate.deviation,
+        "low": estimate.low,
+        "high": estimate.high,
+        "seeds": len(estimate.by_seed),
+        "scenes": estimate.scenes,
+    }
 
 
 def _table_records(results: Results) -> list[dict[str, Any]]:
-    return [
-        {
-            "evaluation": name,
-            "variant": row.variant,
-            "metric": metric,
-            **_record(row, metric),
-            "steps": steps_shown(row.steps),
-        }
-        for name in results.plan.evaluations
-        for row in results.rows(name)
-        for metric in row.scores
-    ]
-
-
-def _record(row: Row, metric: str) -> dict[str, Any]:
-    score, apart = row.scores[metric], _estimate(row.differences.get(metric))
-    own = {"mean": score.mean, "sd": score.deviation, "seeds": len(score.by_seed)}
-    between = {"difference": apart["mean"], "low": apart["low"], "high": apart["high"]}
-    return {**own, "scenes": score.scenes, **between, "paired_seeds": apart["seeds"]}
+    found = []
+    for name in results.plan.evaluations:
+        for row in results.rows(name):
+            for metric, score in row.scores.items():
+                own, apart = _estimate(score), _estimate(row.differences.get(metric))
+                found.append(
+                    {
+                        "evaluation": name,
+                        "variant": row.variant,
+                        "metric": metric,
+                        **{key: own[key] for key in ("mean", "sd", "seeds", "scenes")},
+                        "difference": apart["mean"],
+                        "low": apart["low"],
+                        "high": apart["high"],
+                        "paired_seeds": apart["seeds"],
+                        "steps": steps_shown(row.steps),
+                    }
+                )
+    return found
 
 
 def _run_records(results: Results) -> list[dict[str, Any]]:
-    """Of every run the mean over scenes."""
+    """The mean over scenes of every run."""
     return [
         {
             "evaluation": name,
@@ -216,7 +213,7 @@ def _run_records(results: Results) -> list[dict[str, Any]]:
 
 
 def _time_records(results: Results) -> list[dict[str, Any]]:
-    """Of every run what the clock said, which no other machine or day repeats."""
+    """What the clock said of every run, which no other machine or day repeats."""
     found = []
     for run in results.plan.runs:
         step, seconds = last_record(run.folder / "history.jsonl")

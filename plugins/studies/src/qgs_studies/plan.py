@@ -2,9 +2,9 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from qgs.composer.recipe import annotated, flat
 from qgs.composer.yaml_text import MapNode, dump, from_plain, load_mapping
 from qgs.contracts import OptionError
 from qgs.data.evaluation import EvaluationIndex, EvaluationPlan, IndexEntry
+from qgs.engine.evaluation import Measures
 from qgs.engine.folder import RunFolder
 from qgs.engine.guard import CollapseError, NonFiniteError
 from qgs.engine.protocol import index_of
@@ -31,18 +32,13 @@ EQUAL = (
     *("data", "views", "training", "evaluation", "metrics"),
     *("losses", "objective", "init_from"),
 )
-"""Sections of recipes that are alike in all variants, but for what the study says differs.
+"""Sections of recipes that are equal in all variants unless `differs` names them.
 
 All but the model and its optimiser.
 """
 
 INDEX = "evaluation.index"
-"""A file that may lie elsewhere today: it is compared by what it holds."""
-
-_ENDS = (CollapseError.__name__, NonFiniteError.__name__)
-
-_MOST = 12
-"""Differences of a changed variant that the message names."""
+"""Compared by what the file holds, because it may have moved."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ class Run:
     @property
     def ended(self) -> bool:
         """Whether the training itself went wrong, as it would each time: it is not tried again."""
-        return self.failed.startswith(_ENDS)
+        return self.failed.startswith((CollapseError.__name__, NonFiniteError.__name__))
 
     def evaluation(self, name: str) -> Path:
         """The folder of its results by one evaluation."""
@@ -116,6 +112,11 @@ class Plan:
         """Runs that are not tried again, without results."""
         return [run for run in self.runs if run.ended and not self.done(run)]
 
+    def judged_recipe(self, variant: str, evaluation: str) -> Recipe:
+        """The recipe of a variant as an evaluation changes it."""
+        recipe, node = self.recipes[variant], self.study.evaluations.get(evaluation)
+        return judged_by(recipe, node) if node else recipe
+
     def done(self, run: Run) -> bool:
         """Whether nothing of `run` is missing."""
         return all(map(run.judged, self.evaluations))
@@ -142,9 +143,8 @@ def planned(study: Study, folder: Path) -> Plan:
     Raises as `composed`, what data sources raise, and ValueError where `folder` has runs of a
     variant, or results of an evaluation, that were another then.
     """
-    recipes = composed(study)
-    _check_data(study, recipes)
-    plan = Plan(study, folder, recipes)
+    plan = Plan(study, folder, composed(study))
+    _check_data(plan)
     _refuse_changed(plan)
     return plan
 
@@ -156,22 +156,38 @@ def composed(study: Study) -> dict[str, Recipe]:
     what building them raises.
     """
     problems, recipes = Problems("study"), dict[str, Recipe]()
+
+    def report(error: RecipeError, place: str, where: Origin) -> None:
+        for found in error.problems:
+            at = Origin(found.file, found.line) if found.line else where
+            problems.add(at, f"{place}: {found.option}", found.reason, found.fix, found.cause)
+
     for name, node in study.variants.items():
         try:
-            recipes[name] = _with_budget(study, with_absolute_path(_resolved(study, node)))
+            recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
+            recipes[name] = _with_budget(study, with_absolute_path(recipe))
         except RecipeError as error:
-            for found in error.problems:
-                at = Origin(found.file, found.line)
-                option = f"variants.{name}: {found.option}"
-                problems.add(at, option, found.reason, found.fix, found.cause)
+            report(error, f"variants.{name}", study.origins[name])
     if len(recipes) == len(study.variants):
-        _check_alike(study, recipes, problems)
-        _check_distinct(study, recipes, problems)
-        for name, recipe in recipes.items():
-            for label, node in study.evaluations.items():
-                _judged_by(recipe, node, f"evaluations.{label}, of {name}", problems)
+        _check_equal(study, recipes, problems)
+        for (a, one), (b, other) in combinations(recipes.items(), 2):
+            if not differences(one, other):
+                fix = "change an option of it, or leave one of them out"
+                reason = f"`{b}` is the same model as `{a}`"
+                problems.add(study.origins[b], f"variants.{b}", reason, fix)
+        for label, node in study.evaluations.items():
+            for name, recipe in recipes.items():
+                try:
+                    judged_by(recipe, node)
+                except RecipeError as error:
+                    report(error, f"evaluations.{label}, of {name}", node.origin)
     problems.raise_any()
-    _build_all(study, recipes)
+    for name, recipe in recipes.items():
+        try:
+            _build(recipe)
+        except (ValueError, OSError) as error:
+            error.add_note(f"in the variant `{name}`, {study.origins[name]}")
+            raise
     return recipes
 
 
@@ -183,10 +199,7 @@ def judged_by(recipe: Recipe, node: MapNode) -> Recipe:
 
 
 def write_plan(plan: Plan) -> None:
-    """The recipes and evaluations, from which workers train and judge; equal ones stay as they are.
-
-    So a newer version that knows more options leaves the files readable for an older one at work.
-    """
+    """Write the recipes and evaluations from which workers train and judge, where they changed."""
     for name, recipe in plan.recipes.items():
         file = recipe_file(plan.folder, name)
         if not file.is_file() or differences(resolve(file), recipe):
@@ -194,7 +207,7 @@ def write_plan(plan: Plan) -> None:
     for name, node in plan.study.evaluations.items():
         file = evaluation_file(plan.folder, name)
         if not file.is_file() or read_evaluation(file) != node:
-            write_text(file, dump(_plain(node)))
+            write_text(file, dump(json.loads(json.dumps(node))))
 
 
 def read_evaluation(file: Path) -> MapNode:
@@ -210,10 +223,6 @@ def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[Any, Any]]:
     a, b = flat(ours.tree), flat(theirs.tree)
     paths = [p for p in {**a, **b} if p not in ("seed", "plugins") and a.get(p) != b.get(p)]
     return {path: (a.get(path), b.get(path)) for path in paths}
-
-
-def _resolved(study: Study, node: MapNode) -> Recipe:
-    return resolve(node, [f"seed={study.settings.seeds[0]}"])
 
 
 def _with_budget(study: Study, recipe: Recipe) -> Recipe:
@@ -232,104 +241,65 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
     return replace(resolved, provenance={**recipe.provenance, **told})
 
 
-def _check_alike(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Report what differs between variants although the study does not say so."""
+def _check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
+    """Report what differs between variants although the study does not name it."""
     settings, first = study.settings, recipes[study.settings.reference]
-    allowed, used = settings.differs, set[str]()
     free = {"training.steps"} if settings.budget.images is not None else set()
+    used = set[str]()
     for name, recipe in recipes.items():
-        told = set[str]()
+        reported = set[str]()
         for path, (ours, theirs) in differences(recipe, first).items():
-            said = [a for a in allowed if f"{path}.".startswith(f"{a}.")]
-            used.update(said)
+            allowed = [a for a in settings.differs if f"{path}.".startswith(f"{a}.")]
+            used.update(allowed)
             section, *names = path.split(".")
-            if section not in EQUAL or said or path in free or _same_index(path, recipe, first):
-                continue
-            # of a loss or metric that is another, or absent, its options are one difference
+            # another loss or metric is one difference, whatever options it has
             option = f"{section}.{names[0]}" if section in ("losses", "metrics") else path
-            if option in told:
+            if section not in EQUAL or allowed or path in free or option in reported:
                 continue
-            told.add(option)
+            if path == INDEX and ours and theirs and index_of(recipe) == index_of(first):
+                continue
+            reported.add(option)
             reason = (
                 f"`{path}` is {ours!r} in `{name}` and {theirs!r} in the reference "
                 f"`{settings.reference}` ({recipe.provenance.get(path, 'absent')})"
             )
-            fix = f"make them alike (`overlay` sets it for all), or add `differs: [{option}]`"
+            fix = f"make them equal (`overlay` sets it for all), or add `differs: [{option}]`"
             problems.add(study.origins[name], f"variants.{name}", reason, fix)
-    for path in (path for path in allowed if path not in used):
+    for path in (path for path in settings.differs if path not in used):
         reason, at = f"`{path}` differs in no variant", Origin(str(study.file))
         problems.add(at, "differs", reason, f"remove it; sections are {', '.join(EQUAL)}")
 
 
-def _check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Report variants that are one, such as a changed copy of a file that is read elsewhere."""
-    for (a, one), (b, other) in combinations(recipes.items(), 2):
-        if not differences(one, other):
-            fix = "change an option of it, or leave one of them out"
-            at = study.origins[b]
-            problems.add(at, f"variants.{b}", f"`{b}` is the same model as `{a}`", fix)
+def _build(recipe: Recipe) -> None:
+    """Make every part of a variant, the model without memory, to see that they fit."""
+    recipe.build_optimizer()
+    recipe.rate_factors(recipe.build_model("meta"))
+    recipe.build_losses()
+    recipe.build_objective()
+    if recipe.init_from:
+        checkpoint_path(recipe.init_from)
 
 
-def _same_index(path: str, one: Recipe, other: Recipe) -> bool:
-    """Whether `path` is that of two indices that judge the same frames of the same scenes."""
-    written = one.evaluation.index, other.evaluation.index
-    return path == INDEX and all(written) and index_of(one) == index_of(other)
-
-
-def _judged_by(recipe: Recipe, node: MapNode, option: str, problems: Problems) -> None:
-    try:
-        judged_by(recipe, node)
-    except RecipeError as error:
-        for found in error.problems:
-            at = Origin(found.file, found.line) if found.line else node.origin
-            problems.add(at, f"{option}: {found.option}", found.reason, found.fix, found.cause)
-
-
-def _build_all(study: Study, recipes: Mapping[str, Recipe]) -> None:
-    """Make every part of every variant, models without memory. Raises ValueError, with its name."""
-    for name, recipe in recipes.items():
-        try:
-            recipe.build_optimizer()
-            recipe.rate_factors(recipe.build_model("meta"))
-            recipe.build_losses()
-            recipe.build_objective()
-            if recipe.init_from:
-                checkpoint_path(recipe.init_from)
-        except (ValueError, OSError) as error:
-            error.add_note(f"in the variant `{name}`, {study.origins[name]}")
-            raise
-
-
-def _check_data(study: Study, recipes: Mapping[str, Recipe]) -> None:
+def _check_data(plan: Plan) -> None:
     """Open every data source and index once. Raises as they do, OptionError for metrics."""
-    opened = set[str]()
-    for recipe in recipes.values():
-        for judged in (recipe, *(judged_by(recipe, node) for node in study.evaluations.values())):
-            key = dump([judged.tree["data"], judged.tree["evaluation"], judged.tree["metrics"]])
-            if key in opened:
-                continue
-            opened.add(key)
-            _refuse_unknown_metrics(study, judged)
-            EvaluationPlan(judged.build_data(), judged.views, judged.evaluation, index_of(judged))
-
-
-def _refuse_unknown_metrics(study: Study, recipe: Recipe) -> None:
-    from qgs.engine.evaluation import Measures
-
-    measures = Measures(recipe)
-    columns, unavailable = measures.columns, measures.incomplete([])
-    asked = [study.settings.metric, *(h.metric for h in study.settings.hypotheses)]
-    for name in filter(None, asked):
-        if name not in columns:
-            raise OptionError(
-                f"{study.file}: the recipes measure no `{name}`",
-                f"choose one of {', '.join(columns)}, or add it to `overlay.metrics`",
-            )
-        if name in unavailable:
-            raise OptionError(
-                f"{study.file}: `{name}` cannot be measured here: {unavailable[name]}",
-                f"mend that, or choose one of {', '.join({**columns}.keys() - unavailable)}",
-            )
+    settings, opened = plan.study.settings, set[str]()
+    for variant, name in product(plan.recipes, plan.evaluations):
+        judged = plan.judged_recipe(variant, name)
+        key = dump([judged.tree[section] for section in ("data", "evaluation", "metrics")])
+        if key in opened:
+            continue
+        opened.add(key)
+        measures = Measures(judged)
+        unavailable = dict(measures.incomplete([]))
+        for metric in (settings.metric, *(h.metric for h in settings.hypotheses if h.metric)):
+            if metric not in measures.columns or metric in unavailable:
+                raise OptionError(
+                    f"{plan.study.file}: `{metric}` cannot be measured: "
+                    f"{unavailable.get(metric, 'no recipe has it')}",
+                    f"choose one of {', '.join({**measures.columns}.keys() - unavailable)}, or "
+                    "add it to `overlay.metrics`",
+                )
+        EvaluationPlan(judged.build_data(), judged.views, judged.evaluation, index_of(judged))
 
 
 def _refuse_changed(plan: Plan) -> None:
@@ -338,44 +308,38 @@ def _refuse_changed(plan: Plan) -> None:
     Where the evaluation index lies is no matter; what results were judged by is.
     """
     for name, recipe in plan.recipes.items():
-        file = recipe_file(plan.folder, name)
-        runs = [run for run in _runs_in(plan.folder, name) if not RunFolder(run).is_new]
+        file, folders = recipe_file(plan.folder, name), (plan.folder / "runs" / name).glob("seed-*")
+        runs = [run for run in folders if run.is_dir() and not RunFolder(run).is_new]
         if not runs or not file.is_file():
             continue
         changed = differences(resolve(file), recipe)
         changed.pop(INDEX, None)
         if changed:
-            told = [f"{path}: {old!r} then, {new!r} now" for path, (old, new) in changed.items()]
+            shown = [f"{path}: {old!r} then, {new!r} now" for path, (old, new) in changed.items()]
             raise ValueError(
                 f"{plan.study.file}: the variant `{name}` is not the one that {len(runs)} runs in "
-                f"{plan.folder} were trained with ({listed(told, _MOST, '; ')}); give the new one "
-                "another name, or another --out"
+                f"{plan.folder} were trained with ({listed(shown, between='; ')}); give the new "
+                "one another name, or another --out"
             )
-    for name, node in plan.study.evaluations.items():
+    for variant, name in product(plan.recipes, plan.evaluations):
+        runs = [run for run in plan.runs if run.variant == variant and run.judged(name)]
+        if not runs:
+            continue
+        remedy = f"give the evaluation `{name}` another name" if name else "give another --out"
         file = evaluation_file(plan.folder, name)
-        judged = any(run.judged(name) for run in plan.runs)
-        if judged and file.is_file() and _moved(read_evaluation(file)) != _moved(node):
-            raise ValueError(
-                f"{plan.study.file}: the evaluation `{name}` is not the one that there are results "
-                f"of in {plan.folder} ({file}); give the new one another name"
-            )
-    for name in plan.evaluations:
-        for variant, recipe in plan.recipes.items():
-            runs = [run for run in plan.runs if run.variant == variant and run.judged(name)]
-            if runs:
-                node = plan.study.evaluations.get(name)
-                _refuse_other_index(plan, runs, name, judged_by(recipe, node) if node else recipe)
-
-
-def _refuse_other_index(plan: Plan, runs: Sequence[Run], name: str, recipe: Recipe) -> None:
-    now = index_of(recipe)
-    for folder in (run.evaluation(name) for run in runs):
-        if _judged_index(folder) != now:
-            what = f"the evaluation `{name}` another name" if name else "another --out"
-            raise ValueError(
-                f"{plan.study.file}: the results in {folder} were judged on other scenes or "
-                f"frames than evaluation.index names now ({recipe.evaluation.index}); give {what}"
-            )
+        if name and file.is_file():
+            before, now = read_evaluation(file), plan.study.evaluations[name]
+            if _but_index(before) != _but_index(now):
+                why = f"the results in {plan.folder} were judged by another `{name}` ({file})"
+                raise ValueError(f"{plan.study.file}: {why}; {remedy}")
+        recipe = plan.judged_recipe(variant, name)
+        now = index_of(recipe)
+        for folder in (run.evaluation(name) for run in runs):
+            if _judged_index(folder) != now:
+                raise ValueError(
+                    f"{plan.study.file}: the results in {folder} were judged on other scenes or "
+                    f"frames than evaluation.index names now ({recipe.evaluation.index}); {remedy}"
+                )
 
 
 def _judged_index(results: Path) -> EvaluationIndex | None:
@@ -385,26 +349,6 @@ def _judged_index(results: Path) -> EvaluationIndex | None:
     return index and TypeAdapter(dict[str, IndexEntry | None]).validate_python(index)
 
 
-def _moved(node: MapNode) -> dict[str, Any]:
-    """An evaluation as plain values, whatever index it names."""
-    plain = _plain(node)
-    if "index" in plain.get("evaluation", {}):
-        plain["evaluation"]["index"] = bool(plain["evaluation"]["index"])
-    return plain
-
-
-def _runs_in(folder: Path, variant: str) -> Iterator[Path]:
-    yield from (p for p in (folder / "runs" / variant).glob("seed-*") if p.is_dir())
-
-
-def _plain(node: Any) -> Any:
-    if isinstance(node, Mapping):
-        return {key: _plain(value) for key, value in node.items()}
-    return [*map(_plain, node)] if isinstance(node, list) else node
-
-
-def leftover_runs(plan: Plan) -> list[Path]:
-    """Runs in the folder that the study no longer names; they are kept."""
-    named = {run.folder for run in plan.runs}
-    folders = (plan.folder / "runs").glob("*/seed-*")
-    return sorted(path for path in folders if path.is_dir() and path not in named)
+def _but_index(node: MapNode) -> dict[str, Any]:
+    """What an evaluation changes, whatever index it names."""
+    return {path: value for path, value in flat(node).items() if path != INDEX}

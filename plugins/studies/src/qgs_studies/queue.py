@@ -7,23 +7,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
-from rich.live import Live
-from rich.table import Table
 
 from qgs.engine.guard import CollapseError
 from qgs.io.files import write_text
+from qgs.wording import listed
 from qgs_studies.plan import Plan, Run
 from qgs_studies.work import FAILED, TAKEN, is_free
 
 _POLL_SECONDS = 0.3
-_SHOW_SECONDS = 2.0
 _TAIL = 4096  # bytes of a history that hold its last record
 DEATHS = 3
 """Killed processes of a run in a row, without a save between, after which the run has failed."""
@@ -65,22 +62,18 @@ class Queue:
         before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
         for run in self.runs:
             if run.ended and not self.plan.done(run):
-                self._say(_not_again(run))
-        shown, done = 0.0, set(filter(self.plan.done, self.runs))
-        live = Live(console=self.console, auto_refresh=False, transient=True)
-        terminal = self.console.is_terminal
+                why = f"{run} is not trained again, it would end so each time: {run.failed}"
+                self._say(f"{why}; to train it again, delete {run.failure}{_and_folder(run)}")
+        done = set(filter(self.plan.done, self.runs))
         try:
-            with live if terminal else nullcontext():
-                waiting = True
-                while waiting:
-                    waiting = self._step()
+            with self.console.status(self._left()) as status:
+                while self._step():
                     for run in self.runs:
                         if run not in done and self.plan.done(run):
                             done.add(run)
                             self._say(f"{run} is done, {self._left()}")
-                    if terminal and time.monotonic() - shown > _SHOW_SECONDS:
-                        shown = time.monotonic()
-                        live.update(self._table(), refresh=True)
+                    if self.console.is_terminal:
+                        status.update(self._left())
                     time.sleep(_POLL_SECONDS)
         finally:
             for process, _ in self._processes.values():
@@ -171,55 +164,31 @@ class Queue:
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
-    def _progress(self, run: Run) -> tuple[float, float]:
-        """Used part of the budget of `run`, and seconds on its clock."""
-        step, seconds = last_record(run.folder / "history.jsonl")
-        training = self.plan.recipes[run.variant].training
-        of_seconds = seconds / training.seconds if training.seconds else 0.0
-        return min(max(step / training.steps, of_seconds), 1.0), seconds
-
     def _left(self) -> str:
-        """Number of runs that are done, and about how long the others take."""
-        over = {*self.failures, *self.plan.ended}
-        open_ = [run for run in self.runs if not self.plan.done(run)]
-        text = f"{len(self.runs) - len(open_)} of {len(self.runs)} runs"
-        found = {run: self._progress(run) for run in self.runs}
-        measured = [(used, seconds) for used, seconds in found.values() if used > 0.02 and seconds]
-        open_ = [run for run in open_ if run not in over]
+        """Number of runs that are done, how far those here are, and about how long all take."""
+        missing = [run for run in self.runs if not self.plan.done(run)]
+        text = f"{len(self.runs) - len(missing)} of {len(self.runs)} runs"
+        used, seconds = dict[Run, float](), dict[Run, float]()
+        for run in self.runs:
+            step, seconds[run] = last_record(run.folder / "history.jsonl")
+            training = self.plan.recipes[run.variant].training
+            of_seconds = seconds[run] / training.seconds if training.seconds else 0.0
+            used[run] = min(max(step / training.steps, of_seconds), 1.0)
+        here = listed(f"{run} {used[run]:.0%}" for run in self._processes)
+        text += f", {here}" * bool(here)
+        measured = [run for run in self.runs if used[run] > 0.02 and seconds[run]]
+        open_ = [run for run in missing if run not in {*self.failures, *self.plan.ended}]
         if not measured or not open_:
             return text
-        whole = sum(seconds for _, seconds in measured) / sum(used for used, _ in measured)
+        whole = sum(seconds[run] for run in measured) / sum(used[run] for run in measured)
         at_once = min(max(len(self._processes), 1), len(open_))
-        seconds = whole * sum(1 - found[run][0] for run in open_) / at_once
-        return f"{text}, about {timedelta(seconds=round(seconds))} left"
-
-    def _table(self) -> Table:
-        seeds = self.plan.study.settings.seeds
-        table = Table(title=f"{self.plan.study.title}: {self._left()}", title_justify="left")
-        for name in ("variant", *(f"seed {seed}" for seed in seeds)):
-            table.add_column(name)
-        cells = {(run.variant, run.seed): self._cell(run) for run in self.runs}
-        for variant in self.plan.recipes:
-            table.add_row(variant, *(cells.get((variant, seed), "") for seed in seeds))
-        return table
-
-    def _cell(self, run: Run) -> str:
-        if self.plan.done(run):
-            return "done"
-        if run in self.failures or run.ended:
-            return "failed"
-        used = f"{self._progress(run)[0]:.0%}"
-        if run in self._processes:
-            return used
-        return f"{used}, {'waiting' if is_free(run) else 'elsewhere'}"
+        left = whole * sum(1 - used[run] for run in open_) / at_once
+        return f"{text}, about {timedelta(seconds=round(left))} left"
 
 
-def _not_again(run: Run) -> str:
-    """Why a failed training is not repeated, and how to repeat it."""
-    why = f"{run} is not trained again, it would end so each time: {run.failed}"
-    if run.failed.startswith(CollapseError.__name__):
-        return f"{why}; to train it from the start, delete {run.failure} and {run.folder}"
-    return f"{why}; when the cause is gone, delete {run.failure}: it continues from its last save"
+def _and_folder(run: Run) -> str:
+    """What else to delete: a collapsed training does not continue from its last save."""
+    return f" and {run.folder}" * run.failed.startswith(CollapseError.__name__)
 
 
 def _end(code: int) -> str:

@@ -17,9 +17,9 @@ from scipy.stats import spearmanr
 from qgs.contracts import Column
 from qgs.engine.evaluation import SECTIONS
 from qgs.metrics.baselines import BASELINES
-from qgs.wording import listed
+from qgs.wording import counted, listed
 from qgs_studies.hypotheses import MAIN, Contrast
-from qgs_studies.intervals import CONFIDENCE, CROSSED, crossed_interval, paired_interval
+from qgs_studies.intervals import CONFIDENCE, CROSSED, crossed_interval, interval
 from qgs_studies.plan import Plan, Run
 from qgs_studies.stored import StoredResults, read_results
 from qgs_studies.study import Hypothesis
@@ -58,10 +58,19 @@ class Estimate:
     @property
     def covers(self) -> str:
         """What the interval is over."""
-        seeds = len(self.by_seed)
-        text = f"{seeds} seed{'s' * (seeds != 1)} x {self.scenes} scene{'s' * (self.scenes != 1)}"
-        silent = ["training"] * (seeds == 1) + ["other scenes"] * (self.scenes == 1)
+        text = f"{counted(len(self.by_seed), 'seed')} x {counted(self.scenes, 'scene')}"
+        silent = ["training"] * (len(self.by_seed) == 1) + ["other scenes"] * (self.scenes == 1)
         return f"{text}: says nothing of {' and '.join(silent)}" if silent else text
+
+    def ahead(self, sign: int) -> str:
+        """In how many of the seeds the mean has this sign."""
+        return f"{sum(sign * v > 0 for v in self.by_seed.values())} of {len(self.by_seed)}"
+
+    def clear(self, sign: int) -> bool:
+        """Whether the interval is over trainings and scenes, and all on the side of `sign`."""
+        ends = self.low, self.high
+        inside = all(end is not None and sign * end > 0 for end in ends)
+        return inside and len(self.by_seed) > 1
 
 
 @dataclass(frozen=True)
@@ -108,14 +117,18 @@ class Results:
         self.missing: list[Run] = [run for run in plan.runs if not plan.done(run)]
         self.failed: list[Run] = [run for run in self.missing if run.failed]
         self.columns: dict[str, Column] = {}
-        for by_seed in self._stored.values():
-            for stored in by_seed.values():
-                self.columns = {**stored.columns, **self.columns}
+        for stored in (stored for part in self._stored.values() for stored in part.values()):
+            self.columns = {**stored.columns, **self.columns}
 
     @property
     def column(self) -> Column:
-        """How the study's metric is shown."""
+        """How the study's metric is shown; raises KeyError before a run is finished."""
         return self.columns[self.metric]
+
+    @property
+    def sign(self) -> int:
+        """1 where more of the study's metric is better, else -1."""
+        return 1 if self.column.better == "higher" else -1
 
     def rows(self, evaluation: str = MAIN) -> list[Row]:
         """Variants that have results by `evaluation`, in the order of the study."""
@@ -125,9 +138,11 @@ class Results:
             if not by_seed:
                 continue
             apart = self._apart(variant, evaluation)
-            scores = self._estimates({(variant, evaluation): 1})
             compared = variant != reference and not self._unlike(apart)
-            differences = self._estimates(apart) if compared else {}
+            scores, differences = (
+                {m: e for m in self.columns if (e := self.estimate(terms, m))}
+                for terms in ({(variant, evaluation): 1}, apart if compared else {})
+            )
             steps = sorted({s.step for s in by_seed.values() if s.step is not None})
             rows.append(Row(variant, evaluation, sorted(by_seed), scores, differences, steps))
         return rows
@@ -137,10 +152,9 @@ class Results:
 
         None where an evaluation has several protocols, which have baselines each.
         """
-        parts = [part for (_, name), part in self._stored.items() if name == evaluation]
         if len(self._protocols(evaluation)) != 1:
             return {}
-        scenes = next(iter(parts[0].values())).scenes.values()
+        scenes = self._judged_by(evaluation)[0].scenes.values()
         found: dict[str, dict[str, float]] = {name: {} for name in BASELINES}
         for name, means in found.items():
             for metric in self.columns:
@@ -167,18 +181,17 @@ class Results:
         if not scenes:
             return None
         value = f"model_{metric}"
-        weighed = [(self._stored[term], weight) for term, weight in terms.items()]
         values = np.array(
             [
                 [
-                    sum(w * part[seed].scenes[scene][value] for part, w in weighed)
-                    for scene in scenes
+                    sum(w * self._stored[term][seed].scenes[s][value] for term, w in terms.items())
+                    for s in scenes
                 ]
                 for seed in seeds
             ]
         )
         crossed = crossed_interval(values, confidence)
-        low, high = crossed or paired_interval(values[0]) or (None, None)
+        low, high = crossed or interval(values)
         by_seed = dict(zip(seeds, map(float, values.mean(1)), strict=True))
         return Estimate(by_seed, len(scenes), low, high, confidence if crossed else CONFIDENCE)
 
@@ -187,83 +200,89 @@ class Results:
         return " ".join([self._answer(), *self._left_out(), *self._below_nearest()])
 
     def _left_out(self) -> Iterator[str]:
-        """Of each variant, how many trainings failed: what survives says less; what is missing."""
+        """How many trainings of each variant failed, and how many runs are missing."""
         for variant in self.plan.recipes:
             runs = [run for run in self.plan.runs if run.variant == variant]
             if why := [run.failed.split(":")[0] for run in runs if run in self.failed]:
-                told = listed(dict.fromkeys(why))
-                yield f"Left out: {len(why)} of {len(runs)} trainings of {variant} failed ({told})."
+                of = f"{len(why)} of {len(runs)} trainings of {variant}"
+                yield f"Left out: {of} failed ({listed(dict.fromkeys(why))})."
         if waiting := len(self.missing) - len(self.failed):
             yield f"{waiting} of {len(self.plan.runs)} runs are missing."
 
     def _below_nearest(self) -> Iterator[str]:
         """Which variants a copy of the nearest input photo beats: their order says little."""
-        by, column = self.shared, self._known_column()
-        if by is None or column is None:
+        if self.shared is None or self.metric not in self.columns:
             return
-        nearest = self.baselines(by).get("nearest_input", {}).get(self.metric)
-        scores = {row.variant: row.scores.get(self.metric) for row in self.rows(by)}
-        means = {variant: score.mean for variant, score in scores.items() if score}
-        worse = [v for v, m in means.items() if nearest and column.best((m, nearest)) != m]
+        nearest = self.baselines(self.shared).get("nearest_input", {}).get(self.metric)
+        means = {r.variant: r.scores[self.metric].mean for r in self.rows(self.shared) if r.scores}
+        worse = [v for v, m in means.items() if nearest and self.sign * (m - nearest) < 0]
         if worse:
-            told = f"{column.heading} {self.shown(nearest, sign=False)}"
-            yield f"Worse than the nearest input photo, copied ({told}): {listed(worse)}."
+            value = f"{self.column.heading} {self.shown(nearest, sign=False)}"
+            yield f"Worse than the nearest input photo, copied ({value}): {listed(worse)}."
 
     def _answer(self) -> str:
-        """By scores alone.
+        """By scores alone, in the first evaluation that judges all by one protocol.
 
-        By the first evaluation that judges all alike. Who is best of n is better where the
-        interval at 1 - 0.05 / n says so (Bonferroni): chance has n tries. That all are worse needs
-        no correction, as each must be (an intersection-union test).
+        Who is best of n is better where the interval at 1 - 0.05 / n says so (Bonferroni): chance
+        has n tries. That all are worse needs no correction, as each must be (an
+        intersection-union test).
         """
-        reference, column = self.plan.study.settings.reference, self._known_column()
-        if column is None:
+        settings = self.plan.study.settings
+        if self.metric not in self.columns:
             return "Not known yet: no run is finished."
         if (by := self.shared) is None:
-            return f"Not known: {self._why_unlike()}.{self._verdicts()}"
-        sign = 1 if column.better == "higher" else -1
-        apart = {r.variant: e for r in self.rows(by) if (e := r.differences.get(self.metric))}
-        if not apart:
+            varied = listed(path for path in settings.differs if path.split(".")[0] in SECTIONS)
+            verdicts = Counter(judgement.verdict for judgement in self.judgements())
+            counts = ", ".join(f"{number} {verdict}" for verdict, number in verdicts.items())
+            return (
+                "Not known: no evaluation judges all variants by one protocol, so that their "
+                f"numbers are not compared; add one{f' that sets {varied}' if varied else ''} to "
+                "the study's `evaluations`."
+            ) + (f" Verdicts on its hypotheses: {counts}." if counts else "")
+        sign, reference = self.sign, settings.reference
+        every = {r.variant: e for r in self.rows(by) if (e := r.differences.get(self.metric))}
+        if not every:
             return f"Not known yet: {reference} and another variant share no finished seed."
 
-        def told(lead: Estimate) -> str:
+        def described(lead: Estimate) -> str:
             where = f" in the evaluation `{by}`" if by else ""
-            return f"{column.heading}{where} {self.shown(lead.mean)}{self._sureness(lead, sign)}"
+            tries = round((1 - CONFIDENCE) / (1 - lead.confidence))
+            chosen = f", corrected for the best of {tries}" if tries > 1 else ""
+            sure = f"{100 * lead.confidence:.3g} % interval {self.interval(lead)}{chosen}"
+            return (
+                f"{self.column.heading}{where} {self.shown(lead.mean)} "
+                f"({'no interval' if lead.low is None else sure}, {lead.covers}, "
+                f"better in {lead.ahead(sign)} seeds)"
+            )
 
         def best_of(names: Iterable[str]) -> str:
-            return max(names, key=lambda name: sign * apart[name].mean)
+            return max(names, key=lambda name: sign * every[name].mean)
 
-        judged = {n: e for n, e in apart.items() if e.low is not None and len(e.by_seed) > 1}
-        best, count = best_of(judged or apart), len(judged or apart)
+        judged = {n: e for n, e in every.items() if e.low is not None and len(e.by_seed) > 1}
+        best, count = best_of(judged or every), len(judged or every)
         among = f", the best of {count}," if count > 1 else ""
-        lead = apart[best]
         if not judged:
-            return f"Not known: {best}{among} has {told(lead)}."
-        apart = judged
+            return f"Not known: {best}{among} has {described(every[best])}."
         level = 1 - (1 - CONFIDENCE) / count
-        tried = ((n, self.estimate(self._apart(n, by), self.metric, level)) for n in apart)
+        tried = ((n, self.estimate(self._apart(n, by), self.metric, level)) for n in judged)
         sure = {name: estimate for name, estimate in tried if estimate}
-        if better := [name for name in sure if self._ahead(sure[name], sign)]:
+        if better := [name for name in sure if sure[name].clear(sign)]:
             among = among if best in better else f", of {count} variants,"
             best = best_of(better)
-            return f"Yes: {best}{among} is better than {reference}, {told(sure[best])}."
-        worse = [name for name, estimate in apart.items() if self._ahead(estimate, -sign)]
+            return f"Yes: {best}{among} is better than {reference}, {described(sure[best])}."
+        worse = [name for name, estimate in judged.items() if estimate.clear(-sign)]
         if len(worse) == count:
             which = f"all {count} are worse; the nearest, {best}," if among else f"{best}"
-            return f"No: {which} is worse than {reference}, {told(lead)}."
-        best = best_of(name for name in apart if name not in worse)
+            return f"No: {which} is worse than {reference}, {described(judged[best])}."
+        best = best_of(name for name in judged if name not in worse)
         others = f"; worse, each at 95 %: {listed(worse)}" if worse else ""
-        return f"Undecided: {best} cannot be told from {reference}, {told(sure[best])}{others}."
-
-    def _verdicts(self) -> str:
-        """How many hypotheses have which verdict, a sentence; "" without any."""
-        verdicts = Counter(judgement.verdict for judgement in self.judgements())
-        told = ", ".join(f"{number} {verdict}" for verdict, number in verdicts.items())
-        return f" Verdicts on its hypotheses: {told}." if told else ""
+        return (
+            f"Undecided: {best} cannot be told from {reference}, {described(sure[best])}{others}."
+        )
 
     def notes(self) -> list[str]:
         """What is to be known beside the table."""
-        settings, notes = self.plan.study.settings, []
+        notes, count = list[str](), len(self.plan.study.settings.hypotheses)
         estimates = [e for row in self.rows() for e in row.differences.values()]
         if any(len(e.by_seed) > 1 for e in estimates):
             notes.append(
@@ -276,12 +295,11 @@ class Results:
             )
         if any(e.scenes == 1 for e in estimates):
             notes.append("one scene is too few for an interval")
-        if len(settings.hypotheses) > 1:
-            count = len(settings.hypotheses)
+        if count > 1:
             notes.append(f"each of {count} verdicts is at 95 % on its own, not all together")
         if self.missing:
-            told = listed(self.missing)
-            notes.append(f"{len(self.missing)} of {len(self.plan.runs)} runs are missing: {told}")
+            of = f"{len(self.missing)} of {len(self.plan.runs)}"
+            notes.append(f"{of} runs are missing: {listed(self.missing)}")
         notes += [f"{run} failed: {run.failed}" for run in self.failed]
         if (rank := self.rank_correlation()) is not None:
             of = f"{len(self._published())} variants"
@@ -289,12 +307,10 @@ class Results:
         for name in self.plan.evaluations:
             if len(self._protocols(name)) > 1:
                 found = [v for v in self.plan.recipes if self._unlike(self._apart(v, name))]
-                told = f"; no difference is shown of {listed(found)}" if found else ""
+                none = f"; no difference is shown of {listed(found)}" if found else ""
                 where = name or "the recipes' own evaluation"
-                notes.append(f"{where}: protocols differ between variants{told}")
-            stored = [s for (_, n), p in self._stored.items() for s in p.values() if n == name]
-            lacking = {scene for s in stored for scene in s.missing}
-            if lacking:
+                notes.append(f"{where}: protocols differ between variants{none}")
+            if lacking := {scene for s in self._judged_by(name) for scene in s.missing}:
                 notes.append(f"scenes without a score in some run: {listed(sorted(lacking))}")
         return notes
 
@@ -332,25 +348,6 @@ class Results:
             return "–"
         return f"[{self.shown(estimate.low, metric)}, {self.shown(estimate.high, metric)}]"
 
-    def _known_column(self) -> Column | None:
-        return self.columns.get(self.metric)
-
-    def _sureness(self, estimate: Estimate, sign: int) -> str:
-        ahead = sum(sign * value > 0 for value in estimate.by_seed.values())
-        seeds = f"better in {ahead} of {len(estimate.by_seed)} seeds"
-        interval = f"{100 * estimate.confidence:.3g} % interval {self.interval(estimate)}"
-        tries = round((1 - CONFIDENCE) / (1 - estimate.confidence))
-        chosen = f", corrected for the best of {tries}" if tries > 1 else ""
-        told = "no interval" if estimate.low is None else f"{interval}{chosen}"
-        return f" ({told}, {estimate.covers}, {seeds})"
-
-    @staticmethod
-    def _ahead(estimate: Estimate, sign: int) -> bool:
-        """Whether the interval is over trainings and scenes, and all on the side of `sign`."""
-        ends = estimate.low, estimate.high
-        inside = all(end is not None and sign * end > 0 for end in ends)
-        return inside and len(estimate.by_seed) > 1
-
     def _apart(self, variant: str, evaluation: str) -> Terms:
         """The difference of a variant to the reference; nothing of the reference itself."""
         reference = self.plan.study.settings.reference
@@ -358,10 +355,14 @@ class Results:
             return {}
         return {(variant, evaluation): 1, (reference, evaluation): -1}
 
+    def _judged_by(self, evaluation: str) -> list[StoredResults]:
+        """The results of all runs by `evaluation`."""
+        parts = (part for (_, name), part in self._stored.items() if name == evaluation)
+        return [stored for part in parts for stored in part.values()]
+
     def _protocols(self, evaluation: str) -> set[str]:
         """Hashes of all protocols by which `evaluation` judged."""
-        parts = [part for (_, name), part in self._stored.items() if name == evaluation]
-        return {stored.protocol.sha256 for part in parts for stored in part.values()}
+        return {stored.protocol.sha256 for stored in self._judged_by(evaluation)}
 
     def _unlike(self, terms: Terms) -> bool:
         """Whether terms of one evaluation weigh numbers of unlike protocols against each other."""
@@ -374,15 +375,6 @@ class Results:
         names = [evaluation for (evaluation, hashes), weight in sums.items() if weight and hashes]
         return bool(several) or len(set(names)) < len(names)
 
-    def _why_unlike(self) -> str:
-        differs = self.plan.study.settings.differs
-        told = listed(path for path in differs if path.split(".")[0] in SECTIONS)
-        fix = f" that sets {told}" if told else ""
-        return (
-            "no evaluation judges all variants by one protocol, so that their numbers are not "
-            f"compared; add one{fix} to the study's `evaluations`"
-        )
-
     def _common(self, terms: Terms, metric: str) -> tuple[list[int], list[str]]:
         """Seeds that all `terms` have, and the scenes that have the metric in all of these runs."""
         stored = [self._stored.get(term, {}) for term in terms]
@@ -391,35 +383,25 @@ class Results:
         first, value = every[0] if every else {}, f"model_{metric}"
         return seeds, [n for n in first if all(value in part.get(n, ()) for part in every)]
 
-    def _estimates(self, terms: Terms) -> dict[str, Estimate]:
-        found = {metric: self.estimate(terms, metric) for metric in self.columns}
-        return {metric: estimate for metric, estimate in found.items() if estimate}
-
     def _judged(self, hypothesis: Hypothesis, contrast: Contrast) -> Judgement:
         metric = hypothesis.metric or self.metric
         estimate = self.estimate(contrast.terms, metric)
-        if estimate is None or (lacking := self._lacking(estimate)):
-            reason = self._why_none(contrast.terms, metric) if estimate is None else lacking
-            return Judgement(hypothesis, metric, estimate, "undecided", reason)
+        if estimate is None:
+            reason = f"no scene has `{metric}` in all its runs"
+            if not self._common(contrast.terms, metric)[0]:
+                reason = "no seed of which all its runs are finished"
+            elif metric not in self.columns:
+                reason = f"the runs did not measure `{metric}`"
+            return Judgement(hypothesis, metric, None, "undecided", reason)
+        lacking = ["one training a side"] * (len(estimate.by_seed) < 2)
+        lacking += ["one scene"] * (estimate.scenes < 2)
+        if lacking:
+            return Judgement(hypothesis, metric, estimate, "undecided", " and ".join(lacking))
         verdict: Verdict = "undecided"
-        if self._ahead(estimate, contrast.sign):
+        if estimate.clear(contrast.sign):
             verdict = "seen"
-        elif self._ahead(estimate, -contrast.sign):
+        elif estimate.clear(-contrast.sign):
             verdict = "contradicted"
         reasons = ["the interval holds 0"] * (verdict == "undecided")
         reasons += ["judged by unlike protocols"] * self._unlike(contrast.terms)
         return Judgement(hypothesis, metric, estimate, verdict, ", ".join(reasons))
-
-    @staticmethod
-    def _lacking(estimate: Estimate) -> str:
-        """Why there is no verdict on an estimate however clear it is; empty where there is one."""
-        lacking = ["one training a side"] * (len(estimate.by_seed) < 2)
-        return " and ".join([*lacking, *["one scene"] * (estimate.scenes < 2)])
-
-    def _why_none(self, terms: Terms, metric: str) -> str:
-        seeds, _ = self._common(terms, metric)
-        if not seeds:
-            return "no seed of which all its runs are finished"
-        if metric not in self.columns:
-            return f"the runs did not measure `{metric}`"
-        return f"no scene has `{metric}` in all its runs"

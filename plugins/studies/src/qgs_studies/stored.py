@@ -7,11 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich import box
+
 from qgs.composer.errors import Problems
 from qgs.composer.yaml_text import load_mapping
 from qgs.contracts import Column
 from qgs.engine.protocol import Protocol
 from qgs.engine.results import FRAME_COLUMNS, NAME_COLUMNS
+
+COMPACT: Mapping[str, Any] = {"box": box.SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
+"""How tables are printed."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,11 @@ class StoredResults:
     seed: int | None = None
     budget: str = ""
     runs: Sequence["StoredResults"] = ()
+
+    @property
+    def trainings(self) -> Sequence["StoredResults"]:
+        """`runs`, or the single one that this is."""
+        return self.runs or [self]
 
 
 def read_results(path: str | Path) -> StoredResults:

@@ -9,11 +9,19 @@ import os
 import signal
 import sys
 import threading
+import time
+import traceback
 from pathlib import Path
 from typing import IO
 
+import torch
 from rich.console import Console
 
+from qgs.composer import resolve
+from qgs.engine.evaluation import evaluate
+from qgs.engine.training import train
+from qgs.io.checkpoint import CheckpointFile
+from qgs.io.files import write_text
 from qgs_studies.plan import (
     Run,
     evaluation_file,
@@ -71,14 +79,11 @@ def main() -> int:
     if lock is None:
         return TAKEN
     try:
-        code = _work(given.folder, run, given.evaluations, given.threads, given.device)
+        torch.set_num_threads(given.threads)
+        code = _work(given.folder, run, given.evaluations, given.device)
         run.failure.unlink(missing_ok=True)
         return code
     except Exception as error:
-        import traceback
-
-        from qgs.io.files import write_text
-
         traceback.print_exc()
         write_text(run.failure, f"{type(error).__name__}: {error}\n")
         return FAILED
@@ -86,19 +91,11 @@ def main() -> int:
         lock.close()
 
 
-def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: str) -> int:
+def _work(folder: Path, run: Run, evaluations: list[str], device: str) -> int:
     """Train `run` as far as it was not, judge what was not; 0, or 128 + the signal that ended it.
 
     Raises whatever training and judging raise.
     """
-    import torch
-
-    from qgs.composer import resolve
-    from qgs.engine.evaluation import evaluate
-    from qgs.engine.training import train
-    from qgs.io.checkpoint import CheckpointFile
-
-    torch.set_num_threads(threads)
     recipe = resolve(recipe_file(folder, run.variant), [f"seed={run.seed}"])
     console = Console(file=sys.stdout, width=100)
     result = train(recipe, run.folder, console=console, device=device, resume=True)
@@ -109,9 +106,8 @@ def _work(folder: Path, run: Run, evaluations: list[str], threads: int, device: 
     for name in ("", *evaluations):
         if run.judged(name):
             continue
-        judged = (
-            judged_by(recipe, read_evaluation(evaluation_file(folder, name))) if name else recipe
-        )
+        changes = read_evaluation(evaluation_file(folder, name)) if name else None
+        judged = judged_by(recipe, changes) if changes else recipe
         evaluation = evaluate(result.model, judged, result.steps, trained_on=seen)
         evaluation.write(run.evaluation(name))
         console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)
@@ -123,14 +119,10 @@ def _end_with(parent: int) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            threading.Event().wait(_WATCH_SECONDS)
-        _stop()
+            time.sleep(_WATCH_SECONDS)
+        os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _stop() -> None:
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":
