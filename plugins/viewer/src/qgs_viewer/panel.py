@@ -13,7 +13,7 @@ import viser
 from qgs.analysis.scenes import frame_list
 from qgs_viewer.choice import Choice, Others, anchor_colors, painted
 from qgs_viewer.look import Look
-from qgs_viewer.pictures import PARTS, attention_parts
+from qgs_viewer.pictures import PARTS, attention_pictures_of, sheet
 from qgs_viewer.placement import hit, near_ray
 from qgs_viewer.server import stand
 from qgs_viewer.sources import ModelSource, Source
@@ -21,6 +21,8 @@ from qgs_viewer.stage import Stage
 
 MOST_BOXES = 24
 """Up to so many photos each have a check box; more are named in a line of text."""
+PHOTO_SIDE = 192
+"""Pixels on the longer side of photos that show attention."""
 NONE = -1
 """The number in the field `query` while none is picked."""
 _CAPTIONS = {
@@ -164,11 +166,11 @@ class Panel:
         if not look.queries:
             return
         query, layer = choice.query, choice.layer
-        found = {} if query is None else attention_parts(look, query, layer)
+        found = {} if query is None else attention_pictures_of(look, query, layer, PHOTO_SIDE)
         for part, handle in self.pictures.items():
             handle.visible = part in found
             if part in found:
-                handle.image = found[part]
+                handle.image = sheet(found[part])
         self.everything.visible = query is not None
         self._said.content = "" if query is None else told(look, query, layer)
 

@@ -7,11 +7,10 @@ from qgs.drawing.images import Picture, enlarged, rgb_picture, shaded, side_by_s
 from qgs_viewer.look import Look
 from qgs_viewer.queries import attention_pictures, patch_maps
 
-SIDE = 192
-"""Pixels on the longer side of each photo."""
 COLUMNS = 2
 ERROR_MAP = "inferno"
-PARTS = ("result", "content", "geometry")
+PARTS = {"result": "attention", "content": "content logits", "geometry": "geometry bias"}
+Parts = dict[str, list[Picture]]
 
 
 def color_error(images: Tensor, truth: Tensor) -> Tensor:
@@ -24,26 +23,26 @@ def error_picture(error: Tensor, most: float) -> Picture:
     return shaded(error, 0.0, most, ERROR_MAP)
 
 
-def attention_parts(look: Look, query: int, layer: int) -> dict[str, Picture]:
-    """Attention, content logits and geometry bias of a query, by PARTS; less those it lacks.
+def attention_pictures_of(look: Look, query: int, layer: int, side: int) -> Parts:
+    """Photos coloured by what a query attends to, by PARTS; less those it lacks; means over heads.
 
-    All input photos in one picture, COLUMNS in a row; means over heads.
+    side: pixels on the longer side of each photo.
     """
     weights = look.attention(query, layer)
     if weights is None or look.views is None:
         return {}
-    photos = [enlarged(rgb_picture(image), SIDE) for image in look.views.images[0]]
+    photos = [enlarged(rgb_picture(image), side) for image in look.views.images[0]]
     parts = (weights.weights, weights.content, weights.geometry)
     return {
-        name: _sheet(attention_pictures(photos, patch_maps(part[0, :, 0], look.grid)))
+        name: attention_pictures(photos, patch_maps(part[0, :, 0], look.grid))
         for name, part in zip(PARTS, parts, strict=True)
         if part is not None
     }
 
 
-def _sheet(pictures: list[Picture]) -> Picture:
-    blank = np.full_like(pictures[0], 255)
-    rows = [pictures[start : start + COLUMNS] for start in range(0, len(pictures), COLUMNS)]
+def sheet(pictures: list[Picture]) -> Picture:
+    """All pictures in one, COLUMNS in a row."""
     columns = min(COLUMNS, len(pictures))
-    rows = [side_by_side([*row, *[blank] * (columns - len(row))]) for row in rows]
-    return np.concatenate(rows, 0)
+    padded = [*pictures, *[np.full_like(pictures[0], 255)] * (-len(pictures) % columns)]
+    rows = range(0, len(padded), columns)
+    return np.concatenate([side_by_side(padded[row : row + columns]) for row in rows], 0)

@@ -36,6 +36,12 @@ class Ellipses:
     depths: Tensor
     whole: Tensor
 
+    def outline(self, index: int) -> Tensor:
+        """Points (2, OUTLINE_POINTS) around one ellipse."""
+        angle = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS)
+        circle = torch.stack([angle.cos(), angle.sin()])
+        return self.centers[index][:, None] + self.axes[index] @ circle
+
 
 @full_precision
 def project_support(support: SpatialSupport, cameras: Cameras) -> Ellipses:
@@ -86,16 +92,14 @@ def support_picture(
     """All centres as dots, queries of `colors` as ellipses, on the view of cameras (1, 1)."""
     ellipses = project_support(support, cameras)
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
-    angle = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS)
-    circle = torch.stack([angle.cos(), angle.sin()])
     farthest_first = torch.argsort(ellipses.depths, descending=True).tolist()
     image = _oversampled(washed(photo, 0.45))
     draw = ImageDraw.Draw(image, "RGBA")
     for index in [i for i in farthest_first if i not in colors] + list(colors):
         color = colors.get(index)
         if color and ellipses.whole[index]:
-            outline = (ellipses.centers[index][:, None] + ellipses.axes[index] @ circle) * scale
-            points = [tuple(point) for point in outline.T.clamp(-1e5, 1e5).tolist()]
+            outline = (ellipses.outline(index) * scale).T.clamp(-1e5, 1e5)
+            points = [tuple(point) for point in outline.tolist()]
             draw.polygon(points, fill=(*color, 22))
             draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
         if ellipses.depths[index] > 0:

@@ -6,39 +6,24 @@ from importlib.metadata import entry_points
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from qgs.analysis.saving import orbit_path
-from qgs.analysis.trace import trace
 from qgs.contracts import Column, LearnedQueries
 from qgs.data.sampling import Sample
 from qgs.data.scenes import warn_once
+from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, hex_color
-from qgs.drawing.images import (
-    Picture,
-    checked,
-    data_uri,
-    depth_picture,
-    depth_range,
-    enlarged,
-    finer,
-    rgb_picture,
-    side_by_side,
-)
+from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
 from qgs.drawing.pages import page_environment
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
 from qgs_viewer.curves import Curves, curves_figure
-from qgs_viewer.pictures import color_error, error_picture
-from qgs_viewer.queries import (
-    DrawnQuery,
-    attention_pictures,
-    notable_queries,
-    patch_maps,
-    query_picture,
-    support_picture,
-)
+from qgs_viewer.figures.exhibits import Exhibit, exhibit
+from qgs_viewer.pictures import PARTS, attention_pictures_of, color_error, error_picture
+from qgs_viewer.queries import DrawnQuery, notable_queries, query_picture
 
 
 @dataclass(frozen=True)
@@ -108,7 +93,7 @@ class Tile:
 
     def __post_init__(self) -> None:
         for picture in self.image if isinstance(self.image, list) else [self.image]:
-            checked(picture)
+            images.checked(picture)
 
 
 @dataclass(frozen=True)
@@ -131,15 +116,16 @@ def report_html(report: Report) -> str:
     """The whole page; it needs no other file and no network."""
     samples = report.samples
     shown = [(c, [c.model(sample.inputs) for sample in samples]) for c in report.contenders]
-    # A new section of figures is a function that returns a ReportSection, and its name here.
-    makers = (queries, anchors, attention, training_curves)
-    own = [make(shown, samples) for make in makers]
-    sections = [orbit(shown, samples), *offered_sections(shown, samples), *own]
+    exhibits = [exhibit(c.name, c.model, samples[0], c.curves) for c in report.contenders]
+    sections = [
+        *(orbit(shown, samples), *offered_sections(shown, samples), queries(shown, samples)),
+        *(anchors(exhibits), attention(exhibits), training_curves(exhibits)),
+    ]
     scenes = [
         pictured_scene([(c, predictions[number]) for c, predictions in shown], sample, depth)
         for number, (sample, depth) in enumerate(zip(samples, report.depths, strict=True))
     ]
-    environment = page_environment("qgs_viewer", uri=data_uri, hex=hex_color)
+    environment = page_environment("qgs_viewer", uri=images.data_uri, hex=hex_color)
     template = environment.get_template("report.html")
     sections = [section for section in sections if section.figures]
     return template.render(report=report, scenes=scenes, sections=sections)
@@ -222,7 +208,7 @@ def orbit(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
 def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """The most notable queries of each model, seen from the first target view."""
     figures = []
-    cameras = finer(samples[0].targets.cameras[:, :1], SIDE)
+    cameras = images.finer(samples[0].targets.cameras[:, :1], SIDE)
     for contender, (prediction, *_) in shown:
         chosen = notable_queries(contender.model, prediction.gaussians, cameras, QUERIES)
         picture = query_picture(contender.model, prediction.gaussians, chosen, cameras)
@@ -237,27 +223,19 @@ def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     )
 
 
-def anchors(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
+def anchors(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Supports on the first input view, before the decoder and after each layer."""
     figures: dict[str, list[Tile]] = {}
-    sample = samples[0]
-    camera = sample.inputs.cameras[:, :1]
-    photo = enlarged(rgb_picture(sample.inputs.images[0, 0]), SIDE)
-    for contender, _ in shown:
-        model = contender.model
-        prediction = model(sample.inputs, layers=range(1, model.depth + 1))
-        chosen = notable_queries(model, prediction.gaussians, camera, ANCHORS)
-        colors = {query.index: query.color for query in chosen}
-        start = model.queries(model.encoder(sample.inputs), sample.inputs)
-        learned = isinstance(model.queries, LearnedQueries)
-        states = {"learned start" if learned else "start of these photos": start} | {
-            f"after layer {number}": layer.state for number, layer in prediction.layers.items()
-        }
-        for caption, state in states.items():
-            support = model.queries.support(state)
-            if support is not None:
-                picture = support_picture(photo, support, camera, colors)
-                figures.setdefault(contender.name, []).append(Tile(picture, caption))
+    for shown in exhibits:
+        if shown.look.support(0) is None:
+            continue
+        chosen = shown.notable(ANCHORS, shown.sample.inputs.cameras[:, :1])
+        learned = isinstance(shown.model.queries, LearnedQueries)
+        layers = range(shown.look.depth + 1)
+        captions = ["learned start" if learned else "start of these photos"]
+        captions += [f"after layer {layer}" for layer in layers[1:]]
+        tiles = map(Tile, shown.anchors(layers, chosen, SIDE), captions)
+        figures[shown.name] = [*tiles]
     return ReportSection(
         "Where queries look",
         "Every query’s anchor on the first input view, as a dot; twelve that matter to this view "
@@ -269,32 +247,18 @@ def anchors(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     )
 
 
-def attention(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
+def attention(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Where the heaviest query looks in the input views: content, geometry, both; mean of heads."""
     figures: dict[str, list[Tile]] = {}
-    sample = samples[0]
-    photos = [enlarged(rgb_picture(i), SIDE // 2) for i in sample.inputs.images[0]]
-    view = sample.targets.cameras[:, :1]
-    for contender, (prediction, *_) in shown:
-        model = contender.model
-        if not model.depth:
-            continue
-        (drawn,) = notable_queries(model, prediction.gaussians, view, 1)
-        with trace(model, layers=[model.depth], queries=[drawn.index]) as record:
-            model(sample.inputs)
-        weights = record.layers[model.depth].cross_attention
-        if weights is None or record.grid is None:
-            continue
-        parts = {
-            "content logits": weights.content,
-            "geometry bias": weights.geometry,
-            "attention": weights.weights,
-        }
-        for caption, part in parts.items():
-            if part is not None:
-                maps = patch_maps(part[0, :, 0], record.grid)
-                picture = side_by_side(attention_pictures(photos, maps))
-                figures.setdefault(contender.name, []).append(Tile(picture, caption))
+    for shown in exhibits:
+        (drawn,) = shown.notable(1, shown.sample.targets.cameras[:, :1])
+        parts = attention_pictures_of(shown.look, drawn.index, shown.look.depth, SIDE // 2)
+        if parts:
+            figures[shown.name] = [
+                Tile(images.side_by_side(parts[part]), PARTS[part])
+                for part in ("content", "geometry", "result")
+                if part in parts
+            ]
     return ReportSection(
         "What one query reads",
         "Cross-attention of the heaviest query over the patches of the input views in the last "
@@ -305,8 +269,13 @@ def attention(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     )
 
 
-def training_curves(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
+def training_curves(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Loss and PSNR for every model whose training has a history."""
-    curves = {contender.name: contender.curves for contender, _ in shown if contender.curves}
-    tiles = [Tile(figure_picture(curves_figure(curves), dpi=144))] if curves else []
-    return ReportSection("Training", "", {"": tiles} if tiles else {}, width=600)
+    curves = {shown.name: shown.curves for shown in exhibits if shown.curves}
+    return drawn_section("Training", "", curves_figure(curves) if curves else None)
+
+
+def drawn_section(title: str, text: str, figure: Figure | None) -> ReportSection:
+    """A section of one figure; without one it is left out of the report."""
+    tiles = [Tile(figure_picture(figure, dpi=144))] if figure else []
+    return ReportSection(title, text, {"": tiles} if tiles else {}, width=600)

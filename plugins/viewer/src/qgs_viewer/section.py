@@ -3,19 +3,17 @@
 from collections.abc import Iterator, Sequence
 
 import torch
-from matplotlib.figure import Figure
 
 from qgs.data.sampling import Sample
-from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import rgb_picture, side_by_side
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras
 from qgs_viewer.choice import Choice
-from qgs_viewer.figures import dispersion, graph, refinement
+from qgs_viewer.figures import anchors, attention, dispersion
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
 from qgs_viewer.look import Look
 from qgs_viewer.page import scenes_html, shared_start
-from qgs_viewer.report import ReportSection, Shown, Tile
+from qgs_viewer.report import ReportSection, Shown, Tile, drawn_section
 from qgs_viewer.server import FIELD_OF_VIEW, first_eye, up_of
 
 _SIZE = 240, 320  # of each scene's picture, H, W
@@ -61,25 +59,25 @@ def scene_section(exhibits: Sequence[Exhibit]) -> ReportSection:
 def refinement_section(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Ways, radii and steps of the anchors from layer to layer, of models that have anchors."""
     anchored = [shown for shown in exhibits if shown.look.support(0) is not None]
-    return _drawn(
+    return drawn_section(
         "How layers move and size anchors",
         "The first scene from above, with the way of every anchor from its learned start (circle) "
         "to the last layer (dot); then the radius of their supports, and how far each layer moves "
         "the anchors: the line is the median over queries, bands hold half and 90 % of them.",
-        refinement.figure(anchored) if anchored else None,
+        anchors.refinement_figure(anchored) if anchored else None,
     )
 
 
 def self_attention_section(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Self-attention of some queries as a graph, first and last layer, of models that tell it."""
-    told, chosen = graph.telling(exhibits)
-    return _drawn(
+    attending, chosen = attention.self_attending(exhibits)
+    return drawn_section(
         "Which queries read which: self-attention",
         f"Queries read not only the photos but, by self-attention, each other. The first scene "
         f"from above, input cameras as triangles. Every dark dot is a query: its anchor before the "
         f"layer, or where it has none, the place of what it adds to the photos. Lines lead from "
-        f"{graph.QUERIES} of them to the {graph.EDGES} that each attends to most.",
-        graph.figure(told, chosen) if told else None,
+        f"{attention.QUERIES} of them to the {attention.EDGES} that each attends to most.",
+        attention.self_attention_figure(attending, chosen) if attending else None,
     )
 
 
@@ -93,7 +91,7 @@ def dispersion_section(shown: Shown, samples: Sequence[Sample]) -> ReportSection
         for contender, predictions in shown
     }
     labels = dispersion.scene_labels(samples)
-    return _drawn(
+    return drawn_section(
         "How far the Gaussians of a query scatter: dispersion",
         "The distance of Gaussians to the centroid of those of their query, in every scene above: "
         "its mean, which a few far Gaussians rule, and its median, in units of the models’ world; "
@@ -102,11 +100,6 @@ def dispersion_section(shown: Shown, samples: Sequence[Sample]) -> ReportSection
         "lengths.",
         dispersion.figure(found, labels) if len(samples) > 1 else None,
     )
-
-
-def _drawn(title: str, text: str, figure: Figure | None) -> ReportSection:
-    tiles = [Tile(figure_picture(figure, dpi=144))] if figure else []
-    return ReportSection(title, text, {"": tiles} if tiles else {}, width=600)
 
 
 def _first_camera(look: Look) -> Cameras:

@@ -1,33 +1,30 @@
-"""Figure: anchors with their supports in a view, layer by layer, and the Gaussians they place."""
+"""Figures of anchors: their supports in a view layer by layer; their ways, radii and steps."""
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from qgs.drawing.images import enlarged, finer, rgb_picture
-from qgs.types import SpatialSupport, map_tensors
-from qgs_viewer.figures.exhibits import Exhibit, Exhibition
-from qgs_viewer.figures.layers import chosen_layers, layer_name
-from qgs_viewer.figures.paper import (
-    SIDE,
-    WIDTH,
-    Made,
-    new_figure,
-    paper_style,
-    picture_panel,
-    row_label,
-)
-from qgs_viewer.queries import DrawnQuery, query_picture, support_picture
+from qgs.drawing.figures import MUTED, categorical, hex_color
+from qgs.drawing.images import finer
+from qgs_viewer.figures import paper
+from qgs_viewer.figures.exhibits import Exhibit, Exhibition, support_of
+from qgs_viewer.figures.outside import draw_ground, plan_of
+from qgs_viewer.figures.paper import Made, chosen_layers, new_figure, paper_style
+from qgs_viewer.queries import DrawnQuery, query_picture
 
 QUERIES = 6
 LAYERS = 4
 """States that are shown, the learned start among them."""
+BANDS = ((5, 95, 0.18), (25, 75, 0.35))
+"""Percentiles between which a band lies, and how opaque it is."""
 
 
-def made(show: Exhibition) -> Made:
-    """See `figure`. Raises NothingToShowError where no model has anchors."""
+def anchors(show: Exhibition) -> Made:
+    """See `anchors_figure`. Raises NothingToShowError where no model has anchors."""
     exhibits, query = show.anchored, show.query
     count = QUERIES if query is None else 1
     which = f"{count} that matter to this view and stand apart" if query is None else "the query"
@@ -38,39 +35,101 @@ def made(show: Exhibition) -> Made:
         f"Gaussians of these queries, with lines to their centroids.{show.without_anchors}"
     )
     chosen = {e.name: e.notable(count, e.sample.inputs.cameras[:, :1], query) for e in exhibits}
-    return Made(figure(exhibits, chosen), caption)
+    return Made(anchors_figure(exhibits, chosen), caption)
 
 
+@paper_style()
 @torch.no_grad()
-def figure(exhibits: Sequence[Exhibit], chosen: dict[str, list[DrawnQuery]]) -> Figure:
+def anchors_figure(exhibits: Sequence[Exhibit], chosen: dict[str, list[DrawnQuery]]) -> Figure:
     """A row for each model with anchors: supports of `chosen` by layer, and their Gaussians."""
     columns = 1 + max(len(chosen_layers(e.look.depth, LAYERS, 0)) for e in exhibits)
     height, width = exhibits[0].sample.inputs.cameras.size
-    with paper_style():
-        drawn = new_figure((WIDTH - 0.2) / columns * height / width * len(exhibits) + 0.2)
-        axes = drawn.subplots(len(exhibits), columns, squeeze=False)
-        for line, shown in zip(axes, exhibits, strict=True):
-            _row(line, shown, chosen[shown.name])
+    drawn = new_figure((paper.WIDTH - 0.2) / columns * height / width * len(exhibits) + 0.2)
+    axes = drawn.subplots(len(exhibits), columns, squeeze=False)
+    for line, shown in zip(axes, exhibits, strict=True):
+        camera = shown.sample.inputs.cameras[:, :1]
+        layers = chosen_layers(shown.look.depth, LAYERS, 0)
+        pictures = shown.anchors(layers, chosen[shown.name], paper.SIDE)
+        for axis, layer, picture in zip(line, layers, pictures, strict=False):
+            title = f"after layer {layer}" if layer else "learned start"
+            paper.picture_panel(axis, picture, title)
+        fine = finer(camera, paper.SIDE)
+        picture = query_picture(shown.model, shown.gaussians, chosen[shown.name], fine)
+        paper.picture_panel(line[len(layers)], picture, "Gaussians of these")
+        for axis in line[len(layers) + 1 :]:
+            axis.set_visible(False)
+        line[0].set_ylabel(shown.name, labelpad=paper.PAD)
     return drawn
 
 
-def _row(axes: Sequence[Axes], shown: Exhibit, chosen: Sequence[DrawnQuery]) -> None:
-    camera = shown.sample.inputs.cameras[:, :1]
-    photo = enlarged(rgb_picture(shown.sample.inputs.images[0, 0]), SIDE)
-    colors = {query.index: query.color for query in chosen}
-    layers = chosen_layers(shown.look.depth, LAYERS, 0)
-    for axis, layer in zip(axes, layers, strict=False):
-        picture = support_picture(photo, support_of(shown, layer), camera.to("cpu"), colors)
-        picture_panel(axis, picture, layer_name(layer))
-    picture = query_picture(shown.model, shown.gaussians, chosen, finer(camera, SIDE))
-    picture_panel(axes[len(layers)], picture, "Gaussians of these")
-    for axis in axes[len(layers) + 1 :]:
-        axis.set_visible(False)
-    row_label(axes[0], shown.name)
+def refinement(show: Exhibition) -> Made:
+    """See `refinement_figure`. Raises NothingToShowError where no model has anchors."""
+    exhibits = show.anchored
+    caption = (
+        f"Refinement of anchors in scene {show.samples[0].scene}. Left: the way of every anchor "
+        "from its learned start (circle) to the last layer (dot), darker by layer, from above, "
+        "with input cameras as triangles and Gaussians as pale dots. Right: radius by layer (of an "
+        "ellipsoid the geometric mean of its semi-axes), layer 0 the learned start, and how far "
+        "each layer moves an anchor; the line is the median over queries, bands hold 50 % and 90 % "
+        f"of them. Units of the models' world.{show.without_anchors}"
+    )
+    return Made(refinement_figure(exhibits), caption)
 
 
-def support_of(shown: Exhibit, layer: int) -> SpatialSupport:
-    """Supports (1, N) after a layer, of a model with anchors; float32 on the CPU."""
-    found = shown.look.support(layer)
-    assert found is not None
-    return map_tensors(lambda tensor: tensor.float(), found)
+def radii(shown: Exhibit) -> np.ndarray:
+    """Radius of each query after each layer (layers + 1, N), 0 the start; geometric mean."""
+    axes = [support_of(shown, layer).axes[0].double() for layer in range(shown.look.depth + 1)]
+    return torch.linalg.det(torch.stack(axes)).abs().pow(1 / 3).numpy()
+
+
+def ways(shown: Exhibit) -> torch.Tensor:
+    """Anchors after each layer (layers + 1, N, 3), 0 the start; float64."""
+    layers = range(shown.look.depth + 1)
+    return torch.stack([support_of(shown, layer).centers[0].double() for layer in layers])
+
+
+@paper_style()
+@torch.no_grad()
+def refinement_figure(exhibits: Sequence[Exhibit]) -> Figure:
+    """A plan of the ways for each model with anchors; radii and steps of all by layer."""
+    wide = [1.25] * len(exhibits) + [1.0, 1.0]
+    drawn = new_figure(max(2.1, paper.WIDTH / sum(wide) * 1.05), gap=0.05)
+    *plans, radius, step = drawn.subplots(1, len(wide), width_ratios=wide)
+    for number, (axis, shown) in enumerate(zip(plans, exhibits, strict=True)):
+        _ways(axis, shown)
+        steps = (ways(shown)[1:] - ways(shown)[:-1]).norm(dim=-1).numpy()
+        layers, color = np.arange(shown.look.depth + 1), hex_color(categorical(number))
+        _bands(radius, layers, radii(shown), color, shown.name)
+        _bands(step, layers[1:], steps, color, shown.name)
+    for axis, title in ((radius, "support radius"), (step, "step of the anchor")):
+        axis.set_title(f"{title}, world units")
+        axis.set(xlabel="layer", ylim=(0, None))
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    if len(exhibits) > 1:
+        radius.legend()
+    return drawn
+
+
+def _bands(axis: Axes, layers: np.ndarray, values: np.ndarray, color: str, name: str) -> None:
+    """Median of values (layers, N) over queries, and BANDS about it."""
+    for low, high, alpha in BANDS:
+        ends = np.percentile(values, [low, high], axis=1)
+        axis.fill_between(layers, *ends, color=color, alpha=alpha, linewidth=0)
+    marked = {"marker": "o", "markersize": 2.5, "label": name}
+    axis.plot(layers, np.median(values, 1), color=color, **marked)
+
+
+def _ways(axis: Axes, shown: Exhibit) -> None:
+    plan = plan_of(shown)
+    draw_ground(axis, shown, plan)
+    places = plan.of(ways(shown)).numpy()
+    lines = np.stack([places[:-1], places[1:]], 2)  # (layers, N, 2 ends, 2)
+    for layer, found in enumerate(lines, start=1):
+        shade = np.full(len(found), layer / len(lines))
+        drawn = LineCollection(list(found), array=shade, cmap="viridis_r")
+        axis.add_collection(drawn)
+        drawn.set(linewidth=0.4, zorder=2, clim=(0, 1))
+    start = {"facecolors": "none", "edgecolors": hex_color(MUTED), "linewidths": 0.4}
+    axis.scatter(*places[0].T, s=4, zorder=3, **start)
+    axis.scatter(*places[-1].T, s=3, color=paper.INK_HEX, linewidths=0, zorder=3)
+    axis.set_title(f"{shown.name}: ways of the anchors")

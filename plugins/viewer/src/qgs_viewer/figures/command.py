@@ -47,8 +47,7 @@ def figures(
     """
     from qgs.engine.distributed import choose_device
     from qgs_viewer.demo import new_folder
-    from qgs_viewer.figures.gallery import refuse_unknown, write_all
-    from qgs_viewer.figures.opening import open_exhibition
+    from qgs_viewer.figures.gallery import open_exhibition, refuse_unknown, write_all
 
     refuse_unknown(only or ())
     folder, console = new_folder(out, "figures"), Console()

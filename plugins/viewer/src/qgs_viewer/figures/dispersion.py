@@ -1,7 +1,7 @@
 """Figure: how far the Gaussians of a query scatter, scene by scene."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from qgs.data.sampling import Sample
 from qgs.drawing.figures import categorical, hex_color
 from qgs.metrics.dispersion import token_dispersion
-from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians
 from qgs_viewer.figures.exhibits import Exhibition, sample_name
 from qgs_viewer.figures.paper import Made, new_figure, paper_style
@@ -29,10 +28,12 @@ LETTERS = 110
 
 def made(show: Exhibition) -> Made:
     """See `figure`."""
-    found = {
-        name: dispersions(_made_of(model, show.samples), model.head.gaussians_per_query)
-        for name, model in show.models.items()
-    }
+    found = {}
+    for name, model in show.models.items():
+        device = next(model.parameters()).device
+        with torch.no_grad():
+            scenes = [model(sample.inputs.to(device)).gaussians for sample in show.samples]
+        found[name] = dispersions(scenes, model.head.gaussians_per_query)
     caption = (
         f"Dispersion of queries on {len(show.samples)} test samples: the distance of Gaussians to "
         "the centroid of those of their query, its mean (above; a few far Gaussians rule it) and "
@@ -55,12 +56,6 @@ def dispersions(made: Iterable[Gaussians], per_query: int) -> dict[str, list[flo
     return values
 
 
-def _made_of(model: QueryGaussianModel, samples: Sequence[Sample]) -> Iterator[Gaussians]:
-    device = next(model.parameters()).device
-    for sample in samples:
-        yield model(sample.inputs.to(device)).gaussians
-
-
 def scene_labels(samples: Sequence[Sample]) -> list[str]:
     """Names of the samples without the words that all begin with, numbers without zeros."""
     names = [re.findall(r"[^\s/_-]*[\s/_-]*", sample_name(s, samples)) for s in samples]
@@ -70,21 +65,21 @@ def scene_labels(samples: Sequence[Sample]) -> list[str]:
     return [str(int(name)) for name in rest] if all(map(str.isdecimal, rest)) else rest
 
 
+@paper_style()
 def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence[str]) -> Figure:
     """Bars by scene for each model by name and each of its values; its mean as a dashed line."""
     kinds = list(next(iter(values.values())))
     lines = -(-len(values) // IN_A_LINE) - 1  # of the legend, besides its first
-    with paper_style():
-        drawn = new_figure((1.55 + 0.16 * lines) * len(kinds) + 0.3, gap=0.04)
-        axes = drawn.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
-        for axis, kind in zip(axes, kinds, strict=True):
-            _bars(axis, {name: found[kind] for name, found in values.items()})
-            axis.set(ylabel=f"{kind}, world units")
-        every = -(-len(labels) // LONGEST)
-        beside = max(0.1, (FEWEST - len(labels)) / 2)
-        turned = 90 if sum(map(len, labels[::every])) > LETTERS else 0
-        axes[-1].set_xticks(np.arange(len(labels))[::every], labels[::every], rotation=turned)
-        axes[-1].set(xlabel="test scene", xlim=(-0.5 - beside, len(labels) - 0.5 + beside))
+    drawn = new_figure((1.55 + 0.16 * lines) * len(kinds) + 0.3, gap=0.04)
+    axes = drawn.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, kind in zip(axes, kinds, strict=True):
+        _bars(axis, {name: found[kind] for name, found in values.items()})
+        axis.set(ylabel=f"{kind}, world units")
+    every = -(-len(labels) // LONGEST)
+    beside = max(0.1, (FEWEST - len(labels)) / 2)
+    turned = 90 if sum(map(len, labels[::every])) > LETTERS else 0
+    axes[-1].set_xticks(np.arange(len(labels))[::every], labels[::every], rotation=turned)
+    axes[-1].set(xlabel="test scene", xlim=(-0.5 - beside, len(labels) - 0.5 + beside))
     return drawn
 
 

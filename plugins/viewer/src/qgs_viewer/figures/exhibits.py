@@ -1,17 +1,18 @@
-"""What figures are made of: trained models, each with what it makes of one scene; more scenes."""
+"""What figures are made of: trained models side by side, on the scenes that judge them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from qgs.data.sampling import Sample
+from qgs.drawing.images import Picture, enlarged, rgb_picture
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Gaussians
+from qgs.types import Cameras, Gaussians, SpatialSupport, map_tensors
 from qgs_viewer.curves import Curves
 from qgs_viewer.look import Look, look_inside
-from qgs_viewer.queries import DrawnQuery, colored_queries, notable_queries
+from qgs_viewer.queries import DrawnQuery, colored_queries, notable_queries, support_picture
 
 
 class NothingToShowError(ValueError):
@@ -29,6 +30,15 @@ class Exhibit:
     look: Look
     sample: Sample
     curves: Curves | None = None
+
+    def anchors(
+        self, layers: Iterable[int], chosen: Sequence[DrawnQuery], side: int
+    ) -> list[Picture]:
+        """The anchors after each of `layers` on the first input view, `chosen` with supports."""
+        photo = enlarged(rgb_picture(self.sample.inputs.images[0, 0]), side)
+        camera = self.sample.inputs.cameras[:, :1].to("cpu")
+        colors = {query.index: query.color for query in chosen}
+        return [support_picture(photo, support_of(self, at), camera, colors) for at in layers]
 
     @property
     def model(self) -> QueryGaussianModel:
@@ -59,8 +69,8 @@ class Exhibition:
     """Models on the same scenes; the exhibits look at the first of `samples`.
 
     depths: for each sample the true depth (T, 1, H, W) of its targets in the models' units, where
-    known. query: the one that figures of single queries show; None lets each model's most notable
-    ones be chosen. notes: what is to be said of models and scenes.
+    known. query: shown in figures of single queries; None for each model's most notable ones.
+    notes: remarks on models and scenes.
     """
 
     exhibits: Sequence[Exhibit]
@@ -107,3 +117,10 @@ def exhibit(
     labels = [sample.label(frame) for frame in frames]
     with torch.no_grad():
         return Exhibit(name, look_inside(model.eval(), inputs, labels, frames), here, curves)
+
+
+def support_of(shown: Exhibit, layer: int) -> SpatialSupport:
+    """Supports (1, N) after a layer, of a model with anchors; float32 on the CPU."""
+    found = shown.look.support(layer)
+    assert found is not None
+    return map_tensors(lambda tensor: tensor.float(), found)

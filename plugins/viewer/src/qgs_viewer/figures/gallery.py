@@ -1,34 +1,85 @@
-"""The figures by name, and their files: PDF and PNG each, and figures.md with what they show."""
+"""From what a user names to figures: models on scenes, PDF and PNG files, and figures.md."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from qgs.data.domain import Domain, verdict
+from qgs.data.evaluation import evaluation_samples, true_depth
+from qgs.io.checkpoint import load
 from qgs.io.files import write_text
 from qgs.wording import listed
-from qgs_viewer.figures import (
-    anchors,
-    attention,
-    curves,
-    dispersion,
-    global_gaussians,
-    graph,
-    novel_views,
-    refinement,
-)
-from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
-from qgs_viewer.figures.paper import Made, write_figure
+from qgs_viewer import contest
+from qgs_viewer.curves import curves_figure, curves_of
+from qgs_viewer.figures import anchors, attention, dispersion, global_gaussians, novel_views
+from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError, exhibit
+from qgs_viewer.figures.paper import WIDTH, Made, paper_style, write_figure
+
+
+@paper_style()
+def curves(show: Exhibition) -> Made:
+    """Loss and PSNR of the training views. Raises NothingToShowError where no run has a history."""
+    found = {e.name: e.curves for e in show.exhibits if e.curves is not None}
+    without = [e.name for e in show.exhibits if e.curves is None]
+    missing = f"{', '.join(without)}: no history.jsonl beside the checkpoint, so no training curve"
+    if not found:
+        raise NothingToShowError(f"{missing}; run folders of `qgs train` have one")
+    caption = (
+        "Training loss and PSNR of the training views by seconds, or where a training took over "
+        "two hours by steps: records of the history pale, their running mean strong."
+        + (f" {missing}." if without else "")
+    )
+    figure = curves_figure(found)
+    figure.set_size_inches(WIDTH, 2.3)
+    return Made(figure, caption)
+
 
 FIGURES: Mapping[str, Callable[[Exhibition], Made]] = {
     "global_gaussians": global_gaussians.made,
     "novel_views": novel_views.made,
-    "anchors": anchors.made,
-    "refinement": refinement.made,
-    "cross_attention": attention.made,
-    "self_attention": graph.made,
+    "anchors": anchors.anchors,
+    "refinement": anchors.refinement,
+    "cross_attention": attention.cross_attention,
+    "self_attention": attention.self_attention,
     "dispersion": dispersion.made,
-    "curves": curves.made,
+    "curves": curves,
 }
 LISTING = "figures.md"
+
+
+def open_exhibition(
+    runs: Sequence[str],
+    photos: str | None = None,
+    scene: str | None = None,
+    query: int | None = None,
+    device: str = "cpu",
+) -> Exhibition:
+    """The models `runs` on the scenes of their recipe's evaluation, or on photos held out.
+
+    scene: of the exhibits and of the first samples; the first one by default. Raises as
+    `contest.recipes_alike` and the data do, and ValueError for an unknown scene or query.
+    """
+    files = contest.checkpoints(runs)
+    recipe = next(iter(contest.recipes_alike(files, photos).values()))
+    source = recipe.build_data()
+    samples = evaluation_samples(source, recipe.views, recipe.evaluation)
+    names = dict.fromkeys(sample.scene for sample in samples)
+    if scene is not None and scene not in names:
+        raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")
+    samples = sorted(samples, key=lambda sample: sample.scene != scene)
+    exhibits, found, notes = [], Domain(), dict[str, list[str]]()
+    found.see(samples[0].inputs.cameras, samples[0].targets.cameras)
+    for name, file in files.items():
+        model = load(file, device)
+        exhibits.append(exhibit(name, model, samples[0], curves_of(file)))
+        if photos is not None and (said := verdict(model.trained_on or Domain(), found)):
+            notes.setdefault(said, []).append(name)
+        if query is not None:
+            exhibits[-1].notable(1, exhibits[-1].sample.inputs.cameras, query)
+    remarks = [f"{', '.join(models)}: {said}." for said, models in notes.items()]
+    if recipe.views.scale == "auto":
+        remarks.append(contest.AUTO_SCALE)
+    depths = [true_depth(source, sample) for sample in samples]
+    return Exhibition(exhibits, samples, depths, query, remarks)
 
 
 def refuse_unknown(names: Sequence[str]) -> None:
@@ -38,9 +89,9 @@ def refuse_unknown(names: Sequence[str]) -> None:
 
 
 def write_all(show: Exhibition, folder: Path, names: Sequence[str] = ()) -> Iterator[str]:
-    """Write the figures `names`, all by default; says of each, once it is there, what it is.
+    """Write the figures `names`, all by default, and yield a line on each once it is written.
 
-    Figures that these models have nothing for are told, and left out.
+    Figures that these models have nothing for are left out.
     """
     texts = [f"# {' and '.join(show.models)}", *show.notes]
     for name in names or FIGURES:

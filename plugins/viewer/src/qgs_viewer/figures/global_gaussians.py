@@ -9,19 +9,10 @@ from matplotlib.figure import Figure
 from qgs.drawing.images import rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
+from qgs_viewer.figures import paper
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition
-from qgs_viewer.figures.overview import overview, seen_points
-from qgs_viewer.figures.paper import (
-    INK_HEX,
-    SIDE,
-    WIDTH,
-    Made,
-    new_figure,
-    paper_style,
-    picture_panel,
-    row_label,
-    tag,
-)
+from qgs_viewer.figures.outside import overview, seen_points
+from qgs_viewer.figures.paper import SIDE, WIDTH, Made, new_figure, paper_style, picture_panel, tag
 from qgs_viewer.placement import corners, on_photo
 from qgs_viewer.queries import DrawnQuery, query_picture
 from qgs_viewer.stage import FRUSTUM, frustum_lines
@@ -32,8 +23,10 @@ SHAPE = (3, 4)
 
 def made(show: Exhibition) -> Made:
     """See `figure`."""
-    chosen = drawn_queries(show.exhibits, show.query)
-    told = [
+    chosen = {
+        e.name: e.notable(1, e.sample.targets.cameras[:, :1], show.query)[0] for e in show.exhibits
+    }
+    sizes = [
         f"{name}: query {query.index}, whose Gaussians lie {query.dispersion:.3g} from their "
         "centroid in the mean"
         for name, query in chosen.items()
@@ -44,50 +37,41 @@ def made(show: Exhibition) -> Made:
         "frusta), framed anew for each model. Left all Gaussians; right those of one query in "
         "colour, at no less than half opacity, with lines to their centroid, over the scene in "
         f"pale grey. {why}{' the first target view' * (show.query is None)} is shown. "
-        f"{'; '.join(told)}. Lines that leave the panel lead to Gaussians outside it."
+        f"{'; '.join(sizes)}. Lines that leave the panel lead to Gaussians outside it."
     )
     return Made(figure(show.exhibits, chosen), caption)
 
 
-def drawn_queries(exhibits: Sequence[Exhibit], query: int | None) -> dict[str, DrawnQuery]:
-    """Of each model by name `query`, or the most notable one of the first target view."""
-    return {e.name: e.notable(1, e.sample.targets.cameras[:, :1], query)[0] for e in exhibits}
-
-
+@paper_style()
 @torch.no_grad()
 def figure(exhibits: Sequence[Exhibit], chosen: Mapping[str, DrawnQuery]) -> Figure:
     """A row for each model, from outside what it made: the scene, the Gaussians of its query."""
-    with paper_style():
-        each = (WIDTH - 0.2) / 2 * SHAPE[0] / SHAPE[1]
-        drawn = new_figure(each * len(exhibits) + 0.25)
-        axes = drawn.subplots(len(exhibits), 2, squeeze=False)
-        for line, shown in zip(axes, exhibits, strict=True):
-            _row(line, shown, chosen[shown.name])
-        axes[0, 0].set_title("all Gaussians, seen from outside")
-        axes[0, 1].set_title("Gaussians of one query")
+    drawn = new_figure((WIDTH - 0.2) / 2 * SHAPE[0] / SHAPE[1] * len(exhibits) + 0.25)
+    axes = drawn.subplots(len(exhibits), 2, squeeze=False)
+    for line, shown in zip(axes, exhibits, strict=True):
+        _row(line, shown, chosen[shown.name])
+    axes[0, 0].set_title("all Gaussians, seen from outside")
+    axes[0, 1].set_title("Gaussians of one query")
     return drawn
 
 
 def _row(axes: Sequence[Axes], shown: Exhibit, query: DrawnQuery) -> None:
     model, gaussians, inputs = shown.model, shown.gaussians, shown.sample.inputs.cameras
-    points = seen_points(model, gaussians, inputs)
+    points = seen_points(shown)
     camera = overview(inputs, points, (SIDE * SHAPE[0] // SHAPE[1], SIDE))
     length = FRUSTUM * float((points - inputs.c2w[0, 0, :3, 3]).norm(dim=-1).median())
     white = torch.ones(3)
     picture_panel(axes[0], rgb_picture(model.render(gaussians, camera, white).rgb[0, 0]))
     picture_panel(axes[1], query_picture(model, gaussians, [query], camera, white))
     tag(axes[1], f"query {query.index}: mean distance to centroid {query.dispersion:.3g}")
-    row_label(axes[0], shown.name)
-    for axis in axes:
-        _frusta(axis, inputs, camera, length)
-
-
-def _frusta(axis: Axes, inputs: Cameras, camera: Cameras, length: float) -> None:
-    """Input cameras as wire frames of `length`, seen by `camera`."""
+    axes[0].set_ylabel(shown.name, labelpad=paper.PAD)
+    # The input cameras, as wire frames.
     flat = Cameras(inputs.c2w[0], inputs.intrinsics[0], inputs.size)
     rims = on_photo(flat, corners(inputs.size), length)
     lines = frustum_lines(flat.c2w[:, :3, 3], rims.to(flat.c2w))
     local = to_camera(lines.flatten(0, 1)[None], camera)[0, 0]
     pixels = to_pixels(local, camera.intrinsics[0, 0]).cpu().numpy() - 0.5
-    for x, y in pixels.reshape(-1, 2, 2).transpose(0, 2, 1):
-        axis.plot(x, y, color=INK_HEX, linewidth=0.7, scalex=False, scaley=False)
+    style = {"color": paper.INK_HEX, "linewidth": 0.7, "scalex": False, "scaley": False}
+    for axis in axes:
+        for x, y in pixels.reshape(-1, 2, 2).transpose(0, 2, 1):
+            axis.plot(x, y, **style)

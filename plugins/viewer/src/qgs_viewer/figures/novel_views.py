@@ -10,26 +10,13 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from qgs.data.sampling import Sample
-from qgs.drawing.images import (
-    DEPTH_MAP,
-    depth_picture,
-    depth_range,
-    rgb_picture,
-)
+from qgs.drawing.images import DEPTH_MAP, depth_picture, depth_range, rgb_picture
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Rendering
+from qgs_viewer.figures import paper
 from qgs_viewer.figures.exhibits import Exhibition, sample_name
-from qgs_viewer.figures.paper import (
-    WIDTH,
-    Made,
-    blank_panel,
-    new_figure,
-    paper_style,
-    picture_panel,
-    row_label,
-    tag,
-)
+from qgs_viewer.figures.paper import WIDTH, Made, blank_panel, new_figure, picture_panel, tag
 from qgs_viewer.pictures import ERROR_MAP, color_error, error_picture
 
 SCENES = 3
@@ -43,7 +30,7 @@ TRUE = " of the models' and the true depth, which is shown where it is known"
 def made(show: Exhibition) -> Made:
     """See `figure`."""
     samples, depths, first = show.samples[:SCENES], show.depths[:SCENES], show.samples[0]
-    target = first.label(_middle(first.target_frames))
+    target = first.label(first.target_frames[len(first.target_frames) // 2])
     more = len(first.input_frames) - INPUTS
     caption = (
         f"Novel views of {', '.join(sample_name(s, samples) for s in samples)}, each from "
@@ -57,6 +44,7 @@ def made(show: Exhibition) -> Made:
     return Made(figure(show.models, samples, depths), caption)
 
 
+@paper.paper_style()
 @torch.no_grad()
 def figure(
     models: Mapping[str, QueryGaussianModel],
@@ -75,26 +63,21 @@ def figure(
     rows = len(samples) * len(models)
     height, width = samples[0].inputs.cameras.size
     side = (WIDTH - 0.35) / columns
-    with paper_style():
-        drawn = new_figure((side * height / width + 0.04) * rows + 0.45)
-        heights = [side * height / width] * rows + [0.07]
-        *panels, scales = drawn.subplots(rows + 1, columns, height_ratios=heights)
-        for number, (sample, depth) in enumerate(zip(samples, depths, strict=True)):
-            block = np.array(panels[number * len(models) : (number + 1) * len(models)])
-            _scene(block, sample, depth, *scenes[number], brightest, _known(depths))
-            row_label(block[0, 0], sample_name(sample, samples))
-        for axis, title in zip(panels[0][::-1], titles, strict=False):
-            axis.set_title(title)
-        _scales(scales, brightest)
+    drawn = new_figure((side * height / width + 0.04) * rows + 0.45)
+    heights = [side * height / width] * rows + [0.07]
+    *panels, scales = drawn.subplots(rows + 1, columns, height_ratios=heights)
+    for number, (sample, depth) in enumerate(zip(samples, depths, strict=True)):
+        block = np.array(panels[number * len(models) : (number + 1) * len(models)])
+        _scene(block, sample, depth, *scenes[number], brightest, _known(depths))
+        block[0, 0].set_ylabel(sample_name(sample, samples), labelpad=paper.PAD)
+    for axis, title in zip(panels[0][::-1], titles, strict=False):
+        axis.set_title(title)
+    _scales(scales, brightest)
     return drawn
 
 
 def _known(depths: Sequence[Tensor | None]) -> bool:
     return any(depth is not None for depth in depths)
-
-
-def _middle(frames: Sequence[int]) -> int:
-    return frames[len(frames) // 2]
 
 
 def _rendered(
@@ -140,7 +123,7 @@ def _scene(
         score = Psnr.column.shown(float(psnr(rendering.rgb[0, 0], truth.to(rendering.rgb))))
         picture_panel(line[first + 1], rgb_picture(rendering.rgb[0, 0]))
         tag(line[first + 1], f"{score} {Psnr.column.unit}")
-        row_label(line[first + 1], name)
+        line[first + 1].set_ylabel(name, labelpad=paper.PAD)
         error = color_error(rendering.rgb[0, 0], truth)
         picture_panel(line[-1], error_picture(error, brightest))
 

@@ -19,6 +19,7 @@ from qgs.io.files import replacing
 WIDTH = 7.0
 """Inches of a figure across a page of two columns."""
 DPI = 220
+PAD = 2.5  # points between a panel and its label
 SIDE = 512
 """Pixels on the longer side of pictures that models render for a panel."""
 INK_HEX = hex_color(INK)
@@ -32,9 +33,17 @@ class Made:
     caption: str
 
 
+def chosen_layers(depth: int, most: int, first: int = 1) -> list[int]:
+    """At most `most` layers from `first` to `depth`, evenly, both among them."""
+    count = min(most, depth - first + 1)
+    if count < 2:
+        return [depth]
+    return [first + round(i * (depth - first) / (count - 1)) for i in range(count)]
+
+
 @contextmanager
 def paper_style() -> Iterator[None]:
-    """Matplotlib settings while a figure is drawn and while it is written."""
+    """Matplotlib settings while a figure is drawn and while it is written; also a decorator."""
     sizes: dict[Any, Any] = {
         "font.size": 8,
         "axes.titlesize": 8,
@@ -62,7 +71,7 @@ def picture_panel(axis: Axes, picture: Picture, title: str = "") -> None:
     axis.imshow(picture, interpolation="nearest", aspect="equal")
     blank_panel(axis)
     if title:
-        axis.set_title(title, pad=2.5)
+        axis.set_title(title, pad=PAD)
 
 
 def blank_panel(axis: Axes) -> None:
@@ -71,11 +80,6 @@ def blank_panel(axis: Axes) -> None:
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
     axis.patch.set_visible(False)
-
-
-def row_label(axis: Axes, text: str) -> None:
-    """What a row of panels shows, at its left."""
-    axis.set_ylabel(text, labelpad=2.5)
 
 
 def tag(axis: Axes, text: str) -> None:
@@ -87,13 +91,9 @@ def tag(axis: Axes, text: str) -> None:
 
 def write_figure(figure: Figure, folder: Path, name: str) -> None:
     """NAME.pdf with text as text, and NAME.png; the same figure gives the same bytes."""
-    settings: dict[str, dict[str, Any]] = {
-        "pdf": {"metadata": {"CreationDate": None}},
-        "png": {},
-    }
-    for kind, more in settings.items():
+    for kind, metadata in (("pdf", {"CreationDate": None}), ("png", {})):
         buffer = BytesIO()
         with paper_style():
-            figure.savefig(buffer, format=kind, dpi=DPI, **more)
+            figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
         with replacing(folder / f"{name}.{kind}") as temporary:
             temporary.write_bytes(buffer.getvalue())
